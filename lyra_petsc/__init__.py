@@ -1,0 +1,3 @@
+"""lyra_petsc: parallel thin-shell simulation on PETSc."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,68 @@
+"""The few ways in which a run ends early, and the exit code of each.
+
+Every module raises one of these and nothing prints or exits by itself; ``cli`` turns
+them into one line on rank 0 and the exit code.
+"""
+
+from __future__ import annotations
+
+
+class LyraError(Exception):
+    """Base of everything a user may see as one line."""
+
+    exit_code = 1
+
+
+class InputError(LyraError):
+    """Bad input: a file, a key or an option that cannot be used (exit 2).
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what is allowed, in one line.
+    file : str, optional
+        The file in which the mistake stands.
+    key : str, optional
+        The key (dotted path, e.g. ``handles[1].group``) or option in question.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, file: object | None = None, key: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.file = None if file is None else str(file)
+        self.key = key
+
+    def __str__(self) -> str:
+        where = ": ".join(part for part in (self.file, self.key) if part)
+        return f"{where}: {self.message}" if where else self.message
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # broadcast from rank 0 to all: pickle must keep the keywords
+        return (_rebuild_input_error, (self.message, self.file, self.key))
+
+
+def _rebuild_input_error(message: str, file: str | None, key: str | None) -> InputError:
+    return InputError(message, file=file, key=key)
+
+
+class SolverError(LyraError):
+    """The solver could not go on; the last good state is on disk (exit 3)."""
+
+    exit_code = 3
+
+
+class OutputError(LyraError):
+    """A result could not be written (disk full, no permission); what was announced stands (exit 3)."""
+
+    exit_code = 3
+
+
+class Interrupted(LyraError):
+    """A signal asked the run to stop; it finished its step and wrote a checkpoint."""
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.signal_number = signal_number
+        self.exit_code = 130 if signal_number == 2 else 143

@@ -1,0 +1,1 @@
+"""Material libraries (one data file each) and their reading."""

@@ -1,0 +1,1 @@
+"""Mesh sources (.geo, .msh, .obj, grids) → vertices, triangles, material coordinates, groups."""

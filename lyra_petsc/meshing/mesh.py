@@ -1,0 +1,79 @@
+"""The triangle mesh of a scene, whole, as it exists on rank 0 during set-up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass
+class Group:
+    """A named set from the mesh (gmsh physical group, OBJ group, or a sheet's name).
+
+    Attributes
+    ----------
+    dimension : int
+        0 points, 1 curves, 2 surfaces.
+    vertices : (n,) int64
+        Its vertices, ascending, each once.
+    triangles : (m,) int64
+        Its triangles (dimension 2), else empty.
+    edges : (k, 2) int64
+        Its edges as vertex pairs (dimension 1), else empty.
+    """
+
+    dimension: int
+    vertices: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+
+@dataclass
+class Mesh:
+    """Triangle mesh of all sheets of a scene.
+
+    Attributes
+    ----------
+    positions : (V, 3) float64
+        Start positions [m], after the source's transform.
+    rest : (V, 3) float64
+        Rest surface [m]: the mesh as it stands after scaling; of a sheet with ``vt`` the
+        ``vt`` with z = 0 where each vertex has one, else (seams) the scaled position.
+    triangles : (F, 3) int64
+        Vertices of each triangle, consistently oriented within a sheet.
+    triangle_uv : (F, 3, 2) float64
+        Material coordinates of each triangle's corners [m], in a frame whose first axis is
+        the warp direction: the ``vt``, or for a sheet without, the rest triangle laid out in
+        its own plane (first axis: x, or where the plane is nearly normal to x, y, projected
+        into it; a sheet flat in xy gets its x, y).
+    flat_rest : (F,) bool
+        True where the rest shape is flat by definition (``vt`` given): rest angles are 0.
+    groups : dict[str, Group]
+        Named groups; names are unique over all sources (see ``build``).
+    notes : list[str]
+        What was repaired or dropped, one line each, for the user.
+    has_seams : bool
+        True if some vertex has more than one material coordinate (``corner_uv`` is needed).
+    has_uv : bool
+        True if any sheet came with ``vt``.
+    """
+
+    positions: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    triangle_uv: NDArray[np.float64]
+    flat_rest: NDArray[np.bool_]
+    groups: dict[str, Group] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    has_seams: bool = False
+    has_uv: bool = False
+
+    @property
+    def n_vertices(self) -> int:
+        return len(self.positions)
+
+    @property
+    def n_triangles(self) -> int:
+        return len(self.triangles)

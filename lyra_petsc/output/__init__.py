@@ -1,0 +1,1 @@
+"""States, checkpoints, XDMF, history, summary, diagnostics."""

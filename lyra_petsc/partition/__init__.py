@@ -1,0 +1,1 @@
+"""Distribution of points and elements over ranks; owned and ghost numbering."""

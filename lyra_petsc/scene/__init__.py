@@ -1,0 +1,1 @@
+"""Scene files and their checked values: text in, values out."""

@@ -1,0 +1,1 @@
+"""The reduced implicit system, PETSc TS/SNES/KSP, step control and recovery."""

@@ -1,0 +1,1 @@
+"""Physical terms: energies, loads and damping; one file each, registered in ``registry``."""
