@@ -1,0 +1,87 @@
+"""Lengths, areas and material frames of the rest shape."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.meshing.mesh import Mesh
+
+Floats = NDArray[np.float64]
+
+
+def triangle_sides(corners: Floats) -> tuple[Floats, Floats]:
+    """The two sides (n, d) each that leave the first corner; ``corners`` is (n, 3, d)."""
+    return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+
+
+def rest_areas(mesh: Mesh) -> Floats:
+    """Rest area of each triangle [m²], (F,), positive."""
+    a, b = triangle_sides(mesh.triangle_uv)
+    areas: Floats = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return areas
+
+
+def vertex_areas(mesh: Mesh) -> Floats:
+    """Rest area of each vertex [m²], (V,): a third of that of its triangles."""
+    shares = np.repeat(rest_areas(mesh) / 3.0, 3)
+    corners = mesh.triangles.reshape(-1)
+    return np.bincount(corners, weights=shares, minlength=mesh.n_vertices).astype(np.float64)
+
+
+def rest_matrices(mesh: Mesh, warp_degrees: Floats | float = 0.0) -> tuple[Floats, Floats]:
+    """Inverse rest matrices in material axes, and rest areas.
+
+    With ``Dm = [u1 - u0, u2 - u0]`` (columns, in material axes) and ``Ds`` the same of current
+    positions, the deformation gradient is ``F = Ds Dm⁻¹``. The first material axis is the warp:
+    the first axis of ``triangle_uv`` rotated by ``warp_degrees`` anticlockwise in that plane.
+
+    ``det Dm`` is positive for every triangle: where the corners run clockwise in the material plane
+    (a mirrored pattern piece) the second material axis is reversed, after the rotation. That changes
+    the sign of the shear E_uv only, hence no energy of an orthotropic material.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    warp_degrees : float or (F,) float
+        Rotation of the warp direction [°].
+
+    Returns
+    -------
+    inverse : (F, 2, 2) float64
+        Dm⁻¹ [1/m].
+    area : (F,) float64
+        Rest areas [m²].
+    """
+    a, b = triangle_sides(mesh.triangle_uv)
+    angle = np.radians(np.broadcast_to(np.asarray(warp_degrees, dtype=np.float64), (mesh.n_triangles,)))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    m00 = cosine * a[:, 0] + sine * a[:, 1]
+    m10 = cosine * a[:, 1] - sine * a[:, 0]
+    m01 = cosine * b[:, 0] + sine * b[:, 1]
+    m11 = cosine * b[:, 1] - sine * b[:, 0]
+    mirror = np.where(m00 * m11 - m01 * m10 < 0.0, -1.0, 1.0)
+    m10, m11 = mirror * m10, mirror * m11
+    determinant = m00 * m11 - m01 * m10
+    inverse = np.empty((mesh.n_triangles, 2, 2))
+    inverse[:, 0, 0] = m11 / determinant
+    inverse[:, 0, 1] = -m01 / determinant
+    inverse[:, 1, 0] = -m10 / determinant
+    inverse[:, 1, 1] = m00 / determinant
+    return inverse, 0.5 * determinant
+
+
+def mean_edge_length(mesh: Mesh) -> float:
+    """Mean rest length [m] of the triangles' sides (interior edges count twice)."""
+    uv = mesh.triangle_uv
+    return float(np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2).mean())
+
+
+def bounding_diagonal(points: Floats) -> float:
+    """Diagonal [m] of the axis-parallel bounding box of ``points`` (n, d)."""
+    return float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+
+
+def rest_diagonal(mesh: Mesh) -> float:
+    """Diagonal [m] of the bounding box of the rest surface: the size errors are measured against."""
+    return bounding_diagonal(mesh.rest)

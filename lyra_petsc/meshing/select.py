@@ -1,0 +1,140 @@
+"""Vertices and triangles picked by group, by number or by box."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.meshing.measure import bounding_diagonal
+from lyra_petsc.meshing.mesh import Group, Mesh
+
+DIMENSION_NAMES = ("point", "curve", "surface", "volume")
+
+
+class Selector(Protocol):
+    """What a handle, load or probe says about its vertices; exactly one is not None."""
+
+    @property
+    def group(self) -> str | None: ...
+    @property
+    def nodes(self) -> Sequence[int] | None: ...
+    @property
+    def box(self) -> Sequence[Sequence[float]] | None: ...
+
+
+def select_vertices(
+    mesh: Mesh, selector: Selector, *, key: str, file: object | None = None
+) -> NDArray[np.int64]:
+    """Vertices a selector names, ascending, each once.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    selector : object with ``group``, ``nodes`` or ``box``
+        A group's name; vertex numbers from 0; or two opposite corners of an axis-parallel box
+        around start positions [m]. The box includes its faces, give or take 1e-9 of the mesh's size.
+    key : str
+        The scene key of the selector, for messages (``handles[0]``).
+    file : optional
+        The scene file, for messages.
+
+    Returns
+    -------
+    (n,) int64
+
+    Raises
+    ------
+    InputError
+        Unknown group, vertex out of range, or nothing selected.
+    """
+    if selector.group is not None:
+        return find_group(mesh, selector.group, key=f"{key}.group", file=file).vertices
+    if selector.nodes is not None:
+        return _numbered(mesh, selector.nodes, key=f"{key}.nodes", file=file)
+    if selector.box is not None:
+        return _boxed(mesh, selector.box, key=f"{key}.box", file=file)
+    raise InputError("nothing is selected; give one of group, nodes, box", key=key, file=file)
+
+
+def select_triangles(
+    mesh: Mesh, group: str | None, *, key: str, file: object | None = None
+) -> NDArray[np.int64]:
+    """Triangles of a surface group, ascending; all triangles for ``None``.
+
+    Raises
+    ------
+    InputError
+        Unknown group, or one of points or curves.
+    """
+    if group is None:
+        return np.arange(mesh.n_triangles, dtype=np.int64)
+    found = find_group(mesh, group, key=key, file=file)
+    if found.dimension != 2:
+        surfaces = [name for name, candidate in mesh.groups.items() if candidate.dimension == 2]
+        raise InputError(
+            f"group '{group}' is a {DIMENSION_NAMES[found.dimension]} group and has no triangles; "
+            f"surface groups: {listing(surfaces)}",
+            key=key,
+            file=file,
+        )
+    return found.triangles
+
+
+def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -> Group:
+    """The group of that name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message gives the nearest name and those that exist.
+    """
+    found = mesh.groups.get(name)
+    if found is not None:
+        return found
+    near = difflib.get_close_matches(name, mesh.groups, n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    raise InputError(
+        f"no group '{name}' in the mesh; {hint}groups: {listing(mesh.groups)}", key=key, file=file
+    )
+
+
+def listing(names: Iterable[str]) -> str:
+    """Names for a message, in order, at most twenty of them."""
+    ordered = sorted(names)
+    if not ordered:
+        return "none"
+    more = f" and {len(ordered) - 20} more" if len(ordered) > 20 else ""
+    return ", ".join(ordered[:20]) + more
+
+
+def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> NDArray[np.int64]:
+    if len(nodes) == 0:
+        raise InputError("the list is empty", key=key, file=file)
+    # compared as Python integers: a number beyond 64 bits must not overflow on the way
+    wrong = [int(node) for node in nodes if not 0 <= int(node) < mesh.n_vertices]
+    if wrong:
+        shown = ", ".join(str(node) for node in wrong[:5])
+        more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+        raise InputError(
+            f"no vertex {shown}{more}; the mesh has vertices 0 to {mesh.n_vertices - 1}", key=key, file=file
+        )
+    return np.unique(np.asarray(nodes, dtype=np.int64))
+
+
+def _boxed(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> NDArray[np.int64]:
+    corners = np.asarray(box, dtype=np.float64)
+    if corners.shape != (2, 3) or not np.isfinite(corners).all():
+        raise InputError("a box is two corners of three finite numbers each", key=key, file=file)
+    slack = 1e-9 * bounding_diagonal(mesh.positions)
+    low, high = corners.min(axis=0) - slack, corners.max(axis=0) + slack
+    inside = np.flatnonzero(((mesh.positions >= low) & (mesh.positions <= high)).all(axis=1))
+    if inside.size == 0:
+        first, last = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
+        span = " to ".join("[" + ", ".join(f"{x:.6g}" for x in point) + "]" for point in (first, last))
+        raise InputError(f"no vertex lies in the box; the mesh spans {span}", key=key, file=file)
+    return inside.astype(np.int64)

@@ -1,0 +1,123 @@
+"""Edges of a triangle mesh: hinges (two triangles), boundary edges (one), and what breaks a surface."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+
+
+class Hinges(NamedTuple):
+    """Interior edges with their two opposite vertices.
+
+    Attributes
+    ----------
+    vertices : (H, 4) int64
+        ``[a, b, c, d]``: edge a-b as the first triangle (a, b, c) runs along it; c is opposite in
+        the first triangle, d in the second, which is (b, a, d) where orientation is consistent.
+    triangles : (H, 2) int64
+        First and second triangle; the first has the smaller index.
+    """
+
+    vertices: Ints
+    triangles: Ints
+
+
+class BoundaryEdges(NamedTuple):
+    """Edges that belong to one triangle only.
+
+    Attributes
+    ----------
+    edges : (B, 2) int64
+        Vertices, in the direction in which the triangle runs.
+    triangles : (B,) int64
+        The triangle of each edge.
+    opposite : (B,) int64
+        The triangle's third vertex.
+    """
+
+    edges: Ints
+    triangles: Ints
+    opposite: Ints
+
+
+class EdgeTable(NamedTuple):
+    """All triangle sides, grouped by the undirected edge they lie on.
+
+    Side ``3 t + k`` runs from corner k to corner k + 1 of triangle t.
+
+    Attributes
+    ----------
+    sides : (3F,) int64
+        Side numbers, sides of one edge next to each other and ascending.
+    first : (E,) int64
+        Where each edge begins in ``sides``.
+    sizes : (E,) int64
+        Number of sides (triangles) of each edge.
+    """
+
+    sides: Ints
+    first: Ints
+    sizes: Ints
+
+
+def edge_table(triangles: Ints) -> EdgeTable:
+    """Group the sides of ``triangles`` (F, 3) by undirected edge; one sort of 3F numbers."""
+    start = triangles.reshape(-1)
+    end = np.roll(triangles, -1, axis=1).reshape(-1)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    span = int(high.max()) + 1 if len(high) else 1
+    key = low.astype(np.int64) * span + high
+    sides = np.argsort(key, kind="stable")
+    key = key[sides]
+    first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1]))) if len(key) else sides
+    sizes = np.diff(np.append(first, len(key)))
+    return EdgeTable(sides, first, sizes)
+
+
+def side_vertices(triangles: Ints, sides: Ints) -> Ints:
+    """Start, end and opposite vertex of the given sides: (n, 3)."""
+    triangle, corner = np.divmod(sides, 3)
+    return np.stack([triangles[triangle, (corner + shift) % 3] for shift in range(3)], axis=1)
+
+
+def hinges(triangles: Ints) -> Hinges:
+    """All interior edges of a manifold mesh, ordered by first triangle and its corner.
+
+    Parameters
+    ----------
+    triangles : (F, 3) int64
+
+    Raises
+    ------
+    ValueError
+        If an edge belongs to more than two triangles (``build_mesh`` refuses such meshes).
+    """
+    table = edge_table(triangles)
+    if table.sizes.size and table.sizes.max() > 2:
+        raise ValueError("an edge belongs to more than two triangles")
+    begin = table.first[table.sizes == 2]
+    first, second = table.sides[begin], table.sides[begin + 1]
+    order = np.argsort(first)
+    first, second = first[order], second[order]
+    vertices = np.concatenate(
+        [side_vertices(triangles, first), side_vertices(triangles, second)[:, 2:]], axis=1
+    )
+    return Hinges(vertices, np.stack([first // 3, second // 3], axis=1))
+
+
+def boundary_edges(triangles: Ints) -> BoundaryEdges:
+    """All edges of ``triangles`` (F, 3) that belong to one triangle, ordered by triangle and corner."""
+    table = edge_table(triangles)
+    sides = np.sort(table.sides[table.first[table.sizes == 1]])
+    vertices = side_vertices(triangles, sides)
+    return BoundaryEdges(vertices[:, :2], sides // 3, vertices[:, 2])
+
+
+def unique_edges(triangles: Ints) -> Ints:
+    """All edges of ``triangles`` (F, 3) as vertex pairs (E, 2), smaller vertex first, each once."""
+    table = edge_table(triangles)
+    return np.sort(side_vertices(triangles, table.sides[table.first])[:, :2], axis=1)
