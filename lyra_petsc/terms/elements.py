@@ -1,0 +1,37 @@
+"""Elements of one term: which points they couple and the numbers that belong to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass
+class Elements:
+    """A set of like elements, whole (rank 0, mesh numbering) or of one rank (local numbering).
+
+    Attributes
+    ----------
+    stencil : (E, n) int
+        The vertices that each element couples.
+    data : mapping of name → (E, …) array
+        Constants of each element, sliced along with the stencil when distributed.
+    n_owned : int
+        The first ``n_owned`` elements are counted on this rank (energies, diagnostics); the
+        rest also touch a vertex that it owns. Equal to E before distribution.
+    index : (E,) int64
+        Number of each element before distribution.
+    """
+
+    stencil: NDArray[np.int32] | NDArray[np.int64]
+    data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    n_owned: int = -1
+    index: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if self.n_owned < 0:
+            self.n_owned = len(self.stencil)
+            self.index = np.arange(len(self.stencil), dtype=np.int64)

@@ -1,0 +1,193 @@
+"""Membrane: St. Venant-Kirchhoff energy of the constant-strain triangle.
+
+Per triangle of rest area A, with F = ∂x/∂u (3×2) and the Green strain E = (FᵀF − I)/2::
+
+    energy = A/2 (c11 E_uu² + 2 c12 E_uu E_vv + c22 E_vv² + c33 (2 E_uv)²)
+
+Source: the Lyra paper, eq. 2-3; Bonet and Wood, Nonlinear Continuum Mechanics for FEA, ch. 8.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from lyra_petsc.terms.kernel import kernel
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.elements import Elements
+from lyra_petsc.terms.term import Elastic
+
+Array = NDArray[np.float64]
+Stencil = NDArray[np.int32]
+
+
+@kernel(inline="always")
+def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
+    """Columns fu, fv of the deformation gradient of triangle e."""
+    a, b, c = s[e, 0], s[e, 1], s[e, 2]
+    px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+    qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+    i00, i01, i10, i11 = inverse[e, 0, 0], inverse[e, 0, 1], inverse[e, 1, 0], inverse[e, 1, 1]
+    return (
+        px * i00 + qx * i10, py * i00 + qy * i10, pz * i00 + qz * i10,
+        px * i01 + qx * i11, py * i01 + qy * i11, pz * i01 + qz * i11,
+    )  # fmt: skip
+
+
+@kernel(inline="always")
+def _green_and_stress(f, c, e):  # type: ignore[no-untyped-def]
+    """Green strain (E_uu, E_vv, 2 E_uv) and second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
+    ux, uy, uz, vx, vy, vz = f
+    e0 = 0.5 * (ux * ux + uy * uy + uz * uz - 1.0)
+    e1 = 0.5 * (vx * vx + vy * vy + vz * vz - 1.0)
+    e2 = ux * vx + uy * vy + uz * vz
+    c11, c12, c22, c33 = c[e, 0], c[e, 1], c[e, 2], c[e, 3]
+    return e0, e1, e2, c11 * e0 + c12 * e1, c12 * e0 + c22 * e1, c33 * e2
+
+
+@kernel()
+def energies(x, s, lo, hi, inverse, area, c, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of triangles lo..hi into out (hi − lo,)."""
+    for e in range(lo, hi):
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, e)
+        out[e - lo] = 0.5 * area[e] * (e0 * s0 + e1 * s1 + e2 * s2)
+
+
+@kernel()
+def add_gradient(x, s, inverse, area, c, out):  # type: ignore[no-untyped-def]
+    """Add the energy's gradient [N] to out (n_local, 3)."""
+    for e in range(s.shape[0]):
+        f = _deformation(x, s, e, inverse)
+        ux, uy, uz, vx, vy, vz = f
+        _, _, _, s0, s1, s2 = _green_and_stress(f, c, e)
+        # columns of the first Piola-Kirchhoff stress P = F S, times the area
+        w = area[e]
+        pux, puy, puz = w * (ux * s0 + vx * s2), w * (uy * s0 + vy * s2), w * (uz * s0 + vz * s2)
+        pvx, pvy, pvz = w * (ux * s2 + vx * s1), w * (uy * s2 + vy * s1), w * (uz * s2 + vz * s1)
+        i00, i01, i10, i11 = inverse[e, 0, 0], inverse[e, 0, 1], inverse[e, 1, 0], inverse[e, 1, 1]
+        bx, by, bz = pux * i00 + pvx * i01, puy * i00 + pvy * i01, puz * i00 + pvz * i01
+        cx, cy, cz = pux * i10 + pvx * i11, puy * i10 + pvy * i11, puz * i10 + pvz * i11
+        ia, ib, ic = s[e, 0], s[e, 1], s[e, 2]
+        out[ia, 0] -= bx + cx
+        out[ia, 1] -= by + cy
+        out[ia, 2] -= bz + cz
+        out[ib, 0] += bx
+        out[ib, 1] += by
+        out[ib, 2] += bz
+        out[ic, 0] += cx
+        out[ic, 1] += cy
+        out[ic, 2] += cz
+
+
+@kernel(inline="always")
+def _tensile(s0, s1, s2):  # type: ignore[no-untyped-def]
+    """The positive-semidefinite part of the 2×2 stress: compressive principal stress dropped."""
+    mean = 0.5 * (s0 + s1)
+    half = 0.5 * (s0 - s1)
+    radius = math.sqrt(half * half + s2 * s2)
+    if mean - radius >= 0.0:
+        return s0, s1, s2
+    if mean + radius <= 0.0:
+        return 0.0, 0.0, 0.0
+    # one tensile direction: σ n nᵀ with n nᵀ = (1 + (S − mean)/radius) / 2
+    scale = (mean + radius) / (2.0 * radius)
+    return scale * (radius + half), scale * (radius - half), scale * s2
+
+
+@kernel()
+def hessians(x, s, lo, hi, exact, inverse, area, c, out):  # type: ignore[no-untyped-def]
+    """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j]."""
+    g = np.empty((3, 2))
+    for e in range(lo, hi):
+        f = _deformation(x, s, e, inverse)
+        ux, uy, uz, vx, vy, vz = f
+        _, _, _, s0, s1, s2 = _green_and_stress(f, c, e)
+        if not exact:
+            s0, s1, s2 = _tensile(s0, s1, s2)
+        w = area[e]
+        s0, s1, s2 = w * s0, w * s1, w * s2
+        c11, c12, c22, c33 = w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]
+        g[1, 0], g[1, 1] = inverse[e, 0, 0], inverse[e, 0, 1]
+        g[2, 0], g[2, 1] = inverse[e, 1, 0], inverse[e, 1, 1]
+        g[0, 0], g[0, 1] = -g[1, 0] - g[2, 0], -g[1, 1] - g[2, 1]
+        for a in range(3):
+            au, av = g[a, 0], g[a, 1]
+            # rows of ∂E/∂x_a
+            a0x, a0y, a0z = au * ux, au * uy, au * uz
+            a1x, a1y, a1z = av * vx, av * vy, av * vz
+            a2x, a2y, a2z = au * vx + av * ux, au * vy + av * uy, au * vz + av * uz
+            for b in range(a, 3):
+                bu, bv = g[b, 0], g[b, 1]
+                b0x, b0y, b0z = bu * ux, bu * uy, bu * uz
+                b1x, b1y, b1z = bv * vx, bv * vy, bv * vz
+                b2x, b2y, b2z = bu * vx + bv * ux, bu * vy + bv * uy, bu * vz + bv * uz
+                q0x, q1x, q2x = c11 * b0x + c12 * b1x, c12 * b0x + c22 * b1x, c33 * b2x
+                q0y, q1y, q2y = c11 * b0y + c12 * b1y, c12 * b0y + c22 * b1y, c33 * b2y
+                q0z, q1z, q2z = c11 * b0z + c12 * b1z, c12 * b0z + c22 * b1z, c33 * b2z
+                geometric = s0 * au * bu + s1 * av * bv + s2 * (au * bv + av * bu)
+                o = out[e - lo, a, b]
+                o[0, 0] = a0x * q0x + a1x * q1x + a2x * q2x + geometric
+                o[0, 1] = a0x * q0y + a1x * q1y + a2x * q2y
+                o[0, 2] = a0x * q0z + a1x * q1z + a2x * q2z
+                o[1, 0] = a0y * q0x + a1y * q1x + a2y * q2x
+                o[1, 1] = a0y * q0y + a1y * q1y + a2y * q2y + geometric
+                o[1, 2] = a0y * q0z + a1y * q1z + a2y * q2z
+                o[2, 0] = a0z * q0x + a1z * q1x + a2z * q2x
+                o[2, 1] = a0z * q0y + a1z * q1y + a2z * q2y
+                o[2, 2] = a0z * q0z + a1z * q1z + a2z * q2z + geometric
+                if b > a:
+                    p = out[e - lo, b, a]
+                    for i in range(3):
+                        for j in range(3):
+                            p[j, i] = o[i, j]
+
+
+@kernel()
+def strain_and_stress(x, s, inverse, c, strain, stress):  # type: ignore[no-untyped-def]
+    """Green strain (E_uu, E_vv, E_uv) and second Piola-Kirchhoff stress [N/m] into (E, 3) arrays."""
+    for e in range(s.shape[0]):
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, e)
+        strain[e, 0], strain[e, 1], strain[e, 2] = e0, e1, 0.5 * e2
+        stress[e, 0], stress[e, 1], stress[e, 2] = s0, s1, s2
+
+
+class Membrane(Elastic):
+    """The membrane energy of all triangles.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 3); data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
+        ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
+    """
+
+    name = "membrane"
+
+    def __init__(self, elements: Elements) -> None:
+        super().__init__(elements)
+        data = elements.data
+        self._inverse, self._area, self._c = data["inverse"], data["area"], data["stiffness"]
+
+    def energies(self, x: Array) -> Array:
+        out = np.empty(self.n_owned)
+        energies(x, self.stencil, 0, self.n_owned, self._inverse, self._area, self._c, out)
+        return out
+
+    def add_gradient(self, x: Array, out: Array) -> None:
+        add_gradient(x, self.stencil, self._inverse, self._area, self._c, out)
+
+    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, exact, self._inverse, self._area, self._c, out)
+
+    def force_scale(self) -> Array:
+        """Internal force [N] that a strain of one would make, per element: the scale of round-off."""
+        stiffest: Array = np.abs(self._c).max(axis=1)
+        shortest = np.abs(self._inverse).max(axis=(1, 2))
+        return stiffest * self._area * shortest
+
+    def strain_and_stress(self, x: Array) -> tuple[Array, Array]:
+        """Green strain (E_uu, E_vv, E_uv) and stress (S_uu, S_vv, S_uv) [N/m], each (E, 3)."""
+        strain, stress = np.empty((self.n_elements, 3)), np.empty((self.n_elements, 3))
+        strain_and_stress(x, self.stencil, self._inverse, self._c, strain, stress)
+        return strain, stress

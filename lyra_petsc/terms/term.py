@@ -1,0 +1,91 @@
+"""What every term offers: pure functions on arrays. It knows neither PETSc, MPI nor files.
+
+Arrays over the points of a rank (owned first, then ghosts) have shape (n_local, 3). Gradients are
+added to all points of a stencil; what lands on ghosts is never read, since each rank has every
+element that touches a point it owns.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.elements import Elements
+
+Array = NDArray[np.float64]
+
+
+class Term(ABC):
+    """A sum over elements; ``name`` as in the registry."""
+
+    name: ClassVar[str]
+
+    def __init__(self, elements: Elements) -> None:
+        self.elements = elements
+        self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
+        self.n_elements = len(self.stencil)
+        self.n_owned = elements.n_owned
+
+
+class Elastic(Term):
+    """An energy of the positions; its force is minus the gradient."""
+
+    #: whether stiffness-proportional damping acts through this term
+    damped: ClassVar[bool] = True
+
+    @abstractmethod
+    def energies(self, x: Array) -> Array:
+        """Energy [J] of each owned element, (n_owned,)."""
+
+    @abstractmethod
+    def add_gradient(self, x: Array, out: Array) -> None:
+        """Add the gradient [N] to ``out`` (n_local, 3)."""
+
+    @abstractmethod
+    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
+        """Hessian blocks [N/m] of elements lo..hi into ``out`` (hi − lo, n, n, 3, 3).
+
+        ``exact`` false gives the regularised, positive-semidefinite one.
+        """
+
+    @abstractmethod
+    def force_scale(self) -> Array:
+        """Force [N] whose relative round-off each element's force carries, (E,)."""
+
+    def prepare(self, time: float) -> None:  # noqa: B027
+        """Set what depends on the time [s] at the end of the coming step (moving targets)."""
+
+
+class Viscous(Term):
+    """A potential of the velocities, with the geometry frozen at the start of the step."""
+
+    @abstractmethod
+    def freeze(self, x: Array, v: Array) -> None:
+        """Take the geometry from the positions (n_local, 3) at the start of the step."""
+
+    @abstractmethod
+    def potentials(self, v: Array) -> Array:
+        """Potential [W] of each owned element, (n_owned,); its gradient is minus the force."""
+
+    @abstractmethod
+    def add_gradient(self, v: Array, out: Array) -> None:
+        """Add the gradient with respect to velocity [N] to ``out``."""
+
+    @abstractmethod
+    def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
+        """Hessian blocks [N s/m] with respect to velocity into ``out`` (hi − lo, n, n, 3, 3)."""
+
+
+class Load(Term):
+    """A force that does not change within a step."""
+
+    @abstractmethod
+    def add_force(self, x: Array, time: float, out: Array) -> None:
+        """Add the force [N], for the step that starts at positions x and ends at ``time``, to ``out``."""
+
+    def potential(self, x: Array) -> float:
+        """Potential energy [J] of this rank's elements where the load has one, else 0."""
+        return 0.0
