@@ -1,0 +1,157 @@
+"""The scene: every key, its unit, its range and its default.
+
+Attribute names are the keys of the scene file, except ``from``, which Python calls
+``start``. SI units throughout. Blocks are frozen; ``None`` means the key is absent and its
+term is off.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+from typing_extensions import Self
+
+from lyra_petsc.scene.block import Block, nearest
+from lyra_petsc.scene.control import Output, PetscValue, Solver, Time, petsc_options
+from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
+from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
+from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
+
+__all__ = [
+    "Grid",
+    "Handle",
+    "Initial",
+    "Keyframe",
+    "Load",
+    "Material",
+    "Membrane",
+    "MeshSource",
+    "Output",
+    "Rotation",
+    "Scene",
+    "Selector",
+    "Solver",
+    "Time",
+    "Transform",
+    "Vec3",
+    "Wind",
+]
+
+
+def _one_or_many(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        if not value:
+            raise problem("must hold at least one entry")
+        return list(value)
+    return [value]
+
+
+def _many(value: Any) -> Any:
+    if isinstance(value, dict):
+        raise problem("must be a list; put '- ' before the entry")
+    if not isinstance(value, (list, tuple)):
+        raise problem(f"must be a list, not {shown(value)}")
+    return list(value)
+
+
+def _named(value: Any) -> Any:
+    if not isinstance(value, dict):
+        raise problem(f"must be a block of names, not {shown(value)}")
+    return value
+
+
+class Scene(Block):
+    """Everything a run is told.
+
+    Attributes
+    ----------
+    title : str
+    mesh : list of MeshSource
+        Sheets, vertices numbered consecutively.
+    material : list of Material
+        At most one without a group: it serves the triangles that no other block names.
+    gravity : (3,) [m/s²] or None
+    wind : Wind or None
+    handles : list of Handle
+    motions : dict of list of Keyframe
+        By name; times strictly ascending.
+    loads : list of Load
+    initial : Initial or None
+    time : Time
+    output : Output
+    probes : dict of Selector
+    solver : Solver
+    petsc : dict
+        PETSc options without the leading dash; None is an option without a value.
+    """
+
+    title: Text = ""
+    mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
+    material: Annotated[list[Material], BeforeValidator(_one_or_many)]
+    gravity: Vector | None = None
+    wind: Wind | None = None
+    handles: Annotated[list[Handle], BeforeValidator(_many)] = Field(default_factory=list)
+    motions: Annotated[
+        dict[Name, Annotated[list[Keyframe], BeforeValidator(_many)]], BeforeValidator(_named)
+    ] = Field(default_factory=dict)
+    loads: Annotated[list[Load], BeforeValidator(_many)] = Field(default_factory=list)
+    initial: Initial | None = None
+    time: Time
+    output: Output = Field(default_factory=Output)
+    probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
+    solver: Solver = Field(default_factory=Solver)
+    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options)] = Field(default_factory=dict)
+
+    _source: Path | None = PrivateAttr(default=None)
+
+    @property
+    def source(self) -> Path | None:
+        """The file this scene was read from, for messages; no part of its value."""
+        return self._source
+
+    def __eq__(self, other: object) -> bool:
+        # equal in value: which file it came from does not count
+        return isinstance(other, Scene) and self.model_dump() == other.model_dump()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> Self:
+        for name, keyframes in self.motions.items():
+            if not keyframes:
+                raise problem("must hold at least one keyframe", "motions", name)
+            for i in range(1, len(keyframes)):
+                if keyframes[i].time <= keyframes[i - 1].time:
+                    raise problem(
+                        f"must be later than the keyframe before ({keyframes[i - 1].time:g} s),"
+                        f" not {keyframes[i].time:g}",
+                        "motions",
+                        name,
+                        i,
+                        "time",
+                    )
+        for i, handle in enumerate(self.handles):
+            if handle.motion is not None and handle.motion not in self.motions:
+                raise problem(
+                    f"unknown motion {handle.motion!r}, {nearest(handle.motion, self.motions)}",
+                    "handles",
+                    i,
+                    "motion",
+                )
+        groups: set[str | None] = set()
+        for i, material in enumerate(self.material):
+            if material.group in groups:
+                what = (
+                    f"group {material.group!r}"
+                    if material.group
+                    else "triangles without a group of their own"
+                )
+                raise problem(f"is a second material for the {what}", "material", i, "group")
+            groups.add(material.group)
+        names = [source.name for source in self.mesh]
+        for i, name in enumerate(names):
+            if name is not None and name in names[:i]:
+                raise problem(f"{name!r} is the name of an earlier sheet too", "mesh", i, "name")
+        return self

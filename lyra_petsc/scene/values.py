@@ -1,0 +1,170 @@
+"""Checked values that scene keys are made of: numbers, vectors, scales, names.
+
+Each is strict: text is not taken for a number, nor a yes for a one, and nothing is NaN or
+infinite. The messages say what is wrong and what is allowed; the key is added by
+``scene.messages``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any
+
+from pydantic import PlainValidator
+from pydantic_core import PydanticCustomError
+
+Vec3 = tuple[float, float, float]
+
+# Largest vertex number that every index type downstream can hold.
+LARGEST_INDEX = 2**31 - 2
+
+
+def problem(message: str, *at: str | int) -> PydanticCustomError:
+    """Error of a scene value; ``at`` is the key below the block that is being checked."""
+    # braces in user text would be taken for a template
+    return PydanticCustomError("scene", "{message}", {"message": message, "at": list(at), "problem": True})
+
+
+def shown(value: object) -> str:
+    """``value`` as one short piece of a message."""
+    if value is None:
+        return "empty"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return f"a very long {type(value).__name__}"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def number(value: Any) -> float:
+    """``value`` as a finite float; bool, text and NaN are refused."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        hint = ""
+        if isinstance(value, str):
+            hint = " (text; write it without quotes)" if _reads_as_number(value) else " (text)"
+        raise problem(f"must be a number, not {shown(value)}{hint}")
+    try:
+        result = float(value)
+    except OverflowError:
+        raise problem("must be a number below 1.8e308") from None
+    if not math.isfinite(result):
+        raise problem(f"must be a finite number, not {shown(value)}")
+    return result
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _bounded(check: Callable[[float], bool], allowed: str) -> Callable[[Any], float]:
+    def validate(value: Any) -> float:
+        result = number(value)
+        if not check(result):
+            raise problem(f"must be {allowed}, not {shown(value)}")
+        return result
+
+    return validate
+
+
+def _until(value: Any) -> float:
+    # "never" may be said outright
+    return math.inf if value == math.inf and isinstance(value, float) else number(value)
+
+
+def vector(value: Any) -> Vec3:
+    """``value`` as three finite floats."""
+    if not isinstance(value, (list, tuple)) or len(value) != 3:
+        raise problem(f"must be three numbers like [0, 0, 1], not {shown(value)}")
+    x, y, z = (number(component) for component in value)
+    return x, y, z
+
+
+def _axis(value: Any) -> Vec3:
+    axis = vector(value)
+    if math.hypot(*axis) < 1e-150:
+        raise problem("must be a direction, not a zero vector")
+    return axis
+
+
+def _scale(value: Any) -> float | Vec3:
+    scale = vector(value) if isinstance(value, (list, tuple)) else number(value)
+    if 0.0 in (scale if isinstance(scale, tuple) else (scale,)):
+        raise problem("must not be 0")
+    return scale
+
+
+def _positive_scale(value: Any) -> float | Vec3:
+    scale = _scale(value)
+    if min(scale if isinstance(scale, tuple) else (scale,)) < 0:
+        raise problem(f"must be > 0, not {shown(value)}")
+    return scale
+
+
+def _integer(lowest: int, highest: int) -> Callable[[Any], int]:
+    def validate(value: Any) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise problem(f"must be a whole number, not {shown(value)}")
+        if value < lowest:
+            raise problem(f"must be a whole number >= {lowest}, not {shown(value)}")
+        if value > highest:
+            raise problem(f"must be a whole number <= {highest}, not {shown(value)}")
+        return value
+
+    return validate
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise problem(f"must be text, not {shown(value)} (put it in quotes)")
+    if "\0" in value:
+        raise problem("must be text without null characters")
+    return value
+
+
+def _name(value: Any) -> str:
+    # a gmsh group without a name is called by its number
+    if isinstance(value, int) and not isinstance(value, bool):
+        value = shown(value)
+    name = _text(value)
+    if not name.strip():
+        raise problem("must be a name, not empty text")
+    return name
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise problem(f"must be true or false, not {shown(value)}")
+    return value
+
+
+def _bending(value: Any) -> float | Vec3:
+    """One stiffness, or one for hinge edges at 0°, 45° and 90° to the warp."""
+    given = vector(value) if isinstance(value, (list, tuple)) else number(value)
+    if min(given if isinstance(given, tuple) else (given,)) < 0:
+        raise problem(f"must be >= 0 [N·m], not {shown(value)}")
+    return given
+
+
+Number = Annotated[float, PlainValidator(number)]
+Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0"))]
+NonNegative = Annotated[float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0"))]
+Poisson = Annotated[float, PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]"))]
+Until = Annotated[float, PlainValidator(_until)]
+Vector = Annotated[Vec3, PlainValidator(vector)]
+Axis = Annotated[Vec3, PlainValidator(_axis)]
+Scale = Annotated[float | Vec3, PlainValidator(_scale)]
+PositiveScale = Annotated[float | Vec3, PlainValidator(_positive_scale)]
+Bending = Annotated[float | Vec3, PlainValidator(_bending)]
+Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX))]
+Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX))]
+Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1))]
+Text = Annotated[str, PlainValidator(_text)]
+Name = Annotated[str, PlainValidator(_name)]
+Flag = Annotated[bool, PlainValidator(_flag)]
