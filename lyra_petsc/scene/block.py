@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
+from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.values import problem, shown
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """The end of an "unknown" message: the nearest of ``known``, else all of them."""
-    names = sorted(known)
-    by_lower = {name.lower(): name for name in names}
-    match = difflib.get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)
-    if match:
-        return f"did you mean {by_lower[match[0]]!r}?"
-    return f"known: {', '.join(names)}" if names else "none are known"
 
 
 class Block(BaseModel):
@@ -41,10 +30,11 @@ class Block(BaseModel):
             return data
         if not isinstance(data, dict):
             raise problem(f"must be a block with keys ({', '.join(cls.keys())}), not {shown(data)}")
+        known = cls.keys()
         for key in data:
-            if key not in cls.keys():
+            if key not in known:
                 word = key if isinstance(key, str) else shown(key)
-                raise problem(f"unknown key, {nearest(word, cls.keys())}", word)
+                raise problem(f"unknown key, {nearest(word, known)}", word)
         kept = {key: value for key, value in data.items() if value is not None or key in cls.null_is_a_value}
         return cls.complete(kept)
 

@@ -7,7 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, PlainValidator, field_validator
 
-from lyra_petsc.scene.block import Block, nearest
+from lyra_petsc.nearest import nearest
+from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.values import Count, Flag, Positive, number, problem, shown
 
 INTEGRATORS = ("beuler", "semi-implicit")

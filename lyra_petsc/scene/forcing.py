@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
@@ -27,7 +28,8 @@ from lyra_petsc.scene.values import (
     vector,
 )
 
-AXES = ("x", "y", "z")
+Direction = Literal["x", "y", "z"]
+AXES: tuple[Direction, ...] = ("x", "y", "z")
 
 
 class Wind(Block):
@@ -63,8 +65,7 @@ class _Vertices(Block):
     @classmethod
     def _each_once(cls, nodes: list[int] | None) -> list[int] | None:
         if nodes is not None and len(set(nodes)) != len(nodes):
-            seen: set[int] = set()
-            twice = next(node for node in nodes if node in seen or seen.add(node))
+            twice = Counter(nodes).most_common(1)[0][0]
             raise problem(f"lists vertex {twice} twice")
         return nodes
 
@@ -125,7 +126,7 @@ class Handle(Selector):
         Per vertex and axis: a spring instead of a constraint.
     """
 
-    axes: tuple[Literal["x", "y", "z"], ...] = AXES
+    axes: tuple[Direction, ...] = AXES
     clamp: Flag = False
     motion: Name | None = None
     interpolation: Literal["hermite", "linear"] = "hermite"

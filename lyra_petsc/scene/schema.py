@@ -13,7 +13,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 from typing_extensions import Self
 
-from lyra_petsc.scene.block import Block, nearest
+from lyra_petsc.nearest import nearest
+from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.control import Output, PetscValue, Solver, Time, petsc_options
 from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
@@ -151,7 +152,7 @@ class Scene(Block):
                 raise problem(f"is a second material for the {what}", "material", i, "group")
             groups.add(material.group)
         names = [source.name for source in self.mesh]
-        for i, name in enumerate(names):
-            if name is not None and name in names[:i]:
-                raise problem(f"{name!r} is the name of an earlier sheet too", "mesh", i, "name")
+        for i, sheet in enumerate(names):
+            if sheet is not None and sheet in names[:i]:
+                raise problem(f"{sheet!r} is the name of an earlier sheet too", "mesh", i, "name")
         return self

@@ -8,6 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
+from lyra_petsc.materials.tables import names
+from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.values import (
     LARGEST_INDEX,
@@ -211,6 +213,13 @@ class Material(Block):
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Numbers without ``bending`` mean a membrane: the zero is written out."""
         return {**data, "bending": 0.0} if "membrane" in data and "bending" not in data else data
+
+    @field_validator("cloth")
+    @classmethod
+    def _in_a_library(cls, cloth: str | None) -> str | None:
+        if cloth is not None and cloth not in names():
+            raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, names())}")
+        return cloth
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
