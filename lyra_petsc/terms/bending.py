@@ -11,11 +11,13 @@ the cylindrical bending stiffness on meshes whose lines run along the bend (k �
 from __future__ import annotations
 
 import numpy as np
-from lyra_petsc.terms.kernel import kernel
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.partition.elements import Elements
 from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
+from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
@@ -101,3 +103,103 @@ class Bending(Elastic):
     def force_scale(self) -> Array:
         scale: Array = self._k / self.elements.data["rest_height"]
         return scale
+
+
+def _corners_of(triangles: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which corner (0, 1, 2) of each triangle (n, 3) each vertex (n,) is."""
+    return np.argmax(triangles == vertices[:, None], axis=1)
+
+
+def edge_in_material(
+    rest: RestShape, triangle: NDArray[np.int64], tail: NDArray[np.int64], head: NDArray[np.int64]
+) -> tuple[Array, Array]:
+    """An edge (tail → head) of each triangle in its material plane.
+
+    Returns
+    -------
+    edge : (n, 2) float64
+        Its material vector [m], warp axis first.
+    stiffness : (n,) float64
+        B [N·m] of the triangle's material for that direction.
+    """
+    corners, uv = rest.mesh.triangles[triangle], rest.mesh.triangle_uv[triangle]
+    row = np.arange(len(triangle))
+    edge = uv[row, _corners_of(corners, head)] - uv[row, _corners_of(corners, tail)]
+    warp = np.radians(rest.per_triangle("warp_degrees")[triangle])
+    cosine, sine = np.cos(warp), np.sin(warp)
+    edge = np.stack([cosine * edge[:, 0] + sine * edge[:, 1], cosine * edge[:, 1] - sine * edge[:, 0]], axis=1)
+    direction = np.degrees(np.arctan2(np.abs(edge[:, 1]), np.abs(edge[:, 0])))
+    stiffness = np.zeros(len(triangle))
+    for number, shell in enumerate(rest.shells):
+        mine = rest.shell_of[triangle] == number
+        stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)
+    return edge, stiffness
+
+
+def _foot_and_height(rest: RestShape, triangle: NDArray[np.int64], quad: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Of the opposite vertex over the edge: distance of its foot from the tail and its height [m]."""
+    tail, head, opposite = quad.T
+    edge, _ = edge_in_material(rest, triangle, tail, head)
+    side, _ = edge_in_material(rest, triangle, tail, opposite)
+    length = np.linalg.norm(edge, axis=1)
+    along = (side * edge).sum(axis=1) / length
+    height = np.abs(side[:, 1] * edge[:, 0] - side[:, 0] * edge[:, 1]) / length
+    return along, height
+
+
+def _angles_from_curvature(rest: RestShape, quad: NDArray[np.int64], triangles: NDArray[np.int64]) -> Array:
+    """Rest angles of the piecewise linear interpolant of z = ½ rᵀ κ r, κ the materials' rest curvature.
+
+    Positive curvature raises the sheet towards its normal, which makes the angle negative.
+    """
+    curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells])
+    k11, k22, k12 = curved[rest.shell_of[triangles[:, 0]]].T
+    edge, _ = edge_in_material(rest, triangles[:, 0], quad[:, 0], quad[:, 1])
+    length = np.linalg.norm(edge, axis=1)
+    t = edge / length[:, None]
+    # κ in the frame (edge, across)
+    ee = k11 * t[:, 0] ** 2 + 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 1] ** 2
+    nn = k11 * t[:, 1] ** 2 - 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 0] ** 2
+    en = (k22 - k11) * t[:, 0] * t[:, 1] + k12 * (t[:, 0] ** 2 - t[:, 1] ** 2)
+    angle = np.zeros(len(quad))
+    for side, column, sign in ((0, 2, 1.0), (1, 3, -1.0)):
+        along, height = _foot_and_height(rest, triangles[:, side], quad[:, [0, 1, column]])
+        z = 0.5 * (ee * along**2 + 2 * sign * en * along * height + nn * height**2)
+        angle -= (z - 0.5 * ee * along * length) / height
+    return angle
+
+
+def elements(rest: RestShape) -> Elements:
+    """All interior edges with their constants (rank 0).
+
+    Between two materials the smaller B counts, as in the original; rest lengths are means over the
+    two faces where a seam makes them differ.
+    """
+    quad, faces = rest.hinges.vertices, rest.hinges.triangles
+    edges, stiffnesses = zip(
+        *(edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1]) for side in range(2)), strict=True
+    )
+    length = 0.5 * (np.linalg.norm(edges[0], axis=1) + np.linalg.norm(edges[1], axis=1))
+    b = np.minimum(*stiffnesses)
+    areas = rest.area[faces].sum(axis=1)
+    damping = rest.per_triangle("damping")[faces].mean(axis=1)
+    rest_angle = np.zeros(len(quad))
+    surface = ~rest.mesh.flat_rest[faces].all(axis=1)
+    of_surface = np.empty(int(surface.sum()))
+    angles(rest.mesh.rest, quad[surface], len(of_surface), of_surface)
+    rest_angle[surface] = of_surface
+    if any(shell.rest_curvature for shell in rest.shells):
+        rest_angle += _angles_from_curvature(rest, quad, faces)
+    bends = b > 0.0
+    data = {
+        "k": b * length**2 / (2.0 * areas),
+        "rest_angle": rest_angle,
+        "rest_height": 2.0 * areas / length,
+        "damping": damping,
+    }
+    return Elements(quad[bends], {name: values[bends] for name, values in data.items()})
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Bending:
+    """The term on one rank."""
+    return Bending(elements)

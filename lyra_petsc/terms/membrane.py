@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from lyra_petsc.terms.kernel import kernel
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
@@ -191,3 +193,20 @@ class Membrane(Elastic):
         strain, stress = np.empty((self.n_elements, 3)), np.empty((self.n_elements, 3))
         strain_and_stress(x, self.stencil, self._inverse, self._c, strain, stress)
         return strain, stress
+
+
+def elements(rest: RestShape) -> Elements:
+    """All triangles with their constants (rank 0)."""
+    stiffness = np.array([[m.c11, m.c12, m.c22, m.c33] for m in rest.shells])
+    data = {
+        "inverse": rest.inverse,
+        "area": rest.area,
+        "stiffness": stiffness[rest.shell_of],
+        "damping": rest.per_triangle("damping"),
+    }
+    return Elements(rest.mesh.triangles, data)
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Membrane:
+    """The term on one rank."""
+    return Membrane(elements)

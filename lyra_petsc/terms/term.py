@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.elements import Elements
+from lyra_petsc.partition.elements import Elements
 
 Array = NDArray[np.float64]
 
@@ -55,8 +55,11 @@ class Elastic(Term):
     def force_scale(self) -> Array:
         """Force [N] whose relative round-off each element's force carries, (E,)."""
 
-    def prepare(self, time: float) -> None:  # noqa: B027
-        """Set what depends on the time [s] at the end of the coming step (moving targets)."""
+    def begin(self, time: float, x: Array) -> None:  # noqa: B027
+        """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""
+
+    def prepare(self, t0: float, t1: float) -> None:  # noqa: B027
+        """Set what depends on time for the step from t0 to t1 [s] (moving targets)."""
 
 
 class Viscous(Term):
@@ -83,8 +86,8 @@ class Load(Term):
     """A force that does not change within a step."""
 
     @abstractmethod
-    def add_force(self, x: Array, time: float, out: Array) -> None:
-        """Add the force [N], for the step that starts at positions x and ends at ``time``, to ``out``."""
+    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        """Add the force [N] of the step from t0 to t1 [s] that starts at positions x to ``out``."""
 
     def potential(self, x: Array) -> float:
         """Potential energy [J] of this rank's elements where the load has one, else 0."""

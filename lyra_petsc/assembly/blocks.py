@@ -1,0 +1,122 @@
+"""Values of the block rows a rank owns: sums of element blocks, products, constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lyra_petsc.assembly.pattern import BlockPattern
+
+Array = NDArray[np.float64]
+Fill = Callable[[int, int, Array], None]
+
+CHUNK_VALUES = 32_768
+"""Scalars of element blocks computed before they are scattered: they stay in cache."""
+
+
+@njit(cache=True)
+def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
+    """values[offsets[e, a, b]] += weight[e] blocks[e, a, b]."""
+    for e in range(offsets.shape[0]):
+        w = weight[e]
+        for a in range(offsets.shape[1]):
+            for b in range(offsets.shape[2]):
+                k = offsets[e, a, b]
+                if k >= 0:
+                    for i in range(3):
+                        for j in range(3):
+                            values[k, i, j] += w * blocks[e, a, b, i, j]
+
+
+@njit(cache=True)
+def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
+    """out (n_owned, 3) = values · x (n_local, 3)."""
+    for row in range(len(indptr) - 1):
+        s0 = s1 = s2 = 0.0
+        for k in range(indptr[row], indptr[row + 1]):
+            c = columns[k]
+            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
+            s0 += values[k, 0, 0] * x0 + values[k, 0, 1] * x1 + values[k, 0, 2] * x2
+            s1 += values[k, 1, 0] * x0 + values[k, 1, 1] * x1 + values[k, 1, 2] * x2
+            s2 += values[k, 2, 0] * x0 + values[k, 2, 1] * x1 + values[k, 2, 2] * x2
+        out[row, 0], out[row, 1], out[row, 2] = s0, s1, s2
+
+
+@njit(cache=True)
+def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyped-def]
+    """Zero the rows and columns of prescribed coordinates, but for their diagonal entries."""
+    for t in range(len(touched)):
+        row = touched[t]
+        for k in range(indptr[row], indptr[row + 1]):
+            c = columns[k]
+            for i in range(3):
+                for j in range(3):
+                    if (mask[row, i] or mask[c, j]) and not (row == c and i == j):
+                        values[k, i, j] = 0.0
+
+
+class BlockRows:
+    """Adds element Hessians into block rows, and works on these rows.
+
+    Attributes
+    ----------
+    values : (n_blocks, 3, 3) float64
+        In the order of ``pattern``. Every method that takes ``values`` works on such an array.
+    """
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self.pattern = pattern
+
+    def zeros(self) -> Array:
+        """A new array of values (n_blocks, 3, 3), all zero."""
+        return np.zeros((self.pattern.n_blocks, 3, 3))
+
+    def add(self, name: str, fill: Fill, weight: Array | float, values: Array) -> None:
+        """Add weight × element blocks of the term ``name``.
+
+        Parameters
+        ----------
+        name : str
+            A name among the pattern's stencils.
+        fill : callable (lo, hi, out)
+            Computes the blocks of elements lo..hi into ``out`` (hi − lo, n, n, 3, 3).
+        weight : float or (E,)
+        values : (n_blocks, 3, 3)
+        """
+        offsets = self.pattern.offsets[name]
+        n_elements, n = offsets.shape[:2]
+        chunk = max(1, CHUNK_VALUES // (9 * n * n))
+        buffer = np.empty((min(chunk, n_elements), n, n, 3, 3))
+        weights = np.broadcast_to(np.asarray(weight, dtype=np.float64), (n_elements,))
+        for lo in range(0, n_elements, chunk):
+            hi = min(lo + chunk, n_elements)
+            blocks = buffer[: hi - lo]
+            fill(lo, hi, blocks)
+            _scatter(blocks, offsets[lo:hi], weights[lo:hi], values)
+
+    def add_diagonal(self, diagonal: Array, values: Array) -> None:
+        """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""
+        for axis in range(3):
+            values[self.pattern.diagonal, axis, axis] += diagonal
+
+    def product(self, values: Array, x: Array) -> Array:
+        """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
+        out = np.empty((len(self.pattern.indptr) - 1, 3))
+        _product(self.pattern.indptr, self.pattern.columns, values, x, out)
+        return out
+
+    def rows_beside(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Rows with a block whose row or column point has a prescribed coordinate; mask (n_local, 3)."""
+        held = mask.any(axis=1)
+        rows = np.repeat(np.arange(len(self.pattern.indptr) - 1), np.diff(self.pattern.indptr))
+        return np.unique(rows[held[self.pattern.columns] | held[rows]])
+
+    def constrain(self, values: Array, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> None:
+        """Decouple prescribed coordinates, keeping their own diagonal entries.
+
+        The diagonal of the size of its neighbours is what multigrid and incomplete factors need.
+        """
+        _constrain(self.pattern.indptr, self.pattern.columns, rows, mask, values)

@@ -1,0 +1,68 @@
+"""The one PETSc matrix of a run, and the transfer of block rows into it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.partition.points import Points
+
+
+class SystemMatrix:
+    """A symmetric matrix of 3×3 blocks with the couplings of a pattern.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+    kind : str
+        PETSc matrix type where ``-mat_type`` says nothing (``baij``, ``aij``, ``sbaij``).
+
+    Attributes
+    ----------
+    mat : PETSc.Mat
+    """
+
+    def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
+        comm, rows = points.comm, 3 * points.n_owned
+        self.mat = PETSc.Mat().create(comm)
+        self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
+        self.mat.setType(kind)
+        self.mat.setFromOptions()
+        self._indptr = pattern.indptr.astype(PETSc.IntType)
+        self._columns = points.global_number[pattern.columns].astype(PETSc.IntType)
+        self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
+        self._preallocate(pattern, points)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if self.kind == "sbaij":
+            self._keep_upper(points)
+        self.mat.setUp()
+
+    def _preallocate(self, pattern: BlockPattern, points: Points) -> None:
+        local = pattern.columns < points.n_owned
+        row = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr))
+        inside = np.bincount(row[local], minlength=points.n_owned).astype(PETSc.IntType)
+        outside = np.bincount(row[~local], minlength=points.n_owned).astype(PETSc.IntType)
+        if self.kind == "aij":
+            inside, outside = np.repeat(3 * inside, 3), np.repeat(3 * outside, 3)
+        self.mat.setPreallocationNNZ((inside, outside) if points.comm.size > 1 else inside)
+
+    def _keep_upper(self, points: Points) -> None:
+        row = np.repeat(np.arange(points.n_owned), np.diff(self._indptr)) + points.start
+        self._upper: NDArray[np.bool_] | None = self._columns >= row
+        counts = np.bincount(row[self._upper] - points.start, minlength=points.n_owned)
+        self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
+        self._columns = self._columns[self._upper]
+
+    def set(self, values: NDArray[np.float64]) -> None:
+        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+        if self.kind == "sbaij":
+            values = values[self._upper]
+        self.mat.setValuesBlockedCSR(self._indptr, self._columns, values, PETSc.InsertMode.INSERT)
+        self.mat.assemble()
+
+    def destroy(self) -> None:
+        """Free the matrix; collective."""
+        self.mat.destroy()

@@ -1,0 +1,84 @@
+"""Handles as exact constraints: which coordinates are prescribed in a step, and where to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.handles.motion import Motion, Window, motion_of
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.meshing.select import select_vertices
+from lyra_petsc.scene.schema import Handle, Scene
+
+Array = NDArray[np.float64]
+Selection = dict[int, NDArray[np.int64]]
+
+
+def is_exact(handle: Handle) -> bool:
+    """Whether a handle is a constraint (else it is a spring, see ``terms.spring``)."""
+    return handle.stiffness is None
+
+
+def select_held(scene: Scene, mesh: Mesh) -> Selection:
+    """Vertices of every exact handle of a scene, by its number, on the whole mesh (rank 0)."""
+    return {
+        number: select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)
+        for number, handle in enumerate(scene.handles)
+        if is_exact(handle)
+    }
+
+
+class Held:
+    """The exact handles of a scene on one rank.
+
+    Where two handles prescribe the same coordinate at the same time, the later one in the scene counts.
+
+    Parameters
+    ----------
+    scene : Scene
+    owned : mapping of handle number → (n,) int
+        Owned vertices of each exact handle, local numbering.
+    """
+
+    def __init__(self, scene: Scene, owned: Selection) -> None:
+        self._vertices = owned
+        self._axes = {number: list(scene.handles[number].axis_numbers) for number in owned}
+        self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
+        self._windows = {number: Window.of(scene.handles[number]) for number in owned}
+        self._start: dict[int, Array] = {number: np.zeros((len(v), 3)) for number, v in owned.items()}
+
+    def __bool__(self) -> bool:
+        return bool(self._vertices)
+
+    def begin(self, time: float, x: Array) -> None:
+        """Take the positions x (n_local, 3) from which handles that start at ``time`` [s] set out."""
+        for number, window in self._windows.items():
+            if window.start == time:
+                self._start[number] = x[self._vertices[number]].copy()
+
+    def active(self, t0: float, t1: float) -> tuple[int, ...]:
+        """Numbers of the handles that hold through the step from t0 to t1 [s]."""
+        return tuple(number for number, window in self._windows.items() if window.holds(t0, t1))
+
+    def mask(self, t0: float, t1: float, n_owned: int) -> NDArray[np.bool_]:
+        """Prescribed coordinates (n_owned, 3) of the step from t0 to t1 [s]."""
+        mask = np.zeros((n_owned, 3), dtype=bool)
+        for number in self.active(t0, t1):
+            mask[np.ix_(self._vertices[number], self._axes[number])] = True
+        return mask
+
+    def targets(self, t0: float, t1: float, out: Array) -> None:
+        """Write the positions [m] prescribed at t1 into ``out`` (n_owned, 3)."""
+        for number in self.active(t0, t1):
+            goal = self._motions[number].carried(self._start[number], self._windows[number].start, t1)
+            out[np.ix_(self._vertices[number], self._axes[number])] = goal[:, self._axes[number]]
+
+    def velocities(self, t0: float, t1: float, out: Array) -> None:
+        """Write the velocities [m/s] ẋ*(t1) into ``out`` (n_owned, 3)."""
+        for number in self.active(t0, t1):
+            rate = self._motions[number].velocity(self._start[number], self._windows[number].start, t1)
+            out[np.ix_(self._vertices[number], self._axes[number])] = rate[:, self._axes[number]]
+
+    def vertices(self, number: int) -> NDArray[np.int64]:
+        """Owned vertices of a handle, local numbering."""
+        return self._vertices[number]

@@ -1,0 +1,113 @@
+"""Which rank owns which vertex: a graph partitioner run by PETSc; and an ordering for locality."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+Ints = NDArray[np.int64]
+Graph = tuple[Ints, Ints]
+
+PREFERRED = ("ptscotch", "parmetis", "chaco", "party")
+
+
+def vertex_graph(stencils: list[Ints], n_vertices: int) -> Graph:
+    """Adjacency (row offsets (V+1,), neighbours) of vertices that share an element, without loops."""
+    keys = []
+    for stencil in stencils:
+        n = stencil.shape[1]
+        for a in range(n):
+            for b in range(n):
+                if a != b:
+                    keys.append(stencil[:, a].astype(np.int64) * n_vertices + stencil[:, b])
+    unique = np.unique(np.concatenate(keys)) if keys else np.empty(0, dtype=np.int64)
+    rows, columns = np.divmod(unique, max(n_vertices, 1))
+    offsets = np.zeros(n_vertices + 1, dtype=np.int64)
+    np.cumsum(np.bincount(rows, minlength=n_vertices), out=offsets[1:])
+    return offsets, columns
+
+
+def _matrix(comm: MPI.Comm, graph: Graph, n_columns: int) -> PETSc.Mat:
+    offsets, neighbours = (part.astype(PETSc.IntType) for part in graph)
+    rows = len(offsets) - 1
+    size = ((rows, n_columns), (rows, n_columns)) if comm.size > 1 else (rows, n_columns)
+    return PETSc.Mat().createAIJ(size, csr=(offsets, neighbours, np.ones(len(neighbours))), comm=comm)
+
+
+def locality_order(graph: Graph) -> Ints:
+    """Reverse Cuthill-McKee: position of each vertex in an order that keeps neighbours near."""
+    n = len(graph[0]) - 1
+    matrix = _matrix(MPI.COMM_SELF, graph, n)
+    permutation, other = matrix.getOrdering("rcm")
+    order = permutation.getIndices().astype(np.int64)
+    for item in (permutation, other, matrix):
+        item.destroy()
+    position = np.empty(n, dtype=np.int64)
+    position[order] = np.arange(n)
+    return position
+
+
+def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Ints | None, str]:
+    """Owning rank of each vertex; collective.
+
+    The partitioner is the best that this PETSc has (PT-Scotch, ParMETIS, …), or what
+    ``-mat_partitioning_type`` says.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    graph : (offsets, neighbours)
+        The whole graph, on rank 0; None elsewhere.
+    n_vertices : int
+        V, on all ranks.
+
+    Returns
+    -------
+    owner : (V,) int64 on rank 0, None elsewhere
+    name : str
+        The partitioner used.
+    """
+    if comm.size == 1:
+        return np.zeros(n_vertices, dtype=np.int64), "none (one rank)"
+    bounds = n_vertices * np.arange(comm.size + 1, dtype=np.int64) // comm.size
+    mine = _scatter_rows(comm, graph, bounds)
+    matrix = _matrix(comm, mine, n_vertices)
+    partitioning = PETSc.MatPartitioning().create(comm)
+    partitioning.setAdjacency(matrix)
+    name = _choose(partitioning)
+    parts = PETSc.IS()
+    partitioning.apply(parts)
+    pieces = comm.gather(parts.getIndices().astype(np.int64), root=0)
+    for item in (parts, partitioning, matrix):
+        item.destroy()
+    return (np.concatenate(pieces) if pieces is not None else None), name
+
+
+def _choose(partitioning: PETSc.MatPartitioning) -> str:
+    asked = PETSc.Options().getString("mat_partitioning_type", "")
+    for name in (asked,) if asked else PREFERRED:
+        try:
+            partitioning.setType(name)
+        except PETSc.Error:
+            continue
+        partitioning.setFromOptions()
+        return str(partitioning.getType())
+    # "average" cuts the numbering into equal pieces, which the locality order makes compact
+    partitioning.setType("average")
+    return "average"
+
+
+def _scatter_rows(comm: MPI.Comm, graph: Graph | None, bounds: Ints) -> Graph:
+    if comm.rank == 0:
+        assert graph is not None
+        offsets, neighbours = graph
+        for rank in range(comm.size - 1, -1, -1):
+            lo, hi = bounds[rank], bounds[rank + 1]
+            piece = offsets[lo : hi + 1] - offsets[lo], neighbours[offsets[lo] : offsets[hi]]
+            if rank:
+                comm.send(piece, dest=rank)
+        return piece
+    received: Graph = comm.recv(source=0)
+    return received

@@ -1,0 +1,118 @@
+"""Owned and ghost points of one kind on a rank, and how several kinds share one vector.
+
+Vertices are the kind that exists today; edges are numbered by the same code when a term needs
+unknowns on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Numbering:
+    """Global numbering of one kind of point on rank 0: contiguous per rank.
+
+    Attributes
+    ----------
+    owner : (N,) int64
+        Owning rank of each point of the mesh.
+    number : (N,) int64
+        New global number of each; rank r owns ``bounds[r]`` to ``bounds[r + 1]``.
+    bounds : (ranks + 1,) int64
+    """
+
+    owner: Ints
+    number: Ints
+    bounds: Ints
+
+    @classmethod
+    def build(cls, owner: Ints, position: Ints, n_ranks: int) -> Numbering:
+        """Number by owner, within an owner by ``position`` (N,), an order that keeps neighbours near."""
+        order = np.lexsort((position, owner))
+        number = np.empty(len(owner), dtype=np.int64)
+        number[order] = np.arange(len(owner))
+        bounds = np.zeros(n_ranks + 1, dtype=np.int64)
+        np.cumsum(np.bincount(owner, minlength=n_ranks), out=bounds[1:])
+        return cls(owner, number, bounds)
+
+
+class Points:
+    """Points of one kind on a rank: owned first, then ghosts (others' points that its elements touch).
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    bounds : (ranks + 1,) int64
+        First global number of each rank's points, and N.
+    ghosts : (n_ghost,) int64
+        Global numbers of the ghosts, ascending.
+    original : (n_owned,) int64
+        Index of each owned point in the mesh (file order).
+    """
+
+    def __init__(self, comm: MPI.Comm, bounds: Ints, ghosts: Ints, original: Ints) -> None:
+        self.comm, self.bounds, self.ghosts, self.original = comm, bounds, ghosts, original
+        self.n_global = int(bounds[-1])
+        self.start = int(bounds[comm.rank])
+        self.n_owned = int(bounds[comm.rank + 1]) - self.start
+        self.n_local = self.n_owned + len(ghosts)
+        ranks = np.searchsorted(bounds, ghosts, side="right") - 1
+        remote = np.column_stack([ranks, ghosts - bounds[ranks]]).astype(PETSc.IntType)
+        self._forest = PETSc.SF().create(comm)
+        self._forest.setGraph(self.n_owned, None, remote)
+        self._triple = MPI.DOUBLE.Create_contiguous(3).Commit()
+
+    @property
+    def global_number(self) -> Ints:
+        """Global number of each local point, (n_local,)."""
+        owned = np.arange(self.start, self.start + self.n_owned, dtype=np.int64)
+        return np.concatenate([owned, self.ghosts])
+
+    def update_ghosts(self, values: NDArray[np.float64]) -> None:
+        """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
+        if self.comm.size == 1:
+            return
+        owned, ghosts = values[: self.n_owned], values[self.n_owned :]
+        self._forest.bcastBegin(self._triple, owned, ghosts, MPI.REPLACE)
+        self._forest.bcastEnd(self._triple, owned, ghosts, MPI.REPLACE)
+
+    def destroy(self) -> None:
+        """Free the communication objects; collective."""
+        self._forest.destroy()
+        self._triple.Free()
+
+
+class Layout:
+    """Where the unknowns of several kinds of points stand in one global vector.
+
+    On every rank the unknowns of the first kind come first, then those of the second, and so on.
+
+    Parameters
+    ----------
+    fields : sequence of (bounds, components)
+        The ``bounds`` (ranks + 1,) of each kind's numbering and its unknowns per point.
+    """
+
+    def __init__(self, fields: Sequence[tuple[Ints, int]]) -> None:
+        self._fields = [(np.asarray(bounds), components) for bounds, components in fields]
+        sizes = np.sum([np.diff(bounds) * components for bounds, components in self._fields], axis=0)
+        self.bounds = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+    def unknowns(self, kind: int, points: Ints) -> Ints:
+        """Global unknowns (n, components) of points of a kind given by their global numbers (n,)."""
+        bounds, components = self._fields[kind]
+        rank = np.searchsorted(bounds, points, side="right") - 1
+        before = np.zeros(len(self.bounds) - 1, dtype=np.int64)
+        for earlier, count in self._fields[:kind]:
+            before += np.diff(earlier) * count
+        first = self.bounds[rank] + before[rank] + (points - bounds[rank]) * components
+        return np.asarray(first[:, None] + np.arange(components))

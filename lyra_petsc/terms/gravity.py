@@ -1,0 +1,40 @@
+"""Gravity: force m g on each vertex's lumped mass, potential energy −Σ m g·x."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Load
+
+Array = NDArray[np.float64]
+
+
+class Gravity(Load):
+    """Parameters: ``mass`` (n_owned,) [kg] of the owned vertices, ``acceleration`` (3,) [m/s²]."""
+
+    name = "gravity"
+
+    def __init__(self, mass: Array, acceleration: Array) -> None:
+        super().__init__(Elements(np.empty((0, 1), dtype=np.int32)))
+        self._weight = mass[:, None] * np.asarray(acceleration, dtype=np.float64)
+
+    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        out[: len(self._weight)] += self._weight
+
+    def potential(self, x: Array) -> float:
+        return -float(np.vdot(self._weight, x[: len(self._weight)]))
+
+
+def elements(rest: RestShape) -> None:
+    """Gravity couples nothing and needs only the lumped mass."""
+    return None
+
+
+def make(elements: None, scene: Scene, mass: Array) -> Gravity:
+    """The load on one rank."""
+    assert scene.gravity is not None
+    return Gravity(mass, np.array(scene.gravity))

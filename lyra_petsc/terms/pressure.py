@@ -1,0 +1,68 @@
+"""Pressure: force p a n / 3 on each vertex of a triangle, along its current normal.
+
+Current area a and normal n are those at the start of the step, as for wind, so that the system stays
+symmetric.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.handles.motion import Window
+from lyra_petsc.meshing.select import select_triangles
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Load
+
+Array = NDArray[np.float64]
+
+
+@kernel()
+def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
+    """Add the force [N] of ``pressure`` (E,) [Pa] to out (n_local, 3)."""
+    for e in range(s.shape[0]):
+        a, b, c = s[e, 0], s[e, 1], s[e, 2]
+        px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+        qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+        w = pressure[e] / 6.0
+        fx, fy, fz = w * (py * qz - pz * qy), w * (pz * qx - px * qz), w * (px * qy - py * qx)
+        for k in range(3):
+            i = s[e, k]
+            out[i, 0] += fx
+            out[i, 1] += fy
+            out[i, 2] += fz
+
+
+class Pressure(Load):
+    """Parameters: elements with stencil (E, 3) and data ``load`` (E,), the number of the scene's load."""
+
+    name = "pressure"
+
+    def __init__(self, elements: Elements, pressures: Array, windows: list[Window]) -> None:
+        super().__init__(elements)
+        self._load = elements.data["load"].astype(np.int64)
+        self._pressures, self._windows = pressures, windows
+
+    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        now = self._pressures * np.array([window.strength(t0, t1) for window in self._windows])
+        add_force(x, self.stencil, now[self._load], out)
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles under each pressure load (rank 0)."""
+    stencils, loads = [], []
+    for number, load in enumerate(rest.scene.loads):
+        if load.pressure is not None:
+            chosen = select_triangles(rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source)
+            stencils.append(rest.mesh.triangles[chosen])
+            loads.append(np.full(len(chosen), float(number)))
+    return Elements(np.concatenate(stencils), {"load": np.concatenate(loads)})
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Pressure:
+    """The load on one rank."""
+    pressures = np.array([load.pressure or 0.0 for load in scene.loads])
+    return Pressure(elements, pressures, [Window(load.start, load.until) for load in scene.loads])

@@ -1,0 +1,86 @@
+"""The rest shape with its materials, whole, on rank 0 during set-up: what terms build elements from."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.materials.library import resolve
+from lyra_petsc.materials.shell import ShellMaterial
+from lyra_petsc.meshing.measure import rest_matrices
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.meshing.select import select_triangles
+from lyra_petsc.meshing.topology import Hinges, hinges
+from lyra_petsc.scene.schema import Scene
+
+
+class RestShape:
+    """A scene's mesh with a material on each triangle.
+
+    Attributes
+    ----------
+    scene, mesh
+    shells : list of ShellMaterial
+        One per material block of the scene.
+    shell_of : (F,) int64
+        Which of them each triangle has.
+    inverse : (F, 2, 2) float64
+        Inverse rest matrices in material axes [1/m].
+    area : (F,) float64
+        Rest areas [m²].
+    notes : list of str
+        What the materials' library has to tell.
+
+    Raises
+    ------
+    InputError
+        A material group that is not in the mesh, a triangle without a material.
+    """
+
+    def __init__(self, scene: Scene, mesh: Mesh) -> None:
+        self.scene, self.mesh = scene, mesh
+        self.notes: list[str] = []
+        self.shells: list[ShellMaterial] = []
+        self.shell_of = np.full(mesh.n_triangles, -1, dtype=np.int64)
+        default = -1
+        for number, block in enumerate(scene.material):
+            shell, notes = resolve(block)
+            self.shells.append(shell)
+            self.notes += notes
+            if block.group is None:
+                default = number
+                continue
+            chosen = select_triangles(mesh, block.group, key=f"material[{number}].group", file=scene.source)
+            self.shell_of[chosen] = number
+        self.shell_of[self.shell_of < 0] = default
+        bare = np.flatnonzero(self.shell_of < 0)
+        if len(bare):
+            raise InputError(
+                f"{len(bare)} triangles (first: {bare[0]}) lie in no material's group; "
+                "add a material without a group for them",
+                file=scene.source,
+                key="material",
+            )
+        self.inverse, self.area = rest_matrices(mesh, self.per_triangle("warp_degrees"))
+
+    def per_triangle(self, attribute: str) -> NDArray[np.float64]:
+        """A scalar attribute of ShellMaterial on each triangle, (F,)."""
+        values = np.array([getattr(shell, attribute) for shell in self.shells], dtype=np.float64)
+        on_triangles: NDArray[np.float64] = values[self.shell_of]
+        return on_triangles
+
+    @cached_property
+    def mass(self) -> NDArray[np.float64]:
+        """Lumped mass [kg] of each vertex, (V,): a third of each of its triangles."""
+        shares = np.repeat(self.area * self.per_triangle("density") / 3.0, 3)
+        corners = self.mesh.triangles.ravel()
+        lumped: NDArray[np.float64] = np.bincount(corners, weights=shares, minlength=self.mesh.n_vertices)
+        return lumped
+
+    @cached_property
+    def hinges(self) -> Hinges:
+        """The interior edges; found only if a term asks."""
+        return hinges(self.mesh.triangles)

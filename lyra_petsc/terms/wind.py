@@ -1,0 +1,137 @@
+"""Wind on each triangle, with the geometry frozen at the start of the step.
+
+With v_rel = wind − mean velocity of the vertices, v_n its part along the unit normal n, v_t the rest,
+and the rest area A::
+
+    force = ρ A |v_n| v_n n + drag A v_t        a third to each vertex
+    potential = ρ A |v_n|³ / 3 + drag A |v_t|² / 2
+
+(as the original Lyra: rest area, no ½, so ρ acts as ½ c_d ρ_air). The potential is convex, hence the
+implicit force is stable at any wind and step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Viscous
+
+Array = NDArray[np.float64]
+
+
+@kernel()
+def normals(x, s, out):  # type: ignore[no-untyped-def]
+    """Unit normals of the triangles into out (E, 3); zero for a collapsed one."""
+    for e in range(s.shape[0]):
+        a, b, c = s[e, 0], s[e, 1], s[e, 2]
+        px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+        qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+        nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        scale = 1.0 / length if length > 0.0 else 0.0
+        out[e, 0], out[e, 1], out[e, 2] = nx * scale, ny * scale, nz * scale
+
+
+@kernel(inline="always")
+def _relative(v, s, e, n, wind):  # type: ignore[no-untyped-def]
+    """v_rel and its normal component v_n of triangle e."""
+    a, b, c = s[e, 0], s[e, 1], s[e, 2]
+    third = 1.0 / 3.0
+    rx = wind[0] - third * (v[a, 0] + v[b, 0] + v[c, 0])
+    ry = wind[1] - third * (v[a, 1] + v[b, 1] + v[c, 1])
+    rz = wind[2] - third * (v[a, 2] + v[b, 2] + v[c, 2])
+    return rx, ry, rz, rx * n[e, 0] + ry * n[e, 1] + rz * n[e, 2]
+
+
+@kernel()
+def potentials(v, s, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
+    """Potential [W] of the first len(out) triangles."""
+    for e in range(out.shape[0]):
+        rx, ry, rz, vn = _relative(v, s, e, n, wind)
+        tangential = rx * rx + ry * ry + rz * rz - vn * vn
+        out[e] = area[e] * (density * abs(vn) ** 3 / 3.0 + 0.5 * drag * tangential)
+
+
+@kernel()
+def add_gradient(v, s, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
+    """Subtract the force [N] from out (n_local, 3)."""
+    for e in range(s.shape[0]):
+        rx, ry, rz, vn = _relative(v, s, e, n, wind)
+        w = area[e] / 3.0
+        along = w * (density * abs(vn) - drag) * vn
+        fx, fy, fz = along * n[e, 0] + w * drag * rx, along * n[e, 1] + w * drag * ry, along * n[e, 2] + w * drag * rz
+        for k in range(3):
+            i = s[e, k]
+            out[i, 0] -= fx
+            out[i, 1] -= fy
+            out[i, 2] -= fz
+
+
+@kernel()
+def hessians(v, s, lo, hi, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
+    """Hessian blocks [N s/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3)."""
+    for e in range(lo, hi):
+        _, _, _, vn = _relative(v, s, e, n, wind)
+        w = area[e] / 9.0
+        along = w * (2.0 * density * abs(vn) - drag)
+        for i in range(3):
+            for j in range(3):
+                value = along * n[e, i] * n[e, j]
+                if i == j:
+                    value += w * drag
+                for a in range(3):
+                    for b in range(3):
+                        out[e - lo, a, b, i, j] = value
+
+
+class Wind(Viscous):
+    """Wind on all triangles.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 3); data ``area`` (E,) [m²].
+    velocity : (3,) [m/s]
+    density : float
+        [kg/m³]
+    drag : float
+        [kg/(m² s)]
+    """
+
+    name = "wind"
+
+    def __init__(self, elements: Elements, velocity: Array, density: float, drag: float) -> None:
+        super().__init__(elements)
+        self._area = elements.data["area"]
+        self._normals = np.zeros((self.n_elements, 3))
+        self._law = (np.asarray(velocity, dtype=np.float64), float(density), float(drag))
+
+    def freeze(self, x: Array, v: Array) -> None:
+        normals(x, self.stencil, self._normals)
+
+    def potentials(self, v: Array) -> Array:
+        out = np.empty(self.n_owned)
+        potentials(v, self.stencil, self._area, self._normals, *self._law, out)
+        return out
+
+    def add_gradient(self, v: Array, out: Array) -> None:
+        add_gradient(v, self.stencil, self._area, self._normals, *self._law, out)
+
+    def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
+        hessians(v, self.stencil, lo, hi, self._area, self._normals, *self._law, out)
+
+
+def elements(rest: RestShape) -> Elements:
+    """All triangles with their rest areas (rank 0)."""
+    return Elements(rest.mesh.triangles, {"area": rest.area})
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Wind:
+    """The term on one rank."""
+    assert scene.wind is not None
+    return Wind(elements, np.array(scene.wind.velocity), scene.wind.density, scene.wind.drag)
