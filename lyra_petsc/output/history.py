@@ -1,0 +1,154 @@
+"""Tables with one row per accepted step: history.csv, probes.csv, reactions.csv."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from mpi4py import MPI
+
+from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.parallel import on_root
+
+HISTORY_COLUMNS = (
+    "step",
+    "time",
+    "dt",
+    "newton_iterations",
+    "linear_iterations",
+    "rejected",
+    "kinetic_energy",
+    "membrane_energy",
+    "bending_energy",
+    "potential_energy",
+    "external_work",
+    "dissipation",
+    "residual",
+    "wall_seconds",
+)
+
+
+def vector_columns(names: Sequence[str]) -> tuple[str, ...]:
+    """``step, time`` and the columns ``<name>_x, <name>_y, <name>_z`` of each name."""
+    return ("step", "time", *(f"{name}_{axis}" for name in names for axis in "xyz"))
+
+
+class History:
+    """A CSV table on disk, written row by row by rank 0. Every method is collective.
+
+    Parameters
+    ----------
+    path : path
+        The file; one that exists is replaced, or with ``resume_after`` continued.
+    columns : sequence of str
+        The header; the first column is ``step``.
+    comm : MPI.Comm
+        All ranks of the run; what fails on rank 0 is raised on all.
+    resume_after : int, optional
+        Keep the rows up to and including this step, cut what follows (also a row that a kill
+        left half written) and go on behind them. A file that is missing is begun anew.
+
+    Raises
+    ------
+    InputError
+        If the file to be continued has other columns.
+    OutputError
+        If the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        columns: Sequence[str],
+        comm: MPI.Comm,
+        *,
+        resume_after: int | None = None,
+    ) -> None:
+        if not columns or columns[0] != "step":
+            raise ValueError("the first column is step")
+        self.path = Path(path)
+        self.columns = tuple(columns)
+        self.comm = comm
+        self._file: TextIO | None = None
+        on_root(comm, lambda: self._open(resume_after))
+
+    def append(self, values: Mapping[str, float]) -> None:
+        """Write one row and flush it.
+
+        Parameters
+        ----------
+        values : mapping
+            A number for each column and nothing else; read on rank 0 only.
+        """
+        on_root(self.comm, lambda: self._append(values))
+
+    def close(self) -> None:
+        """Close the file; nothing can be appended afterwards. Not collective."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _open(self, resume_after: int | None) -> None:
+        try:
+            go_on = resume_after is not None and self.path.exists()
+            if resume_after is not None and go_on:
+                self._cut(resume_after)
+            self._file = self.path.open("a" if go_on else "w", encoding="utf-8", newline="")
+            if not go_on:
+                self._write(self.columns)
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def _append(self, values: Mapping[str, float]) -> None:
+        if set(values) != set(self.columns):
+            raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
+        try:
+            self._write([_text(values[name]) for name in self.columns])
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def _write(self, cells: Sequence[str]) -> None:
+        if self._file is None:
+            raise ValueError(f"{self.path} is closed")
+        csv.writer(self._file, lineterminator="\n").writerow(cells)
+        self._file.flush()
+
+    def _cut(self, last_step: int) -> None:
+        """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""
+        kept = self.path.with_name(self.path.name + ".part")
+        with (
+            open(self.path, encoding="utf-8", errors="replace", newline="") as old,
+            open(kept, "w", encoding="utf-8", newline="") as new,
+        ):
+            header = next(csv.reader([old.readline()]), [])
+            if tuple(header) != self.columns:
+                kept.unlink()
+                raise InputError(
+                    f"has the columns {', '.join(header)}; this run writes {', '.join(self.columns)}: "
+                    "resume with the scene it was begun with",
+                    file=self.path,
+                )
+            csv.writer(new, lineterminator="\n").writerow(self.columns)
+            for line in old:
+                if not line.endswith("\n") or not _is_row_until(line, last_step):
+                    break
+                new.write(line)
+            new.flush()
+            os.fsync(new.fileno())
+        os.replace(kept, self.path)
+
+
+def _is_row_until(line: str, last_step: int) -> bool:
+    try:
+        return int(line.split(",", 1)[0]) <= last_step
+    except ValueError:
+        return False
+
+
+def _text(value: float) -> str:
+    """The shortest text that reads back as the same number."""
+    return str(int(value)) if isinstance(value, int | np.integer) else repr(float(value))

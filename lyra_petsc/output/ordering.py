@@ -1,0 +1,125 @@
+"""Between the rows that ranks own and the order of the mesh file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import ArrayLike, NDArray
+
+
+class FileOrder:
+    """A plan that moves rows between their owners and contiguous slabs in file order.
+
+    Rank r of P holds slab ``[r N // P, (r + 1) N // P)`` of the N rows of a file. Both
+    directions are one ``Alltoallv``; no rank ever holds more than its rows and its slab.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+        All ranks that own rows or write; construction is collective.
+    original : (n_owned,) int
+        Position in the file of each row this rank owns, in any order; may be empty. Together
+        the ranks name each of ``0 … n_global − 1`` exactly once.
+    n_global : int
+        N, the number of rows in the file.
+
+    Raises
+    ------
+    ValueError
+        On every rank, if the ranks' rows are not each file row exactly once.
+    """
+
+    def __init__(self, comm: MPI.Comm, original: ArrayLike, n_global: int) -> None:
+        rows = np.asarray(original, dtype=np.int64).reshape(-1)
+        self.comm = comm
+        self.n_owned = len(rows)
+        self.n_global = int(n_global)
+        self.starts: NDArray[np.int64] = np.arange(comm.size + 1, dtype=np.int64) * self.n_global // comm.size
+
+        self._outgoing: NDArray[np.int64] = np.argsort(rows, kind="stable")
+        ordered = rows[self._outgoing]
+        inside = len(ordered) == 0 or bool(ordered[0] >= 0 and ordered[-1] < self.n_global)
+        if not comm.allreduce(inside, MPI.LAND):
+            raise ValueError(f"a row lies outside 0 … {self.n_global - 1}")
+        self._to_ranks = np.diff(np.searchsorted(ordered, self.starts)).astype(np.int32)
+        self._from_ranks = np.empty_like(self._to_ranks)
+        comm.Alltoall(self._to_ranks, self._from_ranks)
+
+        arrived = self._exchange(ordered, self._to_ranks, self._from_ranks)
+        self._incoming: NDArray[np.int64] = arrived - self.start
+        each_once = np.array_equal(np.sort(self._incoming), np.arange(self.n_slab))
+        if not comm.allreduce(each_once, MPI.LAND):
+            raise ValueError(f"the ranks' rows are not each of 0 … {self.n_global - 1} exactly once")
+
+    @property
+    def start(self) -> int:
+        """First file row of this rank's slab."""
+        return int(self.starts[self.comm.rank])
+
+    @property
+    def n_slab(self) -> int:
+        """Number of file rows in this rank's slab."""
+        return int(self.starts[self.comm.rank + 1]) - self.start
+
+    def to_slab(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """Rows in the owner's numbering → this rank's slab of the file. Collective.
+
+        Parameters
+        ----------
+        rows : (n_owned, ...) array
+            Any type and trailing shape, the same on all ranks.
+
+        Returns
+        -------
+        (n_slab, ...) array
+        """
+        self._expect(rows, self.n_owned, "owned rows")
+        arrived = self._exchange(rows[self._outgoing], self._to_ranks, self._from_ranks)
+        slab = np.empty_like(arrived)
+        slab[self._incoming] = arrived
+        return slab
+
+    def from_slab(self, slab: NDArray[Any]) -> NDArray[Any]:
+        """This rank's slab of the file → rows in the owner's numbering. Collective.
+
+        Parameters
+        ----------
+        slab : (n_slab, ...) array
+            Any type and trailing shape, the same on all ranks.
+
+        Returns
+        -------
+        (n_owned, ...) array
+        """
+        self._expect(slab, self.n_slab, "rows of the slab")
+        arrived = self._exchange(slab[self._incoming], self._from_ranks, self._to_ranks)
+        rows = np.empty_like(arrived)
+        rows[self._outgoing] = arrived
+        return rows
+
+    @staticmethod
+    def _expect(rows: NDArray[Any], count: int, what: str) -> None:
+        if len(rows) != count:
+            raise ValueError(f"{len(rows)} given for {count} {what}")
+
+    def _exchange(
+        self, rows: NDArray[Any], send: NDArray[np.int32], receive: NDArray[np.int32]
+    ) -> NDArray[Any]:
+        rows = np.ascontiguousarray(rows)
+        arrived = np.empty((int(receive.sum()), *rows.shape[1:]), dtype=rows.dtype)
+        # counting in rows keeps the counts within 32 bits whatever a row is wide
+        width = rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+        row_type = MPI.BYTE.Create_contiguous(width).Commit()
+        try:
+            self.comm.Alltoallv(
+                [rows, (send, _offsets(send)), row_type], [arrived, (receive, _offsets(receive)), row_type]
+            )
+        finally:
+            row_type.Free()
+        return arrived
+
+
+def _offsets(counts: NDArray[np.int32]) -> NDArray[np.int32]:
+    return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int32)

@@ -1,0 +1,126 @@
+"""Fixtures for all tests, and what keeps a parallel run of pytest from hanging.
+
+Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
+running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
+After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
+shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import gc
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+WAIT_FOR_OTHERS = 20.0  # s that a failed rank gives the others to finish the test
+LONGEST_TEST = 300.0  # s after which every rank shows where it stands and the job ends
+
+WORLD = MPI.COMM_WORLD
+FAILURE = pytest.StashKey[str]()
+FAILURE_ELSEWHERE = pytest.StashKey[str]()
+TERMINAL = pytest.StashKey[TextIO]()
+
+
+@pytest.fixture
+def comm() -> MPI.Comm:
+    """COMM_WORLD."""
+    return WORLD
+
+
+@pytest.fixture
+def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An empty folder of this test, the same on every rank."""
+    return Path(WORLD.bcast(tmp_path_factory.mktemp("shared") if WORLD.rank == 0 else None, root=0))
+
+
+@pytest.hookimpl(trylast=True)  # the terminal exists by then
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "parallel: runs on every rank of mpirun at the same time")
+    if WORLD.size == 1:
+        return
+    capture = config.pluginmanager.getplugin("capturemanager")
+    if capture is not None:
+        with capture.global_and_fixture_disabled():
+            terminal = os.dup(2)
+    else:
+        terminal = os.dup(2)
+    config.stash[TERMINAL] = os.fdopen(terminal, "w")
+    if WORLD.rank > 0:  # rank 0 speaks for all
+        config.get_terminal_writer()._file = open(os.devnull, "w")  # noqa: SIM115
+
+
+def together(item: pytest.Item) -> bool:
+    return WORLD.size > 1 and item.get_closest_marker("parallel") is not None
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    if together(item):
+        faulthandler.dump_traceback_later(LONGEST_TEST, exit=True, file=item.config.stash[TERMINAL])
+    yield
+    if together(item):
+        faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Agree on the outcome before fixtures (whose end may be collective) are torn down."""
+    if together(item):
+        agree(item)
+    yield
+    if together(item):
+        collect_garbage()
+
+
+def agree(item: pytest.Item) -> None:
+    mine = item.stash.get(FAILURE, None)
+    failed, any_failed = np.array([mine is not None], "i"), np.zeros(1, "i")
+    request = WORLD.Iallreduce(failed, any_failed, MPI.MAX)
+    start = time.monotonic()
+    while not request.Test():
+        time.sleep(1e-3)
+        if mine is not None and time.monotonic() - start > WAIT_FOR_OTHERS:
+            terminal = item.config.stash[TERMINAL]
+            terminal.write(f"\nfailed on rank {WORLD.rank}, others still wait: {item.nodeid}\n{mine}\n")
+            terminal.flush()
+            WORLD.Abort(1)
+    if any_failed[0]:
+        texts = WORLD.allgather(mine)
+        if mine is None:
+            item.stash[FAILURE_ELSEWHERE] = "\n".join(
+                f"failed on rank {rank}:\n{text}" for rank, text in enumerate(texts) if text is not None
+            )
+
+
+def collect_garbage() -> None:
+    """Objects that are freed collectively must be freed by all ranks at the same place."""
+    gc.collect()
+    if "petsc4py.PETSc" in sys.modules:
+        from petsc4py import PETSc
+
+        if hasattr(PETSc, "garbage_cleanup"):
+            PETSc.garbage_cleanup()
+    WORLD.Barrier()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    outcome = yield
+    report = outcome.get_result()
+    if not together(item):
+        return
+    if report.failed and report.when != "teardown":
+        item.stash[FAILURE] = report.longreprtext
+    elsewhere = item.stash.get(FAILURE_ELSEWHERE, None)
+    if report.when == "teardown" and elsewhere is not None:
+        report.outcome = "failed"
+        report.longrepr = elsewhere

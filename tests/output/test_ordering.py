@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from lyra_petsc.output.ordering import FileOrder
+
+pytestmark = pytest.mark.parallel
+
+
+def shuffled(comm, n_global, owners):
+    """Rows of a shuffled file, dealt to the given ranks only."""
+    order = np.random.default_rng(7).permutation(n_global)
+    owners = [rank for rank in owners if rank < comm.size] or [0]
+    return np.array_split(order, len(owners))[owners.index(comm.rank)] if comm.rank in owners else order[:0]
+
+
+@pytest.mark.parametrize("owners", [(0, 1, 2), (1,), (0, 2)])
+@pytest.mark.parametrize("n_global", [0, 1, 2, 101])
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((), np.int64), ((3,), np.float64), ((3, 2), np.float32), ((3,), np.int32)]
+)
+def test_there_and_back(comm, owners, n_global, shape, dtype):
+    original = shuffled(comm, n_global, owners)
+    plan = FileOrder(comm, original, n_global)
+    whole = np.arange(n_global * int(np.prod(shape)), dtype=dtype).reshape(n_global, *shape)
+    slab = plan.to_slab(whole[original])
+    assert slab.dtype == dtype
+    expected = whole[comm.rank * n_global // comm.size : (comm.rank + 1) * n_global // comm.size]
+    np.testing.assert_array_equal(slab, expected)
+    np.testing.assert_array_equal(plan.from_slab(slab), whole[original])
+
+
+def test_rows_that_are_no_permutation_are_refused_on_every_rank(comm):
+    mine = np.arange(comm.rank, 10, comm.size)
+    with pytest.raises(ValueError, match="exactly once"):
+        FileOrder(comm, np.where(mine == 3, 4, mine), 10)
+    with pytest.raises(ValueError, match="outside"):
+        FileOrder(comm, np.where(mine == 0, 10, mine), 10)
+    with pytest.raises(ValueError, match="exactly once"):
+        FileOrder(comm, mine, 11)
+
+
+def test_an_array_of_another_length_is_refused(comm):
+    plan = FileOrder(comm, np.arange(comm.rank, 10, comm.size), 10)
+    with pytest.raises(ValueError, match="owned rows"):
+        plan.to_slab(np.zeros(11))
+    with pytest.raises(ValueError, match="slab"):
+        plan.from_slab(np.zeros(11))

@@ -1,0 +1,51 @@
+import pytest
+
+from lyra_petsc.output.phases import Phases
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_nested_phases_take_their_time_out_of_the_outer_one():
+    clock = Clock()
+    phases = Phases(clock)
+    clock.now += 1
+    with phases("solve"):
+        clock.now += 2
+        with phases("assembly"):
+            clock.now += 4
+        clock.now += 8
+    clock.now += 16
+    assert phases.seconds() == {"solve": 10.0, "assembly": 4.0, "other": 17.0}
+    assert sum(phases.seconds().values()) == phases.total == 31.0
+
+
+def test_the_open_phase_is_counted_and_a_phase_adds_up():
+    clock = Clock()
+    phases = Phases(clock)
+    for _ in range(3):
+        with phases("output"):
+            clock.now += 1
+    with phases("solve"):
+        clock.now += 5
+        assert phases.seconds() == {"output": 3.0, "solve": 5.0, "other": 0.0}
+
+
+def test_an_exception_closes_its_phase():
+    clock = Clock()
+    phases = Phases(clock)
+    with pytest.raises(RuntimeError):
+        fail_inside(phases, clock)
+    clock.now += 2
+    assert phases.seconds() == {"solve": 1.0, "other": 2.0}
+
+
+def fail_inside(phases: Phases, clock: Clock) -> None:
+    with phases("solve"):
+        clock.now += 1
+        raise RuntimeError
