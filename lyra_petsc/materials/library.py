@@ -114,21 +114,16 @@ def resolve(
         else:
             shell = of_isotropic(entry)
     elif material.membrane is not None and material.density is not None:
-        membrane = material.membrane
-        shell = ShellMaterial(
-            material.density,
-            membrane.c11,
-            membrane.c12,
-            membrane.c22,
-            membrane.c33,
-            _triple(material.bending),
-        )
-    elif None not in (material.young, material.poisson, material.thickness, material.density):
-        assert material.young is not None and material.poisson is not None
-        assert material.thickness is not None and material.density is not None
-        shell = of_isotropic(
-            IsotropicSheet(material.young, material.poisson, material.thickness, material.density)
-        )
+        c = material.membrane
+        shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33, _triple(material.bending))
+    elif (
+        material.young is not None
+        and material.poisson is not None
+        and material.thickness is not None
+        and material.density is not None
+    ):
+        sheet = IsotropicSheet(material.young, material.poisson, material.thickness, material.density)
+        shell = of_isotropic(sheet)
     else:
         raise InputError(
             "needs cloth, or density + membrane, or young + poisson + thickness + density", file=file, key=key

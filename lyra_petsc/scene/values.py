@@ -107,15 +107,21 @@ def _positive_scale(value: Any) -> float | Vec3:
     return scale
 
 
+def integer(value: Any) -> int:
+    """``value`` as a whole number; bool, text and 1.0 are refused."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise problem(f"must be a whole number, not {shown(value)}")
+    return value
+
+
 def _integer(lowest: int, highest: int) -> Callable[[Any], int]:
     def validate(value: Any) -> int:
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise problem(f"must be a whole number, not {shown(value)}")
+        value = integer(value)
         if value < lowest:
             raise problem(f"must be a whole number >= {lowest}, not {shown(value)}")
         if value > highest:
             raise problem(f"must be a whole number <= {highest}, not {shown(value)}")
-        return value
+        return int(value)
 
     return validate
 

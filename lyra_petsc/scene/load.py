@@ -1,0 +1,89 @@
+"""From a scene file and the command line's ``--set`` to a checked `Scene`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.messages import dotted, input_error
+from lyra_petsc.scene.overrides import apply_overrides, unshared
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
+from lyra_petsc.scene.values import shown
+
+__all__ = ["dump_scene", "load_scene"]
+
+# A JSON file with one of these is a scene of ours, not one of the original program.
+_OUR_KEYS = {"mesh", "material", "time"}
+
+
+def load_scene(path: Path | str, overrides: Sequence[str] = ()) -> Scene:
+    """Read and check a scene: YAML, or the original program's conf.json.
+
+    Parameters
+    ----------
+    path : Path
+    overrides : sequence of ``key.path=value``
+        Applied to the scene as understood, before it is checked; see `apply_overrides`.
+
+    Returns
+    -------
+    Scene
+        Mesh paths absolute, taken to stand beside the scene file; ``scene.source`` is ``path``.
+
+    Raises
+    ------
+    InputError
+        On anything that cannot be used, naming file and key.
+    """
+    path = Path(path)
+    text = read_text(path)
+    data = _read(path, text)
+    if not isinstance(data, dict):
+        raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
+    try:
+        if overrides:
+            data = unshared(data)
+        overridden = apply_overrides(data, overrides)
+        scene = Scene.model_validate(data, context={"directory": path.absolute().parent})
+    except ValidationError as error:
+        raise input_error(error, data, file=path, overridden=overridden) from None
+    except RecursionError:
+        raise InputError("is nested too deeply, or refers to itself", file=path) from None
+    for i, source in enumerate(scene.mesh):
+        if source.file is not None:
+            _check_mesh_file(source.file, dotted(["mesh", i, "file"], data), path)
+    scene._source = path
+    return scene
+
+
+def _read(path: Path, text: str) -> Any:
+    """The scene as plain values in our keys, whichever program the file was written for."""
+    start = text.lstrip()
+    if path.suffix.lower() == ".json" or start.startswith(("//", "/*")):
+        data = parse_json(text, file=path)
+        original = isinstance(data, dict) and not _OUR_KEYS & data.keys()
+    elif start.startswith("{") and '"cloths"' in text:
+        data, original = parse_json(text, file=path), True
+    else:
+        data, original = parse_yaml(text, file=path), False
+    if not original:
+        return data
+    from lyra_petsc.scene.original import import_original
+
+    return import_original(data, path)
+
+
+def _check_mesh_file(file: Path, key: str, scene: Path) -> None:
+    try:
+        if file.is_file():
+            return
+        what = "is a directory, not a mesh file" if file.is_dir() else "no such file"
+    except OSError as error:
+        what = f"cannot be read ({error.strerror})"
+    raise InputError(f"{what}: {file}", file=scene, key=key)

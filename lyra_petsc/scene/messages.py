@@ -1,0 +1,71 @@
+"""From pydantic's findings to one line that names the key as the user wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.values import shown
+
+
+def dotted(path: Sequence[str | int], data: Any = None) -> str:
+    """``path`` as a key like ``handles[1].group``.
+
+    Where ``data`` holds a single block in place of a list, the index 0 that stands for it is left
+    out.
+    """
+    key = ""
+    for part in path:
+        if isinstance(part, int):
+            if not isinstance(data, dict):
+                key += f"[{part}]"
+                data = data[part] if isinstance(data, (list, tuple)) and part < len(data) else None
+        else:
+            key += f".{part}" if key else part
+            data = data.get(part) if isinstance(data, dict) else None
+    return key
+
+
+def input_error(
+    error: ValidationError, data: Any, *, file: object | None, overridden: Sequence[str] = ()
+) -> InputError:
+    """The first of pydantic's findings as an `InputError`, and how many more there are.
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+    data : dict
+        What was validated, for the way keys are written.
+    file : path
+        The scene file.
+    overridden : keys
+        Given on the command line and not in the file: the message says so.
+    """
+    findings = error.errors(include_url=False)
+    first = findings[0]
+    context: dict[str, Any] = first.get("ctx", {})
+    path = [part for part in first["loc"] if part != "[key]"] + list(context.get("at", ()))
+    key = dotted(path, data)
+    message = " ".join(_words(first["type"], first["msg"], first.get("input"), context).split())
+    if any(key == given or key.startswith((f"{given}.", f"{given}[")) for given in overridden):
+        message += " (from --set)"
+    if len(findings) > 1:
+        message += f" (and {len(findings) - 1} more)"
+    return InputError(message, file=file, key=key or None)
+
+
+def _words(kind: str, message: str, value: Any, context: dict[str, Any]) -> str:
+    if kind == "scene":
+        return message
+    if kind == "missing":
+        return "missing"
+    if kind == "literal_error":
+        return f"must be {context['expected']}, not {shown(value)}"
+    if kind == "list_type":
+        return f"must be a list, not {shown(value)}"
+    if kind == "recursion_loop":
+        return "refers to itself"
+    return f"{message[:1].lower()}{message[1:]}, not {shown(value)}"

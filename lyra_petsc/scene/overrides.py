@@ -1,0 +1,125 @@
+"""``--set key.path=value``: single values of a scene, changed before it is checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.messages import dotted
+from lyra_petsc.scene.text import parse_yaml
+
+# keys under which a single block may stand for a list of one
+ONE_OR_MANY = ("mesh", "material")
+
+_PART = re.compile(r"([^.\[\]\s]+)((?:\[\d+\])*)")
+
+
+def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> list[str]:
+    """Change ``data`` in place by each ``key.path=value``; the value is YAML.
+
+    List entries are named ``handles[0].until`` or ``handles.0.until``; the index after the last
+    appends. Blocks on the way are created. An empty value removes the key.
+
+    Returns
+    -------
+    list of str
+        The keys that were set, as messages write them.
+
+    Raises
+    ------
+    InputError
+        No ``=``, a malformed path, a value that is no YAML, or a path through what is no block.
+    """
+    return [_apply(data, text) for text in overrides]
+
+
+def unshared(value: Any) -> Any:
+    """A copy in which no two places hold the same block (YAML anchors make such)."""
+    if isinstance(value, dict):
+        return {key: unshared(entry) for key, entry in value.items()}
+    return [unshared(entry) for entry in value] if isinstance(value, list) else value
+
+
+def _apply(data: dict[str, Any], text: str) -> str:
+    path_text, equals, value_text = text.partition("=")
+    option = f"--set {text if len(text) <= 60 else text[:57] + '...'}"
+    if not equals:
+        raise InputError("must read key.path=value", key=option)
+    parts = _parts(path_text.strip(), option)
+    value = parse_yaml(value_text, file=None, key=option)
+    if parts[0] == "mesh":
+        value = _found_here(value, parts[-1])
+    first = parts[0]
+    single = first in ONE_OR_MANY and isinstance(data.get(first), dict) and len(parts) > 1
+    if single:
+        data[first] = [data[first]]
+    if first in ONE_OR_MANY and len(parts) > 1 and not parts[1].isdecimal():
+        entries = data.get(first)
+        if isinstance(entries, list) and len(entries) == 1:
+            parts.insert(1, "0")
+    target: Any = data
+    walked: list[str | int] = []
+    for depth, part in enumerate(parts):
+        target = _step(target, part, walked, value, rest=parts[depth + 1 :], option=option)
+    if single and len(data[first]) == 1:
+        # back to how the file has it, so that messages name the keys as written there
+        data[first] = data[first][0]
+    return dotted(walked, data)
+
+
+def _parts(path: str, option: str) -> list[str]:
+    parts: list[str] = []
+    for piece in path.split("."):
+        match = _PART.fullmatch(piece)
+        if match is None:
+            raise InputError("must read key.path=value, as in handles[0].until=2", key=option)
+        parts.append(match[1])
+        parts += re.findall(r"\d+", match[2])
+    return parts
+
+
+def _step(
+    target: Any,
+    part: str,
+    walked: list[str | int],
+    value: Any,
+    *,
+    rest: list[str],
+    option: str,
+) -> Any:
+    """One part of the path: descend, or set ``value`` if no ``rest`` follows; ``walked`` grows by it."""
+    if isinstance(target, list):
+        if not part.isdecimal() or int(part) > len(target):
+            many = f"[0] to [{len(target)}]" if target else "[0]"
+            raise InputError(f"{dotted(walked)} is a list; give an index, {many}", key=option)
+        index = int(part)
+        if index == len(target):
+            target.append(None)
+        walked.append(index)
+        if not rest:
+            target[index] = value
+        elif target[index] is None:
+            target[index] = [] if rest[0].isdecimal() else {}
+        return target[index]
+    if not isinstance(target, dict):
+        raise InputError(f"{dotted(walked)} holds a single value, no keys", key=option)
+    walked.append(part)
+    if not rest:
+        target[part] = value
+    elif target.get(part) is None:
+        target[part] = [] if rest[0].isdecimal() else {}
+    return target[part]
+
+
+def _found_here(value: Any, key: str) -> Any:
+    """Mesh paths given on the command line stand under the working directory, if they exist there."""
+    if isinstance(value, dict):
+        return {name: _found_here(entry, str(name)) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_found_here(entry, "") for entry in value]
+    if key == "file" and isinstance(value, str) and "\0" not in value and Path(value).is_file():
+        return str(Path(value).absolute())
+    return value

@@ -1,0 +1,120 @@
+"""Reading scene text: files, YAML, and JSON with comments; every failure names file and line."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.errors import InputError
+
+
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises
+    ------
+    InputError
+        Missing, a directory, unreadable, not UTF-8, or empty.
+    """
+    try:
+        if path.is_dir():
+            raise InputError("is a directory, not a file", file=path)
+        if not path.exists():
+            raise InputError("no such file", file=path)
+        if not path.is_file():
+            raise InputError("is not a regular file", file=path)
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 text (byte {error.start})", file=path) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else None
+        raise InputError(f"cannot be read: {reason or error}", file=path) from None
+    if not text.strip():
+        raise InputError("is empty", file=path)
+    return text
+
+
+def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any:
+    """YAML 1.2 text as plain values; duplicate keys are refused."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(io.StringIO(text))
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise InputError(_line(f"{place}{error.problem or error.context}"), file=file, key=key) from None
+    except RecursionError:
+        raise InputError("is nested too deeply", file=file, key=key) from None
+    except (YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
+        # the reader lets such slip out for odd scalars (a 13th month, tags on the wrong kind of node)
+        raise InputError(_line(f"is not YAML: {error}"), file=file, key=key) from None
+
+
+def parse_json(text: str, *, file: object | None) -> Any:
+    """JSON with // and /* */ comments and trailing commas; duplicate keys are refused."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        block = dict(pairs)
+        if len(block) < len(pairs):
+            names = [name for name, _ in pairs]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError("given twice", file=file, key=twice)
+        return block
+
+    def constant(word: str) -> float:
+        raise InputError(f"holds {word}, which is no number", file=file)
+
+    def finite(digits: str) -> float:
+        value = float(digits)
+        return value if math.isfinite(value) else constant(digits)
+
+    try:
+        return json.loads(
+            _plain_json(text), object_pairs_hook=unique, parse_constant=constant, parse_float=finite
+        )
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"line {error.lineno}, column {error.colno}: is not JSON: {error.msg}", file=file
+        ) from None
+    except RecursionError:
+        raise InputError("is nested too deeply", file=file) from None
+    except ValueError as error:
+        raise InputError(_line(f"is not JSON: {error}"), file=file) from None
+
+
+def _line(message: str) -> str:
+    return " ".join(message.split())
+
+
+def _plain_json(text: str) -> str:
+    """``text`` with comments and trailing commas blanked, so that line and column stay true."""
+    plain: list[str] = []
+    comma: int | None = None  # place in `plain` of a comma after which nothing has come yet
+    at = 0
+    while at < len(text):
+        here = text[at]
+        if here == '"':
+            end = at + 1
+            while end < len(text) and text[end] != '"':
+                end += 2 if text[end] == "\\" else 1
+            plain.append(text[at : end + 1])
+            at, comma = end + 1, None
+        elif text.startswith(("//", "/*"), at):
+            line = text.startswith("//", at)
+            end = text.find("\n" if line else "*/", at + (0 if line else 2))
+            end = len(text) if end < 0 else end if line else end + 2
+            plain.append("".join(c if c == "\n" else " " for c in text[at:end]))
+            at = end
+        else:
+            if here in "]}" and comma is not None:
+                plain[comma] = " "
+            if not here.isspace():
+                comma = len(plain) if here == "," else None
+            plain.append(here)
+            at += 1
+    return "".join(plain)
