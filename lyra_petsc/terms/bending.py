@@ -100,8 +100,8 @@ class Bending(Elastic):
     def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
         hessians(x, self.stencil, lo, hi, exact, self._k, self._rest, out)
 
-    def force_scale(self) -> Array:
-        scale: Array = self._k / self.elements.data["rest_height"]
+    def force_scale(self, size: float) -> Array:
+        scale: Array = self._k * size / self.elements.data["rest_height"] ** 2
         return scale
 
 

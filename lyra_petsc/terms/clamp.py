@@ -114,8 +114,8 @@ class Clamp(Elastic):
         hessians(x, self.stencil, lo, hi, exact, self._mirror, self._k, out)
         out[self._k[lo:hi] == 0.0] = 0.0
 
-    def force_scale(self) -> Array:
-        scale: Array = self._k / self.elements.data["height"]
+    def force_scale(self, size: float) -> Array:
+        scale: Array = self._k * size / self.elements.data["height"] ** 2
         return scale
 
 

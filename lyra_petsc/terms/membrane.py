@@ -182,11 +182,10 @@ class Membrane(Elastic):
     def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
         hessians(x, self.stencil, lo, hi, exact, self._inverse, self._area, self._c, out)
 
-    def force_scale(self) -> Array:
-        """Internal force [N] that a strain of one would make, per element: the scale of round-off."""
+    def force_scale(self, size: float) -> Array:
         stiffest: Array = np.abs(self._c).max(axis=1)
-        shortest = np.abs(self._inverse).max(axis=(1, 2))
-        return stiffest * self._area * shortest
+        steepest = np.abs(self._inverse).max(axis=(1, 2))
+        return stiffest * self._area * steepest**2 * size
 
     def strain_and_stress(self, x: Array) -> tuple[Array, Array]:
         """Green strain (E_uu, E_vv, E_uv) and stress (S_uu, S_vv, S_uv) [N/m], each (E, 3)."""

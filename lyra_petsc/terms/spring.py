@@ -75,8 +75,8 @@ class Spring(Elastic):
         for axis in range(3):
             out[:, 0, 0, axis, axis] = self._k[lo:hi, axis]
 
-    def force_scale(self) -> Array:
-        scale: Array = (self._k * np.abs(self._target)).max(axis=1)
+    def force_scale(self, size: float) -> Array:
+        scale: Array = self._k.max(axis=1) * size
         return scale
 
 

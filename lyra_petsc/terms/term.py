@@ -52,8 +52,8 @@ class Elastic(Term):
         """
 
     @abstractmethod
-    def force_scale(self) -> Array:
-        """Force [N] whose relative round-off each element's force carries, (E,)."""
+    def force_scale(self, size: float) -> Array:
+        """Force [N] whose relative round-off each element's force carries, (E,), at coordinates of ``size`` [m]."""
 
     def begin(self, time: float, x: Array) -> None:  # noqa: B027
         """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""

@@ -1,0 +1,206 @@
+"""Set-up: from a checked scene to one rank's part of the discretised problem; collective."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.assembly.blocks import BlockRows
+from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.errors import InputError
+from lyra_petsc.handles.held import Held, is_exact, select_held
+from lyra_petsc.meshing.build import build_mesh
+from lyra_petsc.meshing.measure import bounding_diagonal, mean_edge_length
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.meshing.select import select_vertices
+from lyra_petsc.output.phases import Phases
+from lyra_petsc.parallel import on_root
+from lyra_petsc.partition.distribute import Part, Whole, distribute
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.partition.points import Points
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.start import start_positions, start_velocities
+from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.registry import REGISTRY, Registration, active
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, Load, Term, Viscous
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass
+class Outline:
+    """What every rank knows of the whole: a few numbers and names."""
+
+    n_vertices: int
+    n_triangles: int
+    spacing: float
+    """Mean rest edge length [m]."""
+    diagonal: float
+    """Diagonal of the rest bounding box [m]."""
+    reach: float
+    """Largest coordinate [m] of the start and rest shape."""
+    terms: list[str]
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Model:
+    """One rank's part of a scene, ready to step.
+
+    Attributes
+    ----------
+    scene, outline
+    points : Points
+    terms : dict of name → Term
+        The active ones.
+    system : ReducedSystem
+    pattern : BlockPattern
+    probes : dict of name → (n,) int
+        Owned vertices of each probe, local numbering.
+    mesh : Mesh or None
+        The whole mesh, on rank 0, until ``release``.
+    partitioner : str
+    """
+
+    scene: Scene
+    outline: Outline
+    points: Points
+    terms: dict[str, Term]
+    system: ReducedSystem
+    pattern: BlockPattern
+    probes: dict[str, Ints]
+    mesh: Mesh | None
+    partitioner: str
+
+    def release(self) -> None:
+        """Let go of the whole mesh; from here on no rank holds a global array."""
+        self.mesh = None
+
+    @property
+    def membrane(self) -> Membrane:
+        """The membrane term, which every scene has."""
+        term = self.terms["membrane"]
+        assert isinstance(term, Membrane)
+        return term
+
+
+def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
+    """Mesh, partition, terms and matrix pattern of a scene; collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks alike, for whatever in the scene or its meshes cannot be simulated.
+    """
+    whole: Whole | None = None
+    mesh: Mesh | None = None
+
+    def prepare() -> Outline:
+        nonlocal whole, mesh
+        mesh = build_mesh(scene.mesh, file=scene.source)
+        outline, whole = _whole(scene, mesh)
+        return outline
+
+    with phases("mesh"):
+        outline = on_root(comm, prepare)
+        assert outline is not None
+    with phases("partition"):
+        part = distribute(comm, whole)
+        whole = None
+    with phases("assembly"):
+        return _local(scene, outline, part, mesh)
+
+
+def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
+    """Everything there is to distribute (rank 0)."""
+    rest = RestShape(scene, mesh)
+    light = np.flatnonzero(~(rest.mass > 0.0))
+    if len(light):
+        raise InputError(
+            f"{len(light)} vertices without mass (first: {light[:5].tolist()}); give their material a density > 0",
+            file=scene.source,
+            key="material",
+        )
+    elements: dict[str, Elements] = {}
+    names = []
+    for entry in active(scene, rest.shells):
+        found = entry.module().elements(rest)
+        if found is not None and len(found.stencil) == 0:
+            continue
+        names.append(entry.name)
+        if found is not None:
+            elements[entry.name] = found
+    held = select_held(scene, mesh)
+    for number, vertices in held.items():
+        elements[f"held {number}"] = Elements(vertices[:, None])
+    for name, selector in scene.probes.items():
+        vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
+        elements[f"probe {name}"] = Elements(vertices[:, None])
+    data = {"position": mesh.positions, "mass": rest.mass}
+    if scene.initial is not None:
+        data |= start_positions(scene.initial, mesh, held) | start_velocities(scene.initial, mesh, rest.mass)
+    outline = Outline(
+        n_vertices=mesh.n_vertices,
+        n_triangles=mesh.n_triangles,
+        spacing=mean_edge_length(mesh),
+        diagonal=bounding_diagonal(mesh.rest),
+        reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
+        terms=names,
+        notes=[*mesh.notes, *rest.notes],
+    )
+    return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data)
+
+
+def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Model:
+    mass = part.vertex_data["mass"]
+    registered: dict[str, Registration] = {entry.name: entry for entry in REGISTRY}
+    terms: dict[str, Term] = {
+        name: registered[name].module().make(part.elements.get(name), scene, mass) for name in outline.terms
+    }
+    points = part.points
+    explicit = scene.time.integrator == "semi-implicit"
+    coupling = {
+        name: term.stencil
+        for name, term in terms.items()
+        if isinstance(term, Elastic) or (isinstance(term, Viscous) and not explicit)
+    }
+    pattern = BlockPattern(coupling, points.n_owned, points.n_local, points.global_number)
+    held = Held(
+        scene,
+        {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
+    )
+    system = ReducedSystem(
+        points,
+        mass,
+        [t for t in terms.values() if isinstance(t, Elastic)],
+        [t for t in terms.values() if isinstance(t, Viscous)],
+        [t for t in terms.values() if isinstance(t, Load)],
+        held,
+        BlockRows(pattern),
+        starts=[handle.start for handle in scene.handles],
+        explicit_wind=explicit,
+        exact_hessian=scene.solver.hessian == "exact",
+    )
+    data = part.vertex_data
+    system.x[: points.n_owned] = data["position"]
+    points.update_ghosts(system.x)
+    # handles set out from the undisturbed shape
+    system.begin(0.0)
+    system.x[: points.n_owned] = data.get("start", data["position"])
+    system.v[: points.n_owned] = data.get("velocity", 0.0)
+    points.update_ghosts(system.x)
+    points.update_ghosts(system.v)
+    probes = {name: _own(part, f"probe {name}") for name in scene.probes}
+    return Model(scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner)
+
+
+def _own(part: Part, name: str) -> Ints:
+    """Owned vertices of a set of single-vertex elements, local numbering."""
+    elements = part.elements[name]
+    return elements.stencil[: elements.n_owned, 0].astype(np.int64)

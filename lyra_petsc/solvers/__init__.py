@@ -1,0 +1,1 @@
+"""PETSc options: presets per problem, precedence, unused ones; and failures in words."""

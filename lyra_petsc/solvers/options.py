@@ -1,0 +1,60 @@
+"""The PETSc options database: who wins, and what was never used.
+
+Precedence: our defaults < scene ``petsc:`` < ``.petscrc`` < ``PETSC_OPTIONS`` < command line. PETSc has
+read the last three by the time a scene is known, so that a scene and our defaults only fill gaps. The
+database is never cleared.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+
+from petsc4py import PETSc
+
+Value = str | int | float | bool | None
+
+
+def fill_gaps(options: Mapping[str, Value]) -> list[str]:
+    """Set each option that nobody has set; returns the names that were set."""
+    database = PETSc.Options()
+    filled = []
+    for name, value in options.items():
+        if not database.hasName(name):
+            database.setValue(name, _text(value))
+            filled.append(name)
+    return filled
+
+
+def is_set(name: str) -> bool:
+    """Whether an option stands in the database."""
+    return bool(PETSc.Options().hasName(name))
+
+
+def _text(value: Value) -> str:
+    if value is None or value is True:
+        return "" if value is None else "true"
+    return "false" if value is False else str(value)
+
+
+def unused(ours: list[str]) -> list[str]:
+    """Options in the database that nothing has asked for, but for those of ``ours``.
+
+    petsc4py has no call for this, the C library has: ``PetscOptionsLeftGet``.
+    """
+    try:
+        library = ctypes.CDLL(PETSc.__file__)
+        get = library.PetscOptionsLeftGet
+    except (AttributeError, OSError):
+        return []
+    count = ctypes.c_int64(0)  # PetscInt is 32 or 64 bits wide; little end first
+    names = ctypes.POINTER(ctypes.c_char_p)()
+    values = ctypes.POINTER(ctypes.c_char_p)()
+    get.argtypes = [ctypes.c_void_p] * 4
+    if get(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)):
+        return []
+    found = [names[i].decode() for i in range(count.value)]
+    restore = library.PetscOptionsLeftRestore
+    restore.argtypes = [ctypes.c_void_p] * 4
+    restore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
+    return sorted(name for name in found if name not in ours)

@@ -1,0 +1,55 @@
+"""Why PETSc stopped, in words, and what to try."""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+_SNES = {
+    PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "Newton did not converge within its iterations",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "the line search found no smaller energy",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the linear solve failed",
+    PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN: "the residual is not a number (a triangle collapsed?)",
+    PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN: "the residual is not a number (a triangle collapsed?)",
+    PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_COUNT: "the limit of residual evaluations was reached",
+    PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN: "the line search is stuck in a point that is no solution",
+    PETSc.SNES.ConvergedReason.DIVERGED_INNER: "the inner solve failed",
+}
+_KSP = {
+    PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT: "too many linear iterations",
+    PETSc.KSP.ConvergedReason.DIVERGED_DTOL: "the linear residual grew",
+    PETSc.KSP.ConvergedReason.DIVERGED_BREAKDOWN: "the Krylov method broke down",
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC: "the preconditioner is not positive definite",
+    PETSc.KSP.ConvergedReason.DIVERGED_NANORINF: "the linear system holds a number that is not finite",
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT: "the matrix is not positive definite",
+    -11: "the preconditioner could not be set up (a zero pivot?)",
+}
+_PRECONDITIONER = {
+    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
+    PETSc.KSP.ConvergedReason.DIVERGED_NANORINF,
+    PETSc.KSP.ConvergedReason.DIVERGED_BREAKDOWN,
+    PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT,
+    PETSc.KSP.ConvergedReason.DIVERGED_DTOL,
+    -11,
+}
+
+
+def in_words(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
+    """Why a nonlinear solve failed."""
+    reason = snes.getConvergedReason()
+    words = _SNES.get(reason, f"SNES stopped with reason {reason}")
+    linear = ksp.getConvergedReason()
+    if linear < 0:
+        words += f": {_KSP.get(linear, f'KSP stopped with reason {linear}')}"
+    return words
+
+
+def preconditioner_failed(ksp: PETSc.KSP) -> bool:
+    """Whether another preconditioner might help."""
+    return ksp.getConvergedReason() in _PRECONDITIONER
+
+
+def advice(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
+    """What a user may try after the smallest step has failed."""
+    if ksp.getConvergedReason() < 0:
+        return "try -pc_type lu (one rank) or -pc_type lu -pc_factor_mat_solver_type mumps, or -ksp_max_it"
+    return "try a smaller time.step, solver.max_iterations above 50, more damping, or a finer mesh"

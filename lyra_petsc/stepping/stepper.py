@@ -1,0 +1,279 @@
+"""PETSc TS, SNES, KSP and Mat of a run, owned here, and one attempt at a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.solvers import reasons
+from lyra_petsc.solvers.options import fill_gaps, is_set
+from lyra_petsc.solvers.presets import PRESETS, candidates, options_of
+from lyra_petsc.stepping.system import ReducedSystem
+
+Array = NDArray[np.float64]
+Reason = PETSc.SNES.ConvergedReason
+
+ENERGY_ROUNDOFF = 1e-14
+"""Differences of the objective below this fraction of its summands are noise."""
+
+WITH_RIGID_MODES = ("gamg", "ml", "hypre")
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Outcome of one attempt at a step."""
+
+    converged: bool
+    newton_iterations: int
+    linear_iterations: int
+    residual: float
+    words: str = ""
+    advice: str = ""
+    at_roundoff: bool = False
+
+
+class Stepper:
+    """Backward Euler by TSBEULER on the reduced system.
+
+    Parameters
+    ----------
+    scene : Scene
+    system : ReducedSystem
+    pattern : BlockPattern
+    spacing : float
+        Mean edge length [m], for the step tolerance.
+    floor : float
+        Norm [N] of the residual's round-off.
+
+    Attributes
+    ----------
+    ts, snes, ksp : PETSc objects
+        Without options prefix.
+    preset : str
+        Name of the linear solver in use.
+    our_options : list of str
+        Options this class filled in.
+
+    Raises
+    ------
+    InputError
+        For options that contradict the scene (``-ts_type``, ``-ts_theta_endpoint``, …).
+    """
+
+    def __init__(
+        self, scene: Scene, system: ReducedSystem, pattern: BlockPattern, spacing: float, floor: float
+    ) -> None:
+        self._scene, self._system, self._pattern = scene, system, pattern
+        self._spacing, self._floor = spacing, floor
+        self._newton = scene.time.integrator != "semi-implicit"
+        self._presets = candidates()
+        self.our_options: list[str] = []
+        self._filled: list[str] = []
+        self._shape = (system.points.n_owned, 3)
+        self._create()
+
+    # -- objects -------------------------------------------------------------------------------------
+
+    def _create(self) -> None:
+        points, scene = self._system.points, self._scene
+        self.preset = self._presets[0]
+        self._fill(options_of(self.preset, PETSc.Options().getString("pc_type", "")))
+        self.matrix = SystemMatrix(points, self._pattern, "baij")
+        self.velocity = PETSc.Vec().createMPI((3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm)
+        self.residual = self.velocity.duplicate()
+        self.ts = ts = PETSc.TS().create(points.comm)
+        ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
+        ts.setType(PETSc.TS.Type.BEULER)
+        ts.setIFunction(self._ifunction, self.residual)
+        ts.setIJacobian(self._ijacobian, self.matrix.mat)
+        ts.setMaxTime(scene.time.end)
+        ts.setTimeStep(scene.time.step)
+        ts.setMaxSteps(np.iinfo(PETSc.IntType).max - 1)
+        ts.setMaxSNESFailures(1)
+        ts.setErrorIfStepFails(False)
+        ts.setExactFinalTime(PETSc.TS.ExactFinalTime.STEPOVER)
+        self.snes = snes = ts.getSNES()
+        self.ksp = ksp = snes.getKSP()
+        snes.setInitialGuess(self._guess)
+        ksp.setType(PETSc.KSP.Type.CG)
+        if self._newton:
+            snes.setType(PETSc.SNES.Type.NEWTONLS)
+            snes.setObjective(self._objective)
+            snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
+            snes.setConvergenceTest(self._converged)
+            ksp.setTolerances(rtol=1e-4, max_it=5000)
+        else:
+            snes.setType(PETSc.SNES.Type.KSPONLY)
+            ksp.setTolerances(rtol=1e-6, max_it=5000)
+        ts.setFromOptions()
+        self._refuse_contradictions()
+        ts.setSolution(self.velocity)
+
+    def _fill(self, options: dict[str, object]) -> None:
+        self._filled = fill_gaps(options)  # type: ignore[arg-type]
+        self.our_options += [name for name in self._filled if name not in self.our_options]
+
+    def _refuse_contradictions(self) -> None:
+        kind = self.ts.getType()
+        if kind != "beuler":
+            raise InputError(
+                f"'{kind}' is not a time scheme of this program; choose time.integrator in the scene "
+                "(beuler, semi-implicit) and leave -ts_type out",
+                key="-ts_type",
+            )
+        if is_set("ts_theta_endpoint"):
+            raise InputError("has no meaning for the reduced velocity form; leave it out", key="-ts_theta_endpoint")
+        if PETSc.Options().getString("ts_adapt_type", "none") != "none":
+            raise InputError("TS cannot judge steps of the reduced form; leave it out", key="-ts_adapt_type")
+
+    def next_preset(self) -> str | None:
+        """Change to the next linear solver; its name, or None if there is none left; collective."""
+        if len(self._presets) < 2:
+            return None
+        time, step = self.ts.getTime(), self.ts.getStepNumber()
+        self.destroy()
+        database = PETSc.Options()
+        for name in self._filled:
+            database.delValue(name)
+        self._presets.pop(0)
+        self._create()
+        self.start(time, step)
+        return self.preset
+
+    def destroy(self) -> None:
+        """Free all PETSc objects; collective."""
+        self.ts.destroy()
+        self.matrix.destroy()
+        self.velocity.destroy()
+        self.residual.destroy()
+
+    # -- a step ----------------------------------------------------------------------------------------
+
+    def start(self, time: float, step: int) -> None:
+        """Set time [s] and step number, and take the velocities from the system."""
+        self.ts.setTime(time)
+        self.ts.setStepNumber(step)
+        self.velocity.setArray(self._system.v[: self._shape[0]].ravel())
+
+    def attempt(self, t0: float, t1: float) -> Attempt:
+        """Try the step from t0 to t1 [s]; on success the system holds the new state; collective."""
+        system = self._system
+        system.begin_step(t0, t1)
+        self.velocity.setArray(system.v[: self._shape[0]].ravel())
+        number = self.ts.getStepNumber()
+        self.ts.setTime(t0)
+        self.ts.setTimeStep(t1 - t0)
+        self._at_roundoff = False
+        self._norm = 0.0
+        self.ts.step()
+        newton, linear = self.snes.getIterationNumber(), self.snes.getLinearSolveIterations()
+        converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
+        if converged:
+            velocity = self.velocity.getArray().reshape(self._shape).copy()
+            finite = system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0
+            if finite:
+                system.accept(velocity)
+                self.ts.setTime(t1)
+                return Attempt(True, newton, linear, self._norm, at_roundoff=self._at_roundoff)
+            return Attempt(False, newton, linear, self._norm, "the velocities are not finite", "try a smaller time.step")
+        words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
+        self._linear_failed = reasons.preconditioner_failed(self.ksp)
+        self.ts.setStepNumber(number)
+        self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
+        return Attempt(False, newton, linear, self._norm, words, advice)
+
+    @property
+    def linear_solver_failed(self) -> bool:
+        """Whether the last failed attempt might succeed with another preconditioner."""
+        return self._linear_failed
+
+    def monitor(self) -> None:
+        """Call the TS monitors that the user asked for; collective."""
+        self.ts.monitor(self.ts.getStepNumber(), self.ts.getTime(), self.velocity)
+
+    # -- callbacks ---------------------------------------------------------------------------------------
+
+    def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
+        v, rate = u.getArray(readonly=True).reshape(self._shape), udot.getArray(readonly=True).reshape(self._shape)
+        out = f.getArray().reshape(self._shape)
+        self._system.residual(v, rate, 1.0 / self._system.dt, out)
+
+    def _ijacobian(
+        self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
+    ) -> bool:
+        v = u.getArray(readonly=True).reshape(self._shape)
+        self.matrix.set(self._system.jacobian(v, shift))
+        if a != p:
+            a.assemble()
+        if self.ksp.getPC().getType() in WITH_RIGID_MODES:
+            self._set_rigid_modes()
+        if self._newton:
+            self._at = self._system.objective(v, shift)
+            self._at_norm = self.snes.getFunctionNorm()
+        return True
+
+    def _set_rigid_modes(self) -> None:
+        """Near-null space: the six rigid-body modes of the shape at the start of the step."""
+        coordinates = self.velocity.duplicate()
+        coordinates.setArray(self._system.x[: self._shape[0]].ravel())
+        coordinates.setBlockSize(3)
+        modes = PETSc.NullSpace().createRigidBody(coordinates)
+        self.matrix.mat.setNearNullSpace(modes)
+        modes.destroy()
+        coordinates.destroy()
+
+    def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
+        self._system.first_guess(u.getArray().reshape(self._shape))
+
+    def _objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
+        """Energy of a trial point; where differences drown in round-off, judged by its residual."""
+        v = u.getArray(readonly=True).reshape(self._shape)
+        sigma = 1.0 / self._system.dt
+        value, size = self._system.objective(v, sigma)
+        here, here_size = self._at
+        noise = ENERGY_ROUNDOFF * max(size, here_size)
+        if value == here or not abs(value - here) < noise:
+            return value
+        trial = np.empty(self._shape)
+        self._system.residual(v, sigma * (v - self._system.v[: self._shape[0]]), sigma, trial)
+        square = self._system.points.comm.allreduce(float(np.vdot(trial, trial)))
+        smaller = bool(np.sqrt(square) < self._at_norm)
+        return here - noise if smaller else here + noise
+
+    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
+        _, _, residual = norms
+        self._norm = residual
+        if not np.isfinite(residual):
+            return int(Reason.DIVERGED_FNORM_NAN)
+        if residual <= self._floor:
+            self._at_roundoff = True
+            return int(Reason.CONVERGED_FNORM_ABS)
+        rtol, atol, stol, _ = snes.getTolerances()
+        if residual <= atol:
+            return int(Reason.CONVERGED_FNORM_ABS)
+        if iteration == 0:
+            self._first_norm = residual
+            return None
+        if residual <= rtol * self._first_norm:
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.dt
+        forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
+        scale = float(np.sqrt(forces.max()))
+        solver = self._scene.solver
+        if residual <= solver.force_tolerance * scale and increment <= solver.step_tolerance * self._spacing:
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        if 0.0 < increment <= stol * self._spacing:
+            return int(Reason.CONVERGED_SNORM_RELATIVE)
+        return None
+
+
+def preset_names() -> list[str]:
+    """Names of the linear solvers, for messages."""
+    return list(PRESETS)
