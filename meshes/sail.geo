@@ -13,15 +13,17 @@ Point(1) = {0, 0, 0, size};       // tack
 Point(2) = {base, 0, 0, size};    // clew
 Point(3) = {0, 0, height, size};  // head
 
-// control points of the curved edges; the leech also has roach, so it lies outside the straight line
-Point(4) = {0.25 * base, 1.3 * foot_camber, 0, size};
-Point(5) = {0.65 * base, 1.0 * foot_camber, 0, size};
-Point(6) = {0.80 * base, 0.9 * leech_twist, 0.30 * height, size};
-Point(7) = {0.45 * base, 1.2 * leech_twist, 0.66 * height, size};
+// the foot is an arc; the leech runs through points off the plane, with roach beyond the straight line
+Point(4) = {0.25 * base, 0.75 * foot_camber, 0, size};
+Point(5) = {0.50 * base, foot_camber, 0, size};
+Point(6) = {0.75 * base, 0.75 * foot_camber, 0, size};
+Point(7) = {0.78 * base, 0.70 * leech_twist, 0.27 * height, size};
+Point(8) = {0.54 * base, leech_twist, 0.53 * height, size};
+Point(9) = {0.27 * base, 0.70 * leech_twist, 0.77 * height, size};
 
 Line(1) = {3, 1};
-Bezier(2) = {1, 4, 5, 2};
-Bezier(3) = {2, 6, 7, 3};
+Spline(2) = {1, 4, 5, 6, 2};
+Spline(3) = {2, 7, 8, 9, 3};
 
 Curve Loop(1) = {1, 2, 3};
 Surface(1) = {1};

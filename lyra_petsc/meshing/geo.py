@@ -59,7 +59,7 @@ def mesh_geo(
             except Exception as error:  # gmsh raises nothing more precise
                 raise InputError(f"gmsh: {_complaint(gmsh) or error}", file=path) from None
         try:
-            sheet = read_msh(meshed)
+            sheet = read_msh(meshed, note_loose=False)  # construction points of the script
         except InputError as error:
             raise InputError(error.message, file=path) from None
     if size is not None:
@@ -109,6 +109,7 @@ def _complaint(gmsh: ModuleType) -> str:
 @contextmanager
 def _session() -> Iterator[ModuleType]:
     """gmsh, quiet, with the user's gmsh configuration ignored; signal handlers are left as they were."""
+    handlers = _signal_handlers()  # before the import: gmsh 4.8 resets SIGINT there
     try:
         import gmsh
     except (ImportError, OSError) as error:
@@ -116,7 +117,6 @@ def _session() -> Iterator[ModuleType]:
             f".geo files need gmsh ({error}); install it (apt install python3-gmsh or pip install gmsh) "
             "or give a .msh file"
         ) from None
-    handlers = _signal_handlers()
     # someone else's session in this process goes on after ours (isInitialized came after gmsh 4.8)
     shared = bool(getattr(gmsh, "isInitialized", lambda: False)())
     if not shared:

@@ -19,7 +19,9 @@ class NoTrianglesError(MshError):
     """A sound file without a surface mesh."""
 
 
-def assemble(tags: Ints, points: NDArray[np.float64], blocks: list[Block], names: Names) -> Sheet:
+def assemble(
+    tags: Ints, points: NDArray[np.float64], blocks: list[Block], names: Names, *, note_loose: bool
+) -> Sheet:
     """Sheet of the triangles in ``blocks``.
 
     Parameters
@@ -31,6 +33,8 @@ def assemble(tags: Ints, points: NDArray[np.float64], blocks: list[Block], names
         Elements in file order, with node tags.
     names : dict
         Names of physical groups by (dimension, tag).
+    note_loose : bool
+        Whether dropping nodes that are in no triangle deserves a note.
 
     Raises
     ------
@@ -49,7 +53,7 @@ def assemble(tags: Ints, points: NDArray[np.float64], blocks: list[Block], names
     used = np.zeros(len(tags), dtype=np.bool_)
     used[triangles] = True
     new_number = np.cumsum(used) - 1
-    if not used.all():
+    if note_loose and not used.all():
         loose = tags[~used]
         verb = "node that is in no triangle" if len(loose) == 1 else "nodes that are in no triangle"
         notes.append(f"{len(loose)} {verb} dropped (tag {culprits(loose.tolist())})")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.measure import bounding_diagonal
 from lyra_petsc.meshing.mesh import Group, Mesh
+from lyra_petsc.nearest import nearest
 
 DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 
@@ -96,11 +96,7 @@ def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -
     found = mesh.groups.get(name)
     if found is not None:
         return found
-    near = difflib.get_close_matches(name, mesh.groups, n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    raise InputError(
-        f"no group '{name}' in the mesh; {hint}groups: {listing(mesh.groups)}", key=key, file=file
-    )
+    raise InputError(f"no group '{name}' in the mesh; {nearest(name, mesh.groups)}", key=key, file=file)
 
 
 def listing(names: Iterable[str]) -> str:
