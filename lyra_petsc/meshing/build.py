@@ -140,10 +140,10 @@ def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) ->
         flat[sheet.triangles.reshape(-1), :2] = uv.reshape(-1, 2)
         seams = bool((flat[sheet.triangles][:, :, :2] != uv).any())
         rest = rest if seams else flat
-    check_shape(positions[sheet.triangles], "start", **where)
-    if uv is None:
+    else:
         check_shape(rest[sheet.triangles], "rest", **where)
         uv = lay_out(rest, sheet.triangles)
+    check_shape(positions[sheet.triangles], "start", **where)
     return _Piece(positions, rest, sheet.triangles, uv, sheet.uv is not None, seams)
 
 

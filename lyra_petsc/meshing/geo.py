@@ -100,7 +100,11 @@ def _set_size(gmsh: ModuleType, size: float | None) -> None:
 
 def _complaint(gmsh: ModuleType) -> str:
     """First error gmsh logged, in one line."""
-    for line in gmsh.logger.get():
+    try:
+        lines = gmsh.logger.get()
+    except UnicodeDecodeError:  # an error message that quotes the script
+        return "the script has an error, in text that is not UTF-8"
+    for line in lines:
         if line.startswith("Error"):
             return " ".join(line.split(":", 1)[1].split())
     return ""
@@ -123,6 +127,7 @@ def _session() -> Iterator[ModuleType]:
         gmsh.initialize(readConfigFiles=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("General.Verbosity", 1)  # errors only
         gmsh.option.setNumber("General.AbortOnError", 0)
         if shared:
             gmsh.model.add("lyra_petsc")

@@ -65,7 +65,8 @@ def assemble(
     empty = {name for (dimension, _), name in names.items() if dimension < 3} - {
         group.name for group in groups
     }
-    notes += [f"physical group '{name}' has no elements on the triangles; left out" for name in sorted(empty)]
+    if empty:
+        notes.append(f"physical groups without elements on the triangles left out: {culprits(sorted(empty))}")
     return Sheet(points[used], new_number[triangles], groups=groups, notes=notes)
 
 

@@ -130,7 +130,7 @@ def _parse(text: str, path: Path) -> _Raw:
             elif word not in _IGNORED:
                 raw.unknown[word[:20]] = number
         except (ValueError, IndexError, OverflowError) as error:
-            shown = line.strip()[:60]
+            shown = "".join(c if c.isprintable() else "?" for c in line.strip()[:60])
             reason = f" ({error})" if isinstance(error, _FaceError) else ""
             raise InputError(f"line {number}: '{shown}' cannot be read{reason}", file=path) from None
     close("g", [])
