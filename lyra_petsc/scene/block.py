@@ -18,6 +18,9 @@ class Block(BaseModel):
     # keys for which an explicit null is a value and not the same as leaving them out
     null_is_a_value: ClassVar[frozenset[str]] = frozenset()
 
+    # keys that a scene may well try, and what to say of them
+    not_yet: ClassVar[dict[str, str]] = {}
+
     @classmethod
     def keys(cls) -> list[str]:
         """The keys as a scene file writes them."""
@@ -34,6 +37,8 @@ class Block(BaseModel):
         for key in data:
             if key not in known:
                 word = key if isinstance(key, str) else shown(key)
+                if word in cls.not_yet:
+                    raise problem(cls.not_yet[word], word)
                 raise problem(f"unknown key, {nearest(word, known)}", word)
         kept = {key: value for key, value in data.items() if value is not None or key in cls.null_is_a_value}
         return cls.complete(kept)

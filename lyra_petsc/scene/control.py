@@ -12,6 +12,8 @@ from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.values import Count, Flag, Positive, number, problem, shown
 
 INTEGRATORS = ("beuler", "semi-implicit")
+LATER_INTEGRATORS = ("midpoint", "alpha2", "bdf2")
+WHAT_IS_THERE = f"there is: end and step in seconds, integrator {' or '.join(INTEGRATORS)}"
 FIELDS = (
     "velocity",
     "green_strain",
@@ -35,6 +37,11 @@ class Time(Block):
         ``beuler`` (full Newton) or ``semi-implicit`` (one linear solve a step).
     """
 
+    not_yet: ClassVar[dict[str, str]] = {
+        "analysis": f"static analysis is not there yet; {WHAT_IS_THERE}",
+        "tolerance": f"adaptive steps are not there yet; {WHAT_IS_THERE}",
+    }
+
     end: Positive
     step: Positive
     integrator: Literal["beuler", "semi-implicit"] = "beuler"
@@ -43,12 +50,14 @@ class Time(Block):
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Refuse ``step: auto`` in words: a number is what it takes."""
         if data.get("step") == "auto":
-            raise problem("adaptive steps are not there yet; give a number of seconds", "step")
+            raise problem(f"adaptive steps are not there yet; {WHAT_IS_THERE}", "step")
         return data
 
     @field_validator("integrator", mode="before")
     @classmethod
     def _there(cls, value: Any) -> Any:
+        if value in LATER_INTEGRATORS:
+            raise problem(f"{value} is not there yet; {WHAT_IS_THERE}")
         if value not in INTEGRATORS:
             raise problem(f"must be one of {', '.join(INTEGRATORS)}, not {shown(value)}")
         return value
@@ -111,13 +120,13 @@ class Solver(Block):
     max_iterations : int
         Newton iterations a step may take.
     hessian : str
-        ``regularised`` (kept positive definite) or ``exact``.
+        ``exact``, ``regularised`` (always positive definite), or ``adaptive``: as exact as it can be.
     """
 
     force_tolerance: Positive = 1e-6
     step_tolerance: Positive = 1e-6
     max_iterations: Count = 50
-    hessian: Literal["regularised", "exact"] = "regularised"
+    hessian: Literal["adaptive", "regularised", "exact"] = "adaptive"
 
 
 def _petsc_value(value: Any) -> Any:

@@ -1,0 +1,217 @@
+"""Every mistake in a scene is one InputError that names the file, the key and what is allowed."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.load import load_scene
+
+GRID = "mesh: {grid: {width: 1, height: 1, nx: 2, ny: 2}}"
+BASE = {"mesh": GRID, "material": "material: {cloth: paper}", "time": "time: {end: 1, step: 0.01}"}
+
+
+def scene_text(part: str) -> str:
+    """A scene that is right but for ``part``, which replaces the block of the same key."""
+    first = part.split(":", 1)[0]
+    return "\n".join([text for key, text in BASE.items() if key != first] + [part]) + "\n"
+
+
+# (block, key in the message, words in the message)
+CASES = [
+    # unknown keys, at every depth, with the nearest
+    ("gravitty: [0, 0, -9.81]", "gravitty", "did you mean 'gravity'"),
+    ("mesh: {gird: {}}", "mesh.gird", "did you mean 'grid'"),
+    ("mesh: {grid: {widht: 1, height: 1, nx: 2, ny: 2}}", "mesh.grid.widht", "'width'"),
+    ("mesh: [{grid: {width: 1, heigth: 1, nx: 2, ny: 2}}]", "mesh[0].grid.heigth", "'height'"),
+    ("handles: [{group: a}, {grup: a}]", "handles[1].grup", "'group'"),
+    ("handles: [{group: a, start: 0}]", "handles[0].start", "known: "),
+    ("material: {cloth: paper, dampng: 1}", "material.dampng", "'damping'"),
+    ("output: {checkpoint: {second: 1}}", "output.checkpoint.second", "'seconds'"),
+    ("motions: {swing: [{time: 0, rotate: {axis: [0, 0, 1], degree: 1}}]}",
+     "motions.swing[0].rotate.degree", "'degrees'"),
+    ("solver: {zzz: 1}", "solver.zzz", "known: force_tolerance"),
+    ("1: 2", "1", "unknown key"),
+    # wrong types
+    ("time: 3", "time", "must be a block with keys (end, step, integrator), not 3"),
+    ("time: {end: 1, step: '1e-5'}", "time.step", "not '1e-5' (text; write it without quotes)"),
+    ("time: {end: true, step: 1}", "time.end", "must be a number, not true"),
+    ("gravity: -9.81", "gravity", "three numbers"),
+    ("gravity: [0, 0]", "gravity", "three numbers"),
+    ("gravity: [0, 0, down]", "gravity", "must be a number, not 'down'"),
+    ("handles: {group: a}", "handles", "must be a list"),
+    ("handles: 7", "handles", "must be a list, not 7"),
+    ("motions: [1]", "motions", "block of names"),
+    ("probes: {tip: 3}", "probes.tip", "must be a block"),
+    ("output: {reactions: 1}", "output.reactions", "must be true or false, not 1"),
+    ("output: {fields: velocity}", "output.fields", "must be a list"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 2.0, ny: 2}}", "mesh.grid.nx", "whole number"),
+    ("title: 3", "title", "must be text"),
+    ("mesh: {file: 3}", "mesh.file", "path of a mesh file"),
+    ("handles: [{group: [a]}]", "handles[0].group", "must be text"),
+    # not finite, out of range
+    ("gravity: [0, 0, .nan]", "gravity", "finite"),
+    ("time: {end: .inf, step: 0.1}", "time.end", "finite"),
+    ("time: {end: 1" + "0" * 400 + ", step: 0.1}", "time.end", "below 1.8e308"),
+    ("time: {end: 1, step: 0}", "time.step", "must be > 0, not 0"),
+    ("time: {end: -1, step: 0.1}", "time.end", "must be > 0"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 0, ny: 2}}", "mesh.grid.nx", ">= 1"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 99999999999, ny: 2}}", "mesh.grid.nx", "<= 2147483646"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 50000, ny: 50000}}", "mesh.grid", "vertices"),
+    ("mesh: {grid: {width: 0, height: 1, nx: 2, ny: 2}}", "mesh.grid.width", "> 0"),
+    ("mesh: {grid: {width: 1, height: 1, nx: 2, ny: 2, pattern: cross}}", "mesh.grid.pattern", "criss-cross"),
+    (GRID[:-1] + ", transform: {scale: 0}}", "mesh.transform.scale", "not be 0"),
+    (GRID[:-1] + ", transform: {scale: [1, -1, 1]}}", "mesh.transform.scale", "> 0"),
+    (GRID[:-1] + ", transform: {rotate: {axis: [0, 0, 0], degrees: 3}}}",
+     "mesh.transform.rotate.axis", "zero vector"),
+    (GRID[:-1] + ", size: 0.1}", "mesh.size", ".geo files only"),
+    ("material: {cloth: paper, damping: -1}", "material.damping", ">= 0"),
+    ("material: {cloth: paper, thicken: 0}", "material.thicken", "> 0"),
+    ("wind: {velocity: [1, 0, 0], density: -1}", "wind.density", ">= 0"),
+    ("solver: {force_tolerance: 0}", "solver.force_tolerance", "> 0"),
+    ("solver: {hessian: exakt}", "solver.hessian", "'regularised' or 'exact'"),
+    ("output: {every: 0}", "output.every", "> 0"),
+    ("handles: [{nodes: [-1]}]", "handles[0].nodes[0]", ">= 0"),
+    ("handles: [{nodes: [99999999999999999999]}]", "handles[0].nodes[0]", "<= "),
+    ("handles: [{nodes: []}]", "handles[0].nodes", "list of vertex numbers"),
+    ("handles: [{nodes: [1, 2, 1]}]", "handles[0].nodes", "vertex 1 twice"),
+    ("handles: [{group: a, stiffness: 0}]", "handles[0].stiffness", "> 0"),
+    ("handles: [{group: a, axes: [w]}]", "handles[0].axes", "x, y, z"),
+    ("handles: [{group: a, axes: [[1]]}]", "handles[0].axes", "x, y, z"),
+    ("handles: [{box: [[0, 0, 0], [-1, 1, 1]]}]", "handles[0].box", "lower corner first"),
+    ("handles: [{box: [0, 1]}]", "handles[0].box", "three numbers"),
+    ("initial: {seed: -1}", "initial.seed", ">= 0"),
+    # what belongs together
+    ("material:", "material", "missing"),
+    ("mesh: []", "mesh", "at least one"),
+    ("mesh: {name: a}", "mesh", "exactly one of file, grid"),
+    ("mesh: {file: a.obj, grid: {width: 1, height: 1, nx: 2, ny: 2}}", "mesh", "exactly one of file, grid"),
+    ("mesh: {file: a.stl}", "mesh.file", ".geo, .msh, .obj"),
+    ("mesh: {file: none.obj}", "mesh.file", "no such file"),
+    ("mesh: [{file: none.obj}]", "mesh[0].file", "no such file"),
+    ("mesh: [{grid: {width: 1, height: 1, nx: 1, ny: 1}, name: a}, "
+     "{grid: {width: 1, height: 1, nx: 1, ny: 1}, name: a}]", "mesh[1].name", "earlier sheet"),
+    ("time: {end: 1}", "time.step", "missing"),
+    ("time: {end: 1, step: auto}", "time.step", "not there yet; there is: end and step"),
+    ("time: {end: 1, step: auto, tolerance: 1e-3}", "time.tolerance", "adaptive steps are not there yet"),
+    ("time: {end: 1, step: 0.1, integrator: bdf2}", "time.integrator", "beuler or semi-implicit"),
+    ("time: {end: 1, step: 0.1, integrator: euler}", "time.integrator", "one of beuler, semi-implicit"),
+    ("time: {end: 1, step: 0.1, integrator: [euler]}", "time.integrator", "must be one of"),
+    ("time: {analysis: static}", "time.analysis", "static analysis is not there yet; there is: end and step"),
+    ("material: {}", "material", "exactly one way"),
+    ("material: {cloth: paper, young: 1}", "material", "cloth and young are given"),
+    ("material: {cloth: paper, density: 1}", "material.density", "density_scale"),
+    ("material: {cloth: grey-interlock}", "material.cloth", "did you mean 'gray-interlock'"),
+    ("material: {cloth: zzz}", "material.cloth", "known: 11oz-black-denim"),
+    ("material: {density: 1}", "material", "exactly one way"),
+    ("material: {membrane: {c11: 1, c22: 1, c12: 0, c33: 1}}", "material.density", "missing"),
+    ("material: {density: 1, bending: 1}", "material.membrane", "missing"),
+    ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 1, c33: 1}}",
+     "material.membrane.c12", "positive definite"),
+    ("material: {density: 1, membrane: {c11: 1, c22: 1, c33: 1}}", "material.membrane.c12", "missing"),
+    ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 0}}", "material.membrane.c33", "> 0"),
+    ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, bending: [1, 2]}",
+     "material.bending", "three numbers"),
+    ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, bending: -1}",
+     "material.bending", ">= 0"),
+    ("material: {young: 1, poisson: 0.6, thickness: 1, density: 1}", "material.poisson", "(-1, 0.5]"),
+    ("material: {young: 1, poisson: -1, thickness: 1, density: 1}", "material.poisson", "(-1, 0.5]"),
+    ("material: {young: 1, poisson: 0.3, density: 1}", "material.thickness", "missing"),
+    ("material: [{cloth: paper}, {cloth: paper}]", "material[1].group", "second material"),
+    ("material: [{cloth: paper, group: a}, {cloth: paper, group: a}]", "material[1].group", "'a'"),
+    ("wind: {velocity: [1, 0, 0]}", "wind.density", "missing"),
+    ("handles: [{}]", "handles[0]", "exactly one of group, nodes, box"),
+    ("handles: [{group: a, nodes: [1]}]", "handles[0]", "exactly one of group, nodes, box"),
+    ("handles: [{group: a, from: 2, until: 2}]", "handles[0].until", "later than from = 2"),
+    ("handles: [{group: a, motion: swing}]", "handles[0].motion", "unknown motion 'swing'"),
+    ("motions: {swing: []}", "motions.swing", "at least one keyframe"),
+    ("motions: {swing: [{time: 1}, {time: 1}]}", "motions.swing[1].time", "later than the keyframe before"),
+    ("loads: [{group: a}]", "loads[0]", "exactly one of force, pressure, traction"),
+    ("loads: [{force: [0, 0, 1]}]", "loads[0].force", "needs exactly one of group"),
+    ("loads: [{pressure: 1, nodes: [1]}]", "loads[0].nodes", "use group"),
+    ("loads: [{pressure: 1, traction: [0, 0, 1]}]", "loads[0]", "exactly one of force"),
+    ("output: {fields: [velocity, stres]}", "output.fields", "did you mean 'stress'"),
+    ("petsc: {-ksp_type: cg}", "petsc.-ksp_type", "without the dash"),
+    ("petsc: {ksp_type: [cg]}", "petsc.ksp_type", "must be text, a number"),
+    ("petsc: [a]", "petsc", "block of options"),
+    ("probes: {tip: {}}", "probes.tip", "exactly one of"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("part", "key", "words"), CASES, ids=[case[0][:50] for case in CASES])
+def test_message_names_file_key_and_remedy(tmp_path: Path, part: str, key: str, words: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(scene_text(part))
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    error = caught.value
+    assert error.key == key
+    assert words in error.message
+    assert error.file == str(path)
+    assert "\n" not in str(error)
+    assert len(str(error)) < 600
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_base_of_the_table_is_right(tmp_path: Path) -> None:
+    path = tmp_path / "good.yaml"
+    path.write_text(scene_text("title: right"))
+    assert load_scene(path).title == "right"
+
+
+def test_further_mistakes_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(
+        "mesh: {grid: {width: 0, height: 0, nx: 1, ny: 1}}\nmaterial: {cloth: x}\ntime: {end: 1}\n"
+    )
+    with pytest.raises(InputError, match=r"width: must be > 0, not 0 \(and 3 more\)"):
+        load_scene(path)
+
+
+UNREADABLE = [
+    (b"", "is empty"),
+    (b" \n\t\n", "is empty"),
+    (b"\xff\xfe\x00t", "not UTF-8"),
+    (b"title: \xe9\n", "not UTF-8 text (byte 7)"),
+    (b"title: \x00\n", "not YAML"),
+    (b"a: [1, 2\n", "line"),
+    (b"a: 1\na: 2\n", "duplicate key"),
+    (b"wind: {density: 1, density: 2}\n", "duplicate key"),
+    (b"- a\n- b\n", "must be a block of keys"),
+    (b"just words\n", "must be a block of keys"),
+    (b"---\na: 1\n---\nb: 2\n", "document"),
+    (b"a: !!python/object:os.system x\n", "could not determine a constructor"),
+    (b"a: *nowhere\n", "undefined alias"),
+    (b"a: 2001-13-45\n", "not YAML"),
+    (b"{[1]: 2, {a: b}: 3}\n", ""),
+    (b"a: " + b"[" * 3000 + b"\n", ""),
+    (b"mesh: &m [*m]\n", "must be a block"),
+    (b"%YAML 9.9\n---\na: 1\n", ""),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), UNREADABLE, ids=[repr(case[0][:20]) for case in UNREADABLE])
+@pytest.mark.parametrize("overrides", [[], ["time.end=1"]], ids=["plain", "set"])
+def test_unreadable_files(tmp_path: Path, content: bytes, words: str, overrides: list[str]) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_scene(path, overrides)
+    if not overrides or "a block" not in words:
+        assert words in caught.value.message
+    assert caught.value.file == str(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_and_directory(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_scene(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match="is a directory"):
+        load_scene(tmp_path)
+    with pytest.raises(InputError, match=r"cannot be read|no such file"):
+        load_scene(tmp_path / ("x" * 5000))
+    with pytest.raises(InputError, match=r"cannot be read|no such file"):
+        load_scene("a\0b")

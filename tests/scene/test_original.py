@@ -1,0 +1,257 @@
+"""The original program's conf.json, read as a scene."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.load import dump_scene, load_scene
+
+SHIPPED = """\
+{
+    "frame_time": 0.04,   // "quoted" comment, }
+    "frame_steps": 8,
+    "end_time": 15, /* over
+    two lines */
+    "cloths": [{
+        "mesh": "meshes/square.obj",
+        "transform": {"translate": [-0.5, -1, 0.5]},
+        "materials": [{"data": "materials/gray-interlock.json",
+            "damping": 0.03}],
+        "texture":"textures//rainbow.jpg"
+    }],
+    "handles": [{"nodes": [2,3], "motion":0,"end_time":10}],
+    "motions": [[
+        {"time": 1, "transform": {"rotate": [0,0,0,1]}},
+        {"time": 2, "transform": {"rotate": [-45,0,0,2], "translate": [0, 0, 1], "scale": 2}},
+    ]],
+    "gravity": [0, 0, -9.8]
+    //"wind":{"density":1,"velocity":[0,2,0],"drag":1}
+}
+"""
+
+SQUARE = "v 0 0 0\nv 1 0 0\nnl 3\nv 0 1 0\nv 1 1 0\nnl 3\nf 1 2 4\nf 1 4 3\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "meshes" / "square.obj").write_text(SQUARE)
+    (tmp_path / "meshes" / "textured.obj").write_text(SQUARE + "vt 0 0\n")
+    return tmp_path
+
+
+def write(folder: Path, **changes: Any) -> Path:
+    """A minimal scene with ``changes``; a change to None leaves the key out."""
+    scene: dict[str, Any] = {
+        "frame_time": 0.04,
+        "frame_steps": 8,
+        "end_time": 1,
+        "cloths": [{"mesh": "meshes/square.obj", "materials": [{"data": "materials/isotropic.json"}]}],
+    }
+    scene.update(changes)
+    path = folder / "conf.json"
+    path.write_text(json.dumps({key: value for key, value in scene.items() if value is not None}))
+    return path
+
+
+@pytest.mark.parametrize("name", ["conf.json", "conf/conf.json", "conf/spin.txt"])
+def test_shipped_scene(folder: Path, name: str) -> None:
+    path = folder / name
+    path.write_text(SHIPPED)
+    scene = load_scene(path)
+    assert scene.source == path
+    assert scene.time.step == pytest.approx(0.005, rel=1e-15)
+    assert scene.time.end == 15.0
+    assert scene.time.integrator == "semi-implicit"
+    assert scene.output.every == 0.04
+    assert scene.gravity == (0.0, 0.0, -9.8)
+    assert scene.wind is None
+    (sheet,) = scene.mesh
+    assert sheet.file == folder / "meshes" / "square.obj"
+    assert sheet.name is None
+    assert sheet.transform.translate == (-0.5, -1.0, 0.5)
+    assert sheet.transform.rotate is None
+    (material,) = scene.material
+    assert material.group is None
+    assert material.damping == 0.03
+    assert material.density == 0.187
+    assert material.membrane is not None
+    # twice the table's first row; its c12 = -14.69599 counts as 0
+    assert material.membrane.c11 == pytest.approx(33.187664)
+    assert material.membrane.c22 == pytest.approx(68.954246)
+    assert material.membrane.c12 == 0.0
+    assert material.membrane.c33 == pytest.approx(36.860302)
+    assert material.bending == pytest.approx((2.3191698e-05 / 4, 2.4749964e-05 / 4, 1.4267624e-05 / 4))
+    (handle,) = scene.handles
+    assert handle.nodes == [2, 3]
+    assert (handle.start, handle.until, handle.fade, handle.stiffness) == (0.0, 10.0, 0.0, 1000.0)
+    assert handle.motion == "motion0"
+    first, second = scene.motions["motion0"]
+    assert first.rotate is None
+    assert second.rotate is not None
+    assert second.rotate.degrees == -45.0
+    assert second.rotate.axis == (0.0, 0.0, 2.0)
+    assert second.translate == (0.0, 0.0, 1.0)
+    assert second.scale == 2.0
+
+
+def test_import_survives_dump_and_takes_overrides(folder: Path) -> None:
+    path = folder / "conf.json"
+    path.write_text(SHIPPED)
+    understood = folder / "understood.yaml"
+    understood.write_text(dump_scene(load_scene(path)))
+    assert load_scene(understood) == load_scene(path)
+    scene = load_scene(path, ["time.integrator=beuler", "handles[0].until=", "material.damping=0"])
+    assert scene.time.integrator == "beuler"
+    assert scene.handles[0].until == math.inf
+    assert scene.material[0].damping == 0.0
+
+
+def test_defaults_of_the_original(folder: Path) -> None:
+    scene = load_scene(write(folder, frame_steps=None))
+    assert scene.time.step == 0.04
+    assert scene.gravity is None
+    assert scene.wind is None
+    assert scene.handles == []
+    assert scene.material[0].damping == 0.0
+    scene = load_scene(write(folder, frame_time=None, frame_steps=None))
+    assert scene.time.step == pytest.approx(0.005, rel=1e-15)
+    assert load_scene(write(folder, end_time=None, end_frame=50)).time.end == pytest.approx(2.0)
+    handle = {"nodes": [0], "motion": -1, "label": -1}
+    assert load_scene(write(folder, handles=[handle])).handles[0].motion is None
+    assert load_scene(write(folder, wind={"velocity": [0, 2, 0]})).wind is None
+    wind = load_scene(write(folder, wind={"velocity": [0, 2, 0], "density": 1})).wind
+    assert wind is not None
+    assert (wind.velocity, wind.density, wind.drag) == ((0.0, 2.0, 0.0), 1.0, 0.0)
+    assert load_scene(write(folder, wind={"drag": 1})).wind is not None
+
+
+def test_factors_stay_factors(folder: Path) -> None:
+    material = {
+        "data": "isotropic", "density_mult": 2, "stretching_mult": 3, "bending_mult": 4, "thicken": 5
+    }  # fmt: skip
+    scene = load_scene(write(folder, cloths=[{"mesh": "meshes/square.obj", "materials": [material]}]))
+    (ours,) = scene.material
+    assert (ours.density_scale, ours.stretching_scale, ours.bending_scale, ours.thicken) == (2, 3, 4, 5)
+    assert ours.membrane is not None
+    assert (ours.density, ours.membrane.c11, ours.membrane.c33) == (0.1, 80.0, 40.0)
+
+
+def test_several_cloths_labels_and_offsets(folder: Path) -> None:
+    cloth = {"mesh": "meshes/square.obj", "materials": [{"data": "paper"}]}
+    handles = [{"nodes": [1], "cloth": 1}, {"label": 3}, {"label": 3, "cloth": 1}]
+    scene = load_scene(write(folder, cloths=[cloth, cloth], handles=handles))
+    assert [sheet.name for sheet in scene.mesh] == ["cloth0", "cloth1"]
+    assert [material.group for material in scene.material] == ["cloth0", "cloth1"]
+    assert [handle.nodes for handle in scene.handles] == [[5], [1, 3], [5, 7]]
+
+
+def test_material_file_beside_the_scene(folder: Path) -> None:
+    row = [10, -1, 20, 5]
+    table = {"density": 0.3, "stretching": [row] * 6, "bending": [[4e-5] * 5, [-1e-5] * 5, [8e-5] * 5]}
+    (folder / "mine.json").write_text("// measured by hand\n" + json.dumps(table))
+    cloth = {"mesh": "meshes/square.obj", "materials": [{"data": "mine.json"}]}
+    (material,) = load_scene(write(folder, cloths=[cloth])).material
+    assert material.density == 0.3
+    assert material.membrane is not None
+    assert (material.membrane.c11, material.membrane.c12) == (20.0, 0.0)
+    assert (material.membrane.c22, material.membrane.c33) == (40.0, 5.0)
+    assert material.bending == (1e-5, 0.0, 2e-5)
+
+
+ONE = {"mesh": "meshes/square.obj", "materials": [{"data": "paper"}]}
+
+BAD = [
+    ({"gravty": [0, 0, 1]}, "gravty", "did you mean 'gravity'"),
+    ({"obstacles": []}, "obstacles", "unknown key"),
+    ({"cloths": None}, "cloths", "missing"),
+    ({"cloths": []}, "cloths", "at least one"),
+    ({"cloths": 3}, "cloths", "must be a list"),
+    ({"cloths": [{**ONE, "mesh": "meshes/none.obj"}]}, "cloths[0].mesh", "no such file: meshes/none.obj"),
+    ({"cloths": [{**ONE, "mesh": "conf.json"}]}, "cloths[0].mesh", ".obj"),
+    ({"cloths": [{**ONE, "textur": "a"}]}, "cloths[0].textur", "'texture'"),
+    ({"cloths": [{**ONE, "materials": []}]}, "cloths[0].materials", "one material"),
+    ({"cloths": [{**ONE, "materials": [{"data": "materials/grey-interlock.json"}]}]},
+     "cloths[0].materials[0].data", "did you mean 'gray-interlock'"),
+    ({"cloths": [{**ONE, "materials": [{"data": "paper", "yield_curv": 1}]}]},
+     "cloths[0].materials[0].yield_curv", "unknown key"),
+    ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0]}}]}, "cloths[0].transform.rotate", "[degrees, x,"),
+    ({"cloths": [{**ONE, "transform": {"rotate": [45, 0, 0, 0]}}]}, "cloths[0].transform.rotate", "axis"),
+    ({"cloths": [{**ONE, "mesh": "meshes/textured.obj", "transform": {"scale": 2}}]},
+     "cloths[0].transform.scale", "material coordinates"),
+    ({"handles": [{"motion": 0, "nodes": [1]}]}, "handles[0].motion", "no motion 0"),
+    ({"handles": [{"nodes": [1], "cloth": 1}]}, "handles[0].cloth", "no cloth 1"),
+    ({"handles": [{"nodes": [-1]}]}, "handles[0].nodes[0]", ">= 0"),
+    ({"handles": [{}]}, "handles[0]", "nodes or label"),
+    ({"handles": [{"label": 9}]}, "handles[0].label", "no vertex has label 9"),
+    ({"handles": [{"type": "glue", "nodes": [1, 2]}]}, "handles[0].type", "'node'"),
+    ({"handles": [{"nodes": [1], "start_time": 2, "end_time": 1}]}, "handles[0].until", "later than"),
+    ({"motions": [[]]}, "motions[0]", "list of keyframes"),
+    ({"motions": [[{"time": 1, "velocity": {"scale": 2}}]]}, "motions[0][0].velocity", "translate only"),
+    ({"motions": [[{"time": 2}, {"time": 1}]]}, "motions.motion0[1].time", "later than"),
+    ({"end_time": None}, "time.end", "missing"),
+    ({"frame_steps": 0}, "frame_steps", ">= 1"),
+    ({"frame_time": "0.04"}, "frame_time", "must be a number"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "key", "words"), BAD, ids=[case[1] for case in BAD])
+def test_mistakes(folder: Path, changes: dict[str, Any], key: str, words: str) -> None:
+    path = write(folder, **changes)
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    assert caught.value.key == key
+    assert words in caught.value.message
+    assert caught.value.file == str(path)
+    assert "\n" not in str(caught.value)
+
+
+BROKEN = [
+    ('{"frame_time": 0.04,\n "frame_steps": }', "line 2"),
+    ('{"a": NaN}', "NaN"),
+    ('{"a": 1e999}', "1e999"),
+    ('{"a": 1, "a": 2}', "given twice"),
+    ('{"a": "unclosed', "is not JSON"),
+    ('{"a": 1} /* unclosed', "unknown key"),
+    ("// nothing but a comment", "is not JSON"),
+    ("[1, 2]", "must be a block"),
+    ('"text"', "must be a block"),
+    ("[" * 100_000, "nested too deeply"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BROKEN, ids=[case[0][:20] for case in BROKEN])
+def test_broken_json(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "conf.json"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_scene(path)
+    assert words in str(caught.value)
+
+
+BAD_TABLES = [
+    ({"density": 1, "stretching": [[1, 0, 1, 1]] * 5, "bending": [[1] * 5] * 3}, "stretching", "6 rows of 4"),
+    ({"density": 0.1, "stretching": [[1, 0, 1, 1]] * 6, "bending": [[1] * 4] * 3}, "bending", "3 rows of 5"),
+    ({"density": 0.1, "stretching": [[1, 0, 1, -1]] * 6, "bending": [[1] * 5] * 3}, "stretching[0]", "defin"),
+    ({"density": 0, "stretching": [[1, 0, 1, 1]] * 6, "bending": [[1] * 5] * 3}, "density", "> 0"),
+    ({"densty": 1}, "densty", "'density'"),
+    ([1], None, "must be a block"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("table", "key", "words"), BAD_TABLES, ids=[str(case[1]) for case in BAD_TABLES])
+def test_bad_material_files(folder: Path, table: object, key: str | None, words: str) -> None:
+    (folder / "mine.json").write_text(json.dumps(table))
+    cloth = {"mesh": "meshes/square.obj", "materials": [{"data": "mine.json"}]}
+    with pytest.raises(InputError) as caught:
+        load_scene(write(folder, cloths=[cloth]))
+    assert caught.value.file == str(folder / "mine.json")
+    assert caught.value.key == key
+    assert words in caught.value.message
