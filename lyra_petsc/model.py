@@ -185,7 +185,6 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         BlockRows(pattern),
         starts=[handle.start for handle in scene.handles],
         explicit_wind=explicit,
-        exact_hessian=scene.solver.hessian == "exact",
     )
     data = part.vertex_data
     system.x[: points.n_owned] = data["position"]

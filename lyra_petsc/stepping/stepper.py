@@ -15,6 +15,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import fill_gaps, is_set
 from lyra_petsc.solvers.presets import PRESETS, candidates, options_of
+from lyra_petsc.stepping.blend import INDEFINITE, Blend
 from lyra_petsc.stepping.system import ReducedSystem
 
 Array = NDArray[np.float64]
@@ -74,6 +75,7 @@ class Stepper:
         self._spacing, self._floor = spacing, floor
         self._newton = scene.time.integrator != "semi-implicit"
         self._presets = candidates()
+        self._blend = Blend("regularised" if not self._newton else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._shape = (system.points.n_owned, 3)
@@ -103,11 +105,16 @@ class Stepper:
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
         ksp.setType(PETSc.KSP.Type.CG)
+        # an incomplete factor near breakdown makes the preconditioned norm meaningless
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         if self._newton:
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(self._objective)
             snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(self._converged)
+            snes.setLineSearchPreCheck(self._direction)
+            # a Hessian that is not positive definite costs an iteration, not the step
+            snes.setMaxLinearSolveFailures(scene.solver.max_iterations)
             ksp.setTolerances(rtol=1e-4, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
@@ -171,9 +178,9 @@ class Stepper:
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
         self._at_roundoff = False
-        self._norm = 0.0
+        self._norm, self._more_linear = 0.0, 0
         self.ts.step()
-        newton, linear = self.snes.getIterationNumber(), self.snes.getLinearSolveIterations()
+        newton, linear = self.snes.getIterationNumber(), self.snes.getLinearSolveIterations() + self._more_linear
         converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
         if converged:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
@@ -209,7 +216,7 @@ class Stepper:
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
     ) -> bool:
         v = u.getArray(readonly=True).reshape(self._shape)
-        self.matrix.set(self._system.jacobian(v, shift))
+        self.matrix.set(self._system.jacobian(v, shift, self._blend.lower()))
         if a != p:
             a.assemble()
         if self.ksp.getPC().getType() in WITH_RIGID_MODES:
@@ -231,6 +238,20 @@ class Stepper:
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         self._system.first_guess(u.getArray().reshape(self._shape))
+
+    def _direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Solve again with more regularisation while the linear solve meets negative curvature."""
+        changed = False
+        while self.ksp.getConvergedReason() in INDEFINITE and self._blend.raise_():
+            v = x.getArray(readonly=True).reshape(self._shape)
+            self.matrix.set(self._system.jacobian(v, 1.0 / self._system.dt, self._blend.value))
+            self.ksp.solve(self.snes.getFunction()[0], y)
+            self._more_linear += self.ksp.getIterationNumber()
+            changed = True
+        if self.ksp.getConvergedReason() < 0:
+            y.zeroEntries()
+            return True
+        return changed
 
     def _objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
         """Energy of a trial point; where differences drown in round-off, judged by its residual."""

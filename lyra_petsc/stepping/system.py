@@ -39,8 +39,6 @@ class ReducedSystem:
         Times [s] at which handles start to act.
     explicit_wind : bool
         Velocity-dependent loads at (x_n, v_n) instead of implicitly (``semi-implicit``).
-    exact_hessian : bool
-        Newton with the exact Hessian instead of the regularised one.
 
     Attributes
     ----------
@@ -62,14 +60,13 @@ class ReducedSystem:
         *,
         starts: list[float],
         explicit_wind: bool,
-        exact_hessian: bool,
     ) -> None:
         self.points, self.mass = points, mass
         self.elastic, self.viscous, self.loads, self.held = elastic, viscous, loads, held
         self._blocks = blocks
         self._starts = sorted(set(starts))
         self._begun: set[float] = set()
-        self._explicit, self._exact = explicit_wind, exact_hessian
+        self._explicit = explicit_wind
         self._damped = [t for t in elastic if t.damped and np.any(t.elements.data["damping"])]
         self.damped = bool(points.comm.allreduce(len(self._damped), MPI.MAX))
         self._damping = blocks.zeros() if self.damped else None
@@ -133,7 +130,7 @@ class ReducedSystem:
         if self._damping is not None:
             self._damping[:] = 0.0
             for damped in self._damped:
-                self._add_stiffness(damped, self.x, False, damped.elements.data["damping"], self._damping)
+                self._add_stiffness(damped, self.x, 1.0, damped.elements.data["damping"], self._damping)
 
     def _constrain(self, t0: float, t1: float) -> None:
         n = self.points.n_owned
@@ -216,8 +213,11 @@ class ReducedSystem:
         """Square of the norm over this rank's free coordinates."""
         return float(np.sum(part * part, where=self._free))
 
-    def jacobian(self, v: Array, sigma: float) -> Array:
-        """Block rows (n_blocks, 3, 3) of σ M + K/σ + D + ∇∇P, prescribed coordinates decoupled."""
+    def jacobian(self, v: Array, sigma: float, blend: float) -> Array:
+        """Block rows (n_blocks, 3, 3) of σ M + K/σ + D + ∇∇P, prescribed coordinates decoupled.
+
+        ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
+        """
         x, vs = self._stage(v, sigma)
         values = self._values
         if self._damping is not None:
@@ -225,7 +225,7 @@ class ReducedSystem:
         else:
             values[:] = 0.0
         for term in self.elastic:
-            self._add_stiffness(term, x, self._exact, 1.0 / sigma, values)
+            self._add_stiffness(term, x, blend, 1.0 / sigma, values)
         if not self._explicit:
             for wind in self.viscous:
                 self._blocks.add(wind.name, lambda lo, hi, out, w=wind: w.hessians(vs, lo, hi, out), 1.0, values)
@@ -234,8 +234,8 @@ class ReducedSystem:
             self._blocks.constrain(values, self.mask, self._held_rows)
         return values
 
-    def _add_stiffness(self, term: Elastic, x: Array, exact: bool, weight: Array | float, values: Array) -> None:
-        self._blocks.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, exact, out), weight, values)
+    def _add_stiffness(self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array) -> None:
+        self._blocks.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
 
     def objective(self, v: Array, sigma: float) -> tuple[float, float]:
         """The function whose gradient F is (backward Euler), and the size of its summands [W]; collective."""

@@ -44,7 +44,7 @@ def add_gradient(x, s, k, rest, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hessians(x, s, lo, hi, exact, k, rest, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, k, rest, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
     g = np.empty((4, 3))
     h = np.empty((4, 4, 3, 3))
@@ -58,8 +58,8 @@ def hessians(x, s, lo, hi, exact, k, rest, out):  # type: ignore[no-untyped-def]
                 for i in range(3):
                     for j in range(3):
                         o[a, b, i, j] = stiffness * g[a, i] * g[b, j]
-        if exact:
-            moment = stiffness * (theta - rest[e])
+        if blend < 1.0:
+            moment = (1.0 - blend) * stiffness * (theta - rest[e])
             angle_hessian(x0, x1, x2, x3, h)
             for a in range(4):
                 for b in range(4):
@@ -97,8 +97,8 @@ class Bending(Elastic):
     def add_gradient(self, x: Array, out: Array) -> None:
         add_gradient(x, self.stencil, self._k, self._rest, out)
 
-    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, exact, self._k, self._rest, out)
+    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, blend, self._k, self._rest, out)
 
     def force_scale(self, size: float) -> Array:
         scale: Array = self._k * size / self.elements.data["rest_height"] ** 2

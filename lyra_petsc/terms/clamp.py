@@ -46,14 +46,15 @@ def add_gradient(x, s, mirror, k, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hessians(x, s, lo, hi, exact, mirror, k, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, mirror, k, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
     g = np.empty((4, 3))
     h = np.zeros((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
         phi = angle_gradient(x0, x1, x2, point(mirror, e), g)
-        if exact:
+        phi *= 1.0 - blend
+        if blend < 1.0:
             angle_hessian(x0, x1, x2, point(mirror, e), h)
         for a in range(3):
             for b in range(3):
@@ -110,8 +111,8 @@ class Clamp(Elastic):
         held = self._k > 0.0
         add_gradient(x, self.stencil[held], self._mirror[held], self._k[held], out)
 
-    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, exact, self._mirror, self._k, out)
+    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, blend, self._mirror, self._k, out)
         out[self._k[lo:hi] == 0.0] = 0.0
 
     def force_scale(self, size: float) -> Array:

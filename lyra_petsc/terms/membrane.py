@@ -98,15 +98,16 @@ def _tensile(s0, s1, s2):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hessians(x, s, lo, hi, exact, inverse, area, c, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j]."""
     g = np.empty((3, 2))
     for e in range(lo, hi):
         f = _deformation(x, s, e, inverse)
         ux, uy, uz, vx, vy, vz = f
         _, _, _, s0, s1, s2 = _green_and_stress(f, c, e)
-        if not exact:
-            s0, s1, s2 = _tensile(s0, s1, s2)
+        if blend > 0.0:
+            p0, p1, p2 = _tensile(s0, s1, s2)
+            s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 + blend * (p2 - s2)
         w = area[e]
         s0, s1, s2 = w * s0, w * s1, w * s2
         c11, c12, c22, c33 = w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]
@@ -179,8 +180,8 @@ class Membrane(Elastic):
     def add_gradient(self, x: Array, out: Array) -> None:
         add_gradient(x, self.stencil, self._inverse, self._area, self._c, out)
 
-    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, exact, self._inverse, self._area, self._c, out)
+    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
 
     def force_scale(self, size: float) -> Array:
         stiffest: Array = np.abs(self._c).max(axis=1)

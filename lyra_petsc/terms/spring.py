@@ -70,7 +70,7 @@ class Spring(Elastic):
     def add_gradient(self, x: Array, out: Array) -> None:
         np.add.at(out, self.stencil[:, 0], self._k * self._pull(x))
 
-    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
+    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
         out[:] = 0.0
         for axis in range(3):
             out[:, 0, 0, axis, axis] = self._k[lo:hi, axis]

@@ -45,10 +45,10 @@ class Elastic(Term):
         """Add the gradient [N] to ``out`` (n_local, 3)."""
 
     @abstractmethod
-    def hessians(self, x: Array, lo: int, hi: int, exact: bool, out: Array) -> None:
+    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
         """Hessian blocks [N/m] of elements lo..hi into ``out`` (hi − lo, n, n, 3, 3).
 
-        ``exact`` false gives the regularised, positive-semidefinite one.
+        ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one.
         """
 
     @abstractmethod
