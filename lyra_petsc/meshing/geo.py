@@ -57,7 +57,7 @@ def mesh_geo(
             except InputError:
                 raise
             except Exception as error:  # gmsh raises nothing more precise
-                raise InputError(f"gmsh: {_complaint(gmsh) or error}", file=path) from None
+                raise InputError(f"gmsh: {_complaint(gmsh, path) or error}", file=path) from None
         try:
             sheet = read_msh(meshed, note_loose=False)  # construction points of the script
         except InputError as error:
@@ -77,7 +77,7 @@ def _generate(gmsh: ModuleType, path: Path, size: float | None) -> None:
     gmsh.logger.start()
     _set_size(gmsh, size)
     gmsh.open(str(path))
-    if complaint := _complaint(gmsh):
+    if complaint := _complaint(gmsh, path):
         raise InputError(f"gmsh: {complaint}", file=path)
     _set_size(gmsh, size)  # the script may have set its own
     has_mesh = any(len(tags) for tags in gmsh.model.mesh.getElements(2)[1])
@@ -85,7 +85,7 @@ def _generate(gmsh: ModuleType, path: Path, size: float | None) -> None:
         if has_mesh:
             gmsh.model.mesh.clear()
         gmsh.model.mesh.generate(2)
-        if complaint := _complaint(gmsh):
+        if complaint := _complaint(gmsh, path):
             raise InputError(f"gmsh: {complaint}", file=path)
     for option, value in {"SaveAll": 1, "MshFileVersion": 4.1, "Binary": 1, "SaveParametric": 0}.items():
         gmsh.option.setNumber(f"Mesh.{option}", value)
@@ -98,15 +98,16 @@ def _set_size(gmsh: ModuleType, size: float | None) -> None:
         gmsh.option.setNumber(f"Mesh.{option}", value)
 
 
-def _complaint(gmsh: ModuleType) -> str:
-    """First error gmsh logged, in one line."""
+def _complaint(gmsh: ModuleType, path: Path) -> str:
+    """First error gmsh logged, in one line, without the path of the script itself."""
     try:
         lines = gmsh.logger.get()
     except UnicodeDecodeError:  # an error message that quotes the script
         return "the script has an error, in text that is not UTF-8"
     for line in lines:
         if line.startswith("Error"):
-            return " ".join(line.split(":", 1)[1].split())
+            words = " ".join(line.split(":", 1)[1].split())
+            return words.replace(f"'{path}', ", "").removesuffix(" ()")
     return ""
 
 

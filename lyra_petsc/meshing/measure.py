@@ -60,9 +60,10 @@ def rest_matrices(mesh: Mesh, warp_degrees: Floats | float = 0.0) -> tuple[Float
     m10 = cosine * a[:, 1] - sine * a[:, 0]
     m01 = cosine * b[:, 0] + sine * b[:, 1]
     m11 = cosine * b[:, 1] - sine * b[:, 0]
-    mirror = np.where(m00 * m11 - m01 * m10 < 0.0, -1.0, 1.0)
-    m10, m11 = mirror * m10, mirror * m11
-    determinant = m00 * m11 - m01 * m10
+    # from the unrotated sides, so that areas do not depend on the warp's round-off
+    determinant = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    mirror = np.where(determinant < 0.0, -1.0, 1.0)
+    m10, m11, determinant = mirror * m10, mirror * m11, np.abs(determinant)
     inverse = np.empty((mesh.n_triangles, 2, 2))
     inverse[:, 0, 0] = m11 / determinant
     inverse[:, 0, 1] = -m01 / determinant

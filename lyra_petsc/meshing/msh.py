@@ -50,11 +50,11 @@ def read_msh(path: Path, *, note_loose: bool = True) -> Sheet:
         If the file is of another format, damaged, or holds no triangles.
     """
     content = _sections(read_bytes(path), path)
+    for section in ("Nodes", "Elements"):
+        if section not in content.sections:
+            raise InputError(f"the mesh has no triangles: section ${section} is missing", file=path)
     section = ""
     try:
-        for section in ("Nodes", "Elements"):
-            if section not in content.sections:
-                raise InputError(f"damaged: section ${section} is missing", file=path)
         section = "Nodes"
         tags, points = _nodes(content)
         section = "Entities"

@@ -79,15 +79,15 @@ def check_shape(corners: Floats, shape: str, *, file: object | None, key: str | 
         # coordinates carry a round-off of their own size: what is left of a line far from the origin
         noise = 16 * np.finfo(np.float64).eps * np.abs(corners).max(axis=(1, 2)) * longest
         flat = double_area <= np.maximum(_FLATNESS * longest**2, noise)
-    if (bad := np.flatnonzero(flat)).size:
-        raise InputError(
-            f"degenerate triangles (no area in the {shape} shape): {culprits(bad.tolist())} (counted from 0)",
-            file=file,
-            key=key,
-        )
     if (bad := np.flatnonzero(~np.isfinite(double_area))).size:
         raise InputError(
             f"triangles too large to compute in the {shape} shape: {culprits(bad.tolist())} (counted from 0)",
+            file=file,
+            key=key,
+        )
+    if (bad := np.flatnonzero(flat)).size:
+        raise InputError(
+            f"degenerate triangles (no area in the {shape} shape): {culprits(bad.tolist())} (counted from 0)",
             file=file,
             key=key,
         )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mesh_sources import grid_mesh
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.measure import rest_areas
 from lyra_petsc.meshing.topology import unique_edges
-from tests.meshing.sources import grid_mesh
 
 
 def test_vertices_row_by_row() -> None:

@@ -8,10 +8,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from mesh_sources import mesh_of
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.measure import rest_areas
-from tests.meshing.sources import mesh_of
 
 gmsh_module = pytest.importorskip("gmsh")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mesh_sources import Rotation, Transform, mesh_of, obj_mesh
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.measure import rest_areas, rest_matrices
-from tests.meshing.sources import Rotation, Transform, mesh_of, obj_mesh
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 VT = "vt 0 0\nvt 2 0\nvt 2 2\nvt 0 2\n"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from mesh_sources import Rotation, Selector, Transform, grid_mesh
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.select import select_triangles, select_vertices
-from tests.meshing.sources import Rotation, Selector, Transform, grid_mesh
 
 
 def test_group_nodes_and_box() -> None:

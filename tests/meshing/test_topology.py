@@ -6,9 +6,9 @@ import time
 
 import numpy as np
 import pytest
+from mesh_sources import grid_mesh
 
 from lyra_petsc.meshing.topology import boundary_edges, hinges, unique_edges
-from tests.meshing.sources import grid_mesh
 
 
 def test_hinge_of_two_triangles() -> None:
