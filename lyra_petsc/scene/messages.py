@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.scene.values import shown
+from lyra_petsc.scene.values import one_line, shown
 
 
 def dotted(path: Sequence[str | int], data: Any = None) -> str:
@@ -48,8 +48,8 @@ def input_error(
     first = findings[0]
     context: dict[str, Any] = first.get("ctx", {})
     path = [part for part in first["loc"] if part != "[key]"] + list(context.get("at", ()))
-    key = dotted(path, data)
-    message = " ".join(_words(first["type"], first["msg"], first.get("input"), context).split())
+    key = one_line(dotted(path, data))
+    message = one_line(_words(first["type"], first["msg"], first.get("input"), context))
     if any(key == given or key.startswith((f"{given}.", f"{given}[")) for given in overridden):
         message += " (from --set)"
     if len(findings) > 1:

@@ -76,6 +76,8 @@ class Placement(Block):
 
 
 class OriginalMaterial(Block):
+    not_yet = dict.fromkeys(("yield_curv", "weakening"), "plastic creases are not there; leave the key out")
+
     data: Text
     density_mult: Positive = 1.0
     stretching_mult: Positive = 1.0

@@ -10,9 +10,12 @@ from typing import Any
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.messages import dotted
 from lyra_petsc.scene.text import parse_yaml
+from lyra_petsc.scene.values import one_line
 
 # keys under which a single block may stand for a list of one
 ONE_OR_MANY = ("mesh", "material")
+
+MOST_ENTRIES = 2_000_000
 
 _PART = re.compile(r"([^.\[\]\s]+)((?:\[\d+\])*)")
 
@@ -36,16 +39,33 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> list[str]
     return [_apply(data, text) for text in overrides]
 
 
-def unshared(value: Any) -> Any:
-    """A copy in which no two places hold the same block (YAML anchors make such)."""
-    if isinstance(value, dict):
-        return {key: unshared(entry) for key, entry in value.items()}
-    return [unshared(entry) for entry in value] if isinstance(value, list) else value
+def unshared(value: Any, *, file: object | None = None) -> Any:
+    """A copy in which no two places hold the same block (YAML anchors make such).
+
+    Raises
+    ------
+    InputError
+        More than `MOST_ENTRIES`, to which a few anchors within anchors grow.
+    """
+    left = MOST_ENTRIES
+
+    def copy(value: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise InputError(
+                f"holds more than {MOST_ENTRIES} entries once its anchors are expanded", file=file
+            )
+        if isinstance(value, dict):
+            return {key: copy(entry) for key, entry in value.items()}
+        return [copy(entry) for entry in value] if isinstance(value, list) else value
+
+    return copy(value)
 
 
 def _apply(data: dict[str, Any], text: str) -> str:
     path_text, equals, value_text = text.partition("=")
-    option = f"--set {text if len(text) <= 60 else text[:57] + '...'}"
+    option = one_line(f"--set {text if len(text) <= 60 else text[:57] + '...'}")
     if not equals:
         raise InputError("must read key.path=value", key=option)
     parts = _parts(path_text.strip(), option)

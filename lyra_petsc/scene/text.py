@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.values import one_line
 
 
 def read_text(path: Path) -> str:
@@ -47,12 +48,12 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise InputError(_line(f"{place}{error.problem or error.context}"), file=file, key=key) from None
+        raise InputError(one_line(f"{place}{error.problem or error.context}"), file=file, key=key) from None
     except RecursionError:
         raise InputError("is nested too deeply", file=file, key=key) from None
     except (YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
         # the reader lets such slip out for odd scalars (a 13th month, tags on the wrong kind of node)
-        raise InputError(_line(f"is not YAML: {error}"), file=file, key=key) from None
+        raise InputError(one_line(f"is not YAML: {error}"), file=file, key=key) from None
 
 
 def parse_json(text: str, *, file: object | None) -> Any:
@@ -63,7 +64,7 @@ def parse_json(text: str, *, file: object | None) -> Any:
         if len(block) < len(pairs):
             names = [name for name, _ in pairs]
             twice = next(name for name in names if names.count(name) > 1)
-            raise InputError("given twice", file=file, key=twice)
+            raise InputError("given twice", file=file, key=one_line(twice))
         return block
 
     def constant(word: str) -> float:
@@ -84,11 +85,7 @@ def parse_json(text: str, *, file: object | None) -> Any:
     except RecursionError:
         raise InputError("is nested too deeply", file=file) from None
     except ValueError as error:
-        raise InputError(_line(f"is not JSON: {error}"), file=file) from None
-
-
-def _line(message: str) -> str:
-    return " ".join(message.split())
+        raise InputError(one_line(f"is not JSON: {error}"), file=file) from None
 
 
 def _plain_json(text: str) -> str:

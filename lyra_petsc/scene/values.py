@@ -8,6 +8,7 @@ infinite. The messages say what is wrong and what is allowed; the key is added b
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -18,6 +19,11 @@ Vec3 = tuple[float, float, float]
 
 # Largest vertex number that every index type downstream can hold.
 LARGEST_INDEX = 2**31 - 2
+
+# Looks at a few entries only: a value made of YAML anchors can be larger than memory.
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 6, 4
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 
 
 def problem(message: str, *at: str | int) -> PydanticCustomError:
@@ -33,10 +39,15 @@ def shown(value: object) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     try:
-        text = repr(value)
-    except (ValueError, RecursionError):
+        text = _SHORT.repr(value)
+    except ValueError:  # more digits than Python is willing to write
         return f"a very long {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def one_line(text: str) -> str:
+    """``text`` on one line, with what cannot be printed written as an escape."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
 def number(value: Any) -> float:

@@ -35,6 +35,8 @@ CASES = [
      "motions.swing[0].rotate.degree", "'degrees'"),
     ("solver: {zzz: 1}", "solver.zzz", "known: force_tolerance"),
     ("1: 2", "1", "unknown key"),
+    ('"a\\nb\\u202ec": 2', "a b\\u202ec", "unknown key"),
+    ('"{message}": 2', "{message}", "unknown key"),
     # wrong types
     ("time: 3", "time", "must be a block with keys (end, step, integrator), not 3"),
     ("time: {end: 1, step: '1e-5'}", "time.step", "not '1e-5' (text; write it without quotes)"),
@@ -187,8 +189,8 @@ UNREADABLE = [
     (b"a: *nowhere\n", "undefined alias"),
     (b"a: 2001-13-45\n", "not YAML"),
     (b"{[1]: 2, {a: b}: 3}\n", ""),
-    (b"a: " + b"[" * 3000 + b"\n", ""),
-    (b"mesh: &m [*m]\n", "must be a block"),
+    (b"a: " + b"[" * 800 + b"\n", ""),
+    (b"mesh: &m [*m]\n", "refers to itself"),
     (b"%YAML 9.9\n---\na: 1\n", ""),
 ]
 
@@ -200,10 +202,19 @@ def test_unreadable_files(tmp_path: Path, content: bytes, words: str, overrides:
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:
         load_scene(path, overrides)
-    if not overrides or "a block" not in words:
+    if not overrides or "a block" not in words:  # an override needs a block first
         assert words in caught.value.message
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
+
+
+def test_anchors_within_anchors(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    lines = ["a0: &a0 [1]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    path.write_text("\n".join(["title: x", *lines]) + "\n")
+    with pytest.raises(InputError, match="anchors") as caught:
+        load_scene(path)
+    assert caught.value.file == str(path)
 
 
 def test_missing_file_and_directory(tmp_path: Path) -> None:
