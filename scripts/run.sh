@@ -1,0 +1,12 @@
+#!/usr/bin/env bash
+# Simulates a scene in parallel, after installing what is missing.
+#
+#   bash scripts/run.sh [SCENE] [--our options] [-petsc options]
+#
+# Without a scene it runs configs/flag.yaml. RANKS (2) says on how many ranks.
+set -euo pipefail
+source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
+ranks=${RANKS:-2}
+[[ $ranks =~ ^[1-9][0-9]*$ ]] || give_up "RANKS=$ranks is not a number of ranks"
+set_up
+exec "${launcher[@]}" -n "$ranks" "${python[@]}" -m lyra_petsc run "$@"
