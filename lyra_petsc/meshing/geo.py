@@ -57,7 +57,9 @@ def mesh_geo(
             except InputError:
                 raise
             except Exception as error:  # gmsh raises nothing more precise
-                raise InputError(f"gmsh: {_complaint(gmsh, path) or error}", file=path) from None
+                raise InputError(
+                    f"gmsh: {_complaint(gmsh, path) or ' '.join(str(error).split())}", file=path
+                ) from None
         try:
             sheet = read_msh(meshed, note_loose=False)  # construction points of the script
         except InputError as error:
@@ -122,23 +124,26 @@ def _session() -> Iterator[ModuleType]:
             f".geo files need gmsh ({error}); install it (apt install python3-gmsh or pip install gmsh) "
             "or give a .msh file"
         ) from None
-    # someone else's session in this process goes on after ours (isInitialized came after gmsh 4.8)
-    shared = bool(getattr(gmsh, "isInitialized", lambda: False)())
-    if not shared:
-        gmsh.initialize(readConfigFiles=False)
+    try:
+        # someone else's session in this process goes on after ours (isInitialized came after gmsh 4.8)
+        shared = bool(getattr(gmsh, "isInitialized", lambda: False)())
+        if not shared:
+            gmsh.initialize(readConfigFiles=False)
+        theirs = gmsh.model.getCurrent()
+    except Exception as error:  # its Python module and its library may be of different versions
+        raise InputError(f"gmsh does not start ({error}); .geo files need a working gmsh") from None
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.option.setNumber("General.Verbosity", 1)  # errors only
         gmsh.option.setNumber("General.AbortOnError", 0)
-        if shared:
-            gmsh.model.add("lyra_petsc")
         yield gmsh
     finally:
         gmsh.logger.stop()
-        if shared:
-            gmsh.model.remove()
-        else:
+        if not shared:
             gmsh.finalize()
+        elif gmsh.model.getCurrent() != theirs:  # opening a script makes a model of its own
+            gmsh.model.remove()
+            gmsh.model.setCurrent(theirs)
         for number, handler in handlers.items():
             signal.signal(number, handler)
 

@@ -151,3 +151,25 @@ def test_same_mesh_every_time(script: Path) -> None:
     first, second = mesh_of(script, size=0.1), mesh_of(script, size=0.1)
     assert (first.triangles == second.triangles).all()
     assert (first.positions == second.positions).all()
+
+
+@pytest.mark.skipif(not hasattr(gmsh, "isInitialized"), reason="gmsh cannot tell before 4.9")
+def test_a_session_of_the_caller_goes_on(script: Path) -> None:
+    script.write_text(SQUARE)
+    gmsh.initialize(readConfigFiles=False)
+    try:
+        gmsh.model.add("theirs")
+        assert mesh_of(script, size=0.3).n_triangles > 10
+        assert gmsh.model.getCurrent() == "theirs"
+    finally:
+        gmsh.finalize()
+
+
+def test_a_gmsh_that_does_not_start_is_told(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: object) -> None:
+        raise AttributeError("undefined symbol")
+
+    script.write_text(SQUARE)
+    monkeypatch.setattr(gmsh, "initialize", fails)
+    with pytest.raises(InputError, match=r"gmsh does not start \(undefined symbol\)"):
+        mesh_of(script)
