@@ -78,7 +78,7 @@ def mesh_geo(
 def _generate(gmsh: ModuleType, path: Path, size: float | None) -> None:
     gmsh.logger.start()
     _set_size(gmsh, size)
-    gmsh.open(str(path))
+    gmsh.merge(str(path))  # not open, which clears the models of a session that is not ours
     if complaint := _complaint(gmsh, path):
         raise InputError(f"gmsh: {complaint}", file=path)
     _set_size(gmsh, size)  # the script may have set its own
@@ -130,6 +130,7 @@ def _session() -> Iterator[ModuleType]:
         if not shared:
             gmsh.initialize(readConfigFiles=False)
         theirs = gmsh.model.getCurrent()
+        gmsh.model.add("lyra_petsc")
     except Exception as error:  # its Python module and its library may be of different versions
         raise InputError(f"gmsh does not start ({error}); .geo files need a working gmsh") from None
     try:
@@ -139,11 +140,11 @@ def _session() -> Iterator[ModuleType]:
         yield gmsh
     finally:
         gmsh.logger.stop()
-        if not shared:
-            gmsh.finalize()
-        elif gmsh.model.getCurrent() != theirs:  # opening a script makes a model of its own
+        if shared:
             gmsh.model.remove()
             gmsh.model.setCurrent(theirs)
+        else:
+            gmsh.finalize()
         for number, handler in handlers.items():
             signal.signal(number, handler)
 
