@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -28,6 +29,9 @@ from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import REGISTRY, Registration, active
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Load, Term, Viscous
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.bending import Bending
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -87,6 +91,15 @@ class Model:
         """The membrane term, which every scene has."""
         term = self.terms["membrane"]
         assert isinstance(term, Membrane)
+        return term
+
+    @property
+    def bending(self) -> Bending:
+        """The bending term; only where the scene has one."""
+        from lyra_petsc.terms.bending import Bending
+
+        term = self.terms["bending"]
+        assert isinstance(term, Bending)
         return term
 
 

@@ -31,6 +31,11 @@ def is_set(name: str) -> bool:
     return bool(PETSc.Options().hasName(name))
 
 
+def petsc_number(name: str, default: float) -> float:
+    """A number from the options database, or ``default``."""
+    return float(PETSc.Options().getReal(name, default))
+
+
 def _text(value: Value) -> str:
     if value is None or value is True:
         return "" if value is None else "true"

@@ -11,6 +11,13 @@ from lyra_petsc.solvers.options import Value, is_set
 PRESETS: dict[str, dict[str, Value]] = {
     # incomplete factors of 3×3 blocks: unbeatable while they exist
     "ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "bjacobi", "sub_pc_type": "ilu"},
+    "ilu-1": {
+        "mat_type": "baij",
+        "ksp_type": "cg",
+        "pc_type": "bjacobi",
+        "sub_pc_type": "ilu",
+        "sub_pc_factor_levels": 1,
+    },
     # aggregation with the six rigid-body modes of the current shape; couplings by hinges are orders
     # of magnitude weaker than the membrane's, smoothed aggregation would only fill in
     "gamg": {
@@ -24,7 +31,7 @@ PRESETS: dict[str, dict[str, Value]] = {
     # always exists for a positive-definite matrix
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
 }
-ORDER = ("ilu", "gamg", "block-jacobi")
+ORDER = ("ilu", "ilu-1", "gamg", "block-jacobi")
 
 BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "bjacobi", "asm", "ilu", "icc", "sor"})
 """What works on block storage; every other ``-pc_type`` gets ``aij``."""

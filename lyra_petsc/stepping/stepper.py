@@ -14,7 +14,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import fill_gaps, is_set
-from lyra_petsc.solvers.presets import PRESETS, candidates, options_of
+from lyra_petsc.solvers.presets import candidates, options_of
 from lyra_petsc.stepping.blend import INDEFINITE, Blend
 from lyra_petsc.stepping.system import ReducedSystem
 
@@ -78,6 +78,7 @@ class Stepper:
         self._blend = Blend("regularised" if not self._newton else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
+        self._linear_failed = False
         self._shape = (system.points.n_owned, 3)
         self._create()
 
@@ -294,7 +295,3 @@ class Stepper:
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
 
-
-def preset_names() -> list[str]:
-    """Names of the linear solvers, for messages."""
-    return list(PRESETS)

@@ -67,6 +67,8 @@ class ReducedSystem:
         self._starts = sorted(set(starts))
         self._begun: set[float] = set()
         self._explicit = explicit_wind
+        self._springs = [term for term in elastic if term.name == "spring"]
+        self._shell = [term for term in elastic if term.name != "spring"]
         self._damped = [t for t in elastic if t.damped and np.any(t.elements.data["damping"])]
         self.damped = bool(points.comm.allreduce(len(self._damped), MPI.MAX))
         self._damping = blocks.zeros() if self.damped else None
@@ -185,12 +187,22 @@ class ReducedSystem:
 
     def forces(self, v: Array, vdot: Array, sigma: float) -> dict[str, Array]:
         """The parts of F, unconstrained, each (n_owned, 3) [N]; collective."""
-        n = self.points.n_owned
         x, vs = self._stage(v, sigma)
-        self._gradient[:] = 0.0
-        for term in self.elastic:
-            term.add_gradient(x, self._gradient)
-        parts = {"inertia": self.mass[:, None] * vdot, "internal": self._gradient[:n].copy()}
+        return self._parts(x, vs, vdot)
+
+    def forces_at_end(self, vdot: Array) -> dict[str, Array]:
+        """The parts of F at the state (x, v) just accepted, each (n_owned, 3) [N]."""
+        return self._parts(self.x, self.v, vdot)
+
+    def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
+        n = self.points.n_owned
+        parts = {"inertia": self.mass[:, None] * vdot}
+        for name, terms in (("internal", self._shell), ("springs", self._springs)):
+            if terms:
+                self._gradient[:] = 0.0
+                for term in terms:
+                    term.add_gradient(x, self._gradient)
+                parts[name] = self._gradient[:n].copy()
         parts["loads"] = -self._force[:n]
         if self._damping is not None:
             parts["damping"] = self._blocks.product(self._damping, vs)

@@ -75,7 +75,8 @@ class Bending(Elastic):
     ----------
     elements : Elements
         Stencil (E, 4) as in ``hinge``; data ``k`` (E,) [N·m], ``rest_angle`` (E,) [rad],
-        ``rest_height`` (E,) sum of the two heights on the edge [m], ``damping`` (E,) [s].
+        ``rest_height`` (E,) sum of the two heights on the edge [m], ``length`` (E,) of the rest edge [m],
+        ``damping`` (E,) [s].
     """
 
     name = "bending"
@@ -85,14 +86,21 @@ class Bending(Elastic):
         self._k, self._rest = elements.data["k"], elements.data["rest_angle"]
 
     def angles(self, x: Array) -> Array:
-        """Dihedral angles of the owned hinges [rad], (n_owned,)."""
-        out = np.empty(self.n_owned)
-        angles(x, self.stencil, self.n_owned, out)
+        """Dihedral angles of all hinges of this rank [rad], (E,)."""
+        return self._angles(x, self.n_elements)
+
+    def _angles(self, x: Array, n: int) -> Array:
+        out = np.empty(n)
+        angles(x, self.stencil, n, out)
         return out
 
     def energies(self, x: Array) -> Array:
-        change: Array = self.angles(x) - self._rest[: self.n_owned]
-        return self._k[: self.n_owned] * change * change
+        return self.all_energies(x, self.n_owned)
+
+    def all_energies(self, x: Array, n: int) -> Array:
+        """Energy [J] of the first n hinges of this rank, (n,)."""
+        change: Array = self._angles(x, n) - self._rest[:n]
+        return self._k[:n] * change * change
 
     def add_gradient(self, x: Array, out: Array) -> None:
         add_gradient(x, self.stencil, self._k, self._rest, out)
@@ -195,6 +203,7 @@ def elements(rest: RestShape) -> Elements:
         "k": b * length**2 / (2.0 * areas),
         "rest_angle": rest_angle,
         "rest_height": 2.0 * areas / length,
+        "length": length,
         "damping": damping,
     }
     return Elements(quad[bends], {name: values[bends] for name, values in data.items()})

@@ -47,7 +47,7 @@ class RestShape:
         self.shell_of = np.full(mesh.n_triangles, -1, dtype=np.int64)
         default = -1
         for number, block in enumerate(scene.material):
-            shell, notes = resolve(block)
+            shell, notes = resolve(block, file=scene.source, key=f"material[{number}]")
             self.shells.append(shell)
             self.notes += notes
             if block.group is None:

@@ -1,0 +1,201 @@
+"""The command line: verbs, and how each way of failing leaves."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lyra_petsc import __version__
+from lyra_petsc.cli.arguments import split
+from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.nearest import nearest
+
+BUG = 70
+"""Exit code of what should never happen."""
+
+LATER = {
+    "study": "error against run time",
+    "verify": "exact and published answers",
+    "stress": "stability on stiff and extreme cases",
+    "render": "pictures and films",
+    "view": "a live page",
+    "export": "other formats",
+    "report": "one page about a run",
+    "new": "a starter scene",
+}
+"""Verbs that are announced and not there yet."""
+
+GRACE_SECONDS = 5.0
+"""How long a failing rank waits for the others to fail alike before it ends the job."""
+
+
+def run_command_line(argv: Sequence[str]) -> int:
+    """Parse and run; the exit code. Starts PETSc with its part of the arguments."""
+    ours, petsc = split(argv[1:])
+    import petsc4py
+
+    petsc4py.init([argv[0], *petsc])
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    try:
+        _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
+    except LyraError as error:
+        _say(comm, str(error))
+        return _leave_together(comm, error.exit_code)
+    except click.exceptions.Exit as leave:
+        return leave.exit_code
+    except click.ClickException as error:
+        _say(comm, _in_one_line(error))
+        return _leave_together(comm, InputError.exit_code)
+    except (Exception, KeyboardInterrupt) as error:
+        _report_bug(comm, error)
+        if comm.size > 1:
+            comm.Abort(BUG)
+        return BUG
+    return 0
+
+
+def _say(comm: Any, line: str) -> None:
+    if comm.rank == 0:
+        print(f"lyra-petsc: {' '.join(line.split())}", file=sys.stderr, flush=True)
+
+
+def _leave_together(comm: Any, code: int) -> int:
+    """Exit if all ranks failed alike; end the whole job if some are still at work."""
+    if comm.size > 1:
+        request = comm.Ibarrier()
+        deadline = time.monotonic() + GRACE_SECONDS
+        while not request.Test():
+            if time.monotonic() > deadline:
+                comm.Abort(code)
+            time.sleep(0.01)
+    return code
+
+
+def _report_bug(comm: Any, error: BaseException) -> None:
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(frame.filename).name}:{frame.lineno}"
+    text = " ".join(str(error).split()) or "no message"
+    print(
+        f"lyra-petsc: internal error on rank {comm.rank}: {type(error).__name__}: {text} ({where}); "
+        "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened",
+        file=sys.stderr,
+        flush=True,
+    )
+    if os.environ.get("LYRA_TRACEBACK"):
+        traceback.print_exception(error)
+
+
+def _in_one_line(error: click.ClickException) -> str:
+    if isinstance(error, click.NoSuchOption):
+        return f"{error.option_name}: no such option; see --help (PETSc options have one dash)"
+    return error.format_message()
+
+
+class _Verbs(click.Group):
+    """Resolves verbs; help goes to rank 0 only."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0]
+        if name in LATER:
+            raise InputError(f"'{name}' ({LATER[name]}) is not there yet; there are: {_listing(self)}", key=name)
+        if self.get_command(ctx, name) is None:
+            hint = "give a verb first, as in: run " + name if Path(name).suffix else nearest(name, list(self.commands))
+            raise InputError(f"unknown verb, {hint}", key=name)
+        return super().resolve_command(ctx, args)
+
+
+def _listing(group: click.Group) -> str:
+    return ", ".join(sorted(group.commands))
+
+
+def _help(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        if ctx.obj.rank == 0:
+            click.echo(ctx.get_help())
+        ctx.exit()
+
+
+def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        if ctx.obj.rank == 0:
+            click.echo(f"lyra-petsc {__version__}")
+        ctx.exit()
+
+
+_helped = click.option(
+    "--help", is_flag=True, is_eager=True, expose_value=False, callback=_help, help="Show this and exit."
+)
+_SETTINGS = {"help_option_names": [], "token_normalize_func": None}
+
+
+@click.group(cls=_Verbs, context_settings=_SETTINGS, invoke_without_command=True)
+@_helped
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Show the version and exit."
+)
+@click.pass_context
+def _verbs(ctx: click.Context) -> None:
+    """Thin-shell simulation (cloth, membranes, plates) in parallel on PETSc.
+
+    mpirun -n P lyra-petsc VERB [SCENE] [--our options] [-petsc options]
+    """
+    if ctx.invoked_subcommand is None and ctx.obj.rank == 0:
+        click.echo(ctx.get_help())
+
+
+_scene = click.argument("scene", required=False, type=click.Path(path_type=Path))
+_set = click.option(
+    "--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="Change the scene; may be repeated."
+)
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@_scene
+@_set
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
+@click.option("--force", is_flag=True, help="Replace the results in DIR.")
+@click.option("--resume", is_flag=True, help="Go on from the newest checkpoint.")
+@click.pass_obj
+def run(
+    comm: Any, scene: Path | None, settings: tuple[str, ...], out: Path | None, force: bool, resume: bool
+) -> None:
+    """Simulate SCENE (default: a flag in the wind)."""
+    from lyra_petsc.cli.run import run as run_scene
+
+    run_scene(comm, scene, settings, out=out, force=force, resume=resume)
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@_scene
+@_set
+@click.pass_obj
+def check(comm: Any, scene: Path | None, settings: tuple[str, ...]) -> None:
+    """Check SCENE and print what a run would do; runs nothing."""
+    from lyra_petsc.cli.check import check as check_scene
+
+    check_scene(comm, scene, settings)
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@click.pass_obj
+def info(comm: Any) -> None:
+    """Print versions and what does not fit together."""
+    from lyra_petsc.cli.info import info as describe
+
+    text = describe(comm)
+    if comm.rank == 0:
+        click.echo(text)

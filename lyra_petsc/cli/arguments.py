@@ -1,0 +1,47 @@
+"""Split a command line into our words and PETSc's options.
+
+Ours begin with two dashes; everything with one dash and a letter goes to PETSc together with its
+value, as in every PETSc program. A scene that follows a PETSc flag is still the scene.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+_PETSC = re.compile(r"-[A-Za-z_]")
+_SCENE = re.compile(r".*\.(ya?ml|json)$", re.IGNORECASE)
+_TAKES_FILE = ("options_file", "options_file_yaml", "options_string", "options_string_yaml")
+
+
+def split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Our arguments and PETSc's, each in order.
+
+    A word after a PETSc option is its value unless it is an option itself; a negative number is a
+    value. A word that names a scene (.yaml, .yml, .json) is ours, but after ``-options_file`` and its
+    kin. What follows ``--`` is ours.
+    """
+    ours: list[str] = []
+    petsc: list[str] = []
+    words = list(arguments)
+    while words:
+        word = words.pop(0)
+        if word == "--":
+            return ours + [word, *words], petsc
+        if word.startswith("--"):
+            ours.append(word)
+            # --name value: the value is ours even when it begins with a dash and a digit
+            continue
+        if not _PETSC.match(word):
+            ours.append(word)
+            continue
+        petsc.append(word)
+        if words and _is_value(word, words[0]):
+            petsc.append(words.pop(0))
+    return ours, petsc
+
+
+def _is_value(option: str, word: str) -> bool:
+    if word.startswith("--") or _PETSC.match(word):
+        return False
+    return not _SCENE.match(word) or option.lstrip("-") in _TAKES_FILE

@@ -1,0 +1,98 @@
+"""Energies of the state and the work done in a step, as in the energy identity of backward Euler::
+
+    Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
+    bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.terms.gravity import Gravity
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Budget:
+    """Energies [J] at a state, and cumulative works [J] up to it.
+
+    ``external_work`` is that of handles, springs and loads other than gravity, ``dissipation`` that of
+    material damping.
+    """
+
+    kinetic: float = 0.0
+    membrane: float = 0.0
+    bending: float = 0.0
+    potential: float = 0.0
+    external_work: float = 0.0
+    dissipation: float = 0.0
+
+
+class Ledger:
+    """Keeps the budget over the steps; collective.
+
+    Attributes
+    ----------
+    budget : Budget
+    reaction : (n_owned, 3) float64
+        Force [N] of the exact handles on the sheet in the last step; zero in free coordinates.
+    """
+
+    def __init__(self, system: ReducedSystem) -> None:
+        self._system = system
+        self.budget = Budget()
+        self.reaction: Array = np.zeros((system.points.n_owned, 3))
+        self._weight = np.zeros((system.points.n_local, 3))
+        for load in system.loads:
+            if isinstance(load, Gravity):
+                load.add_force(system.x, 0.0, 0.0, self._weight)
+        self.measure()
+
+    def measure(self) -> Budget:
+        """Energies of the present state into the budget."""
+        system = self._system
+        n = system.points.n_owned
+        names = {"membrane": 1, "bending": 2, "clamp": 2}
+        local = np.zeros(4)
+        local[0] = 0.5 * float(np.sum(system.mass[:, None] * system.v[:n] ** 2))
+        for term in system.elastic:
+            if term.name in names:
+                local[names[term.name]] += float(term.energies(system.x).sum())
+        local[3] = sum(load.potential(system.x) for load in system.loads)
+        kinetic, membrane, bending, potential = system.points.comm.allreduce(local)
+        budget = self.budget
+        budget.kinetic, budget.membrane, budget.bending, budget.potential = (
+            float(kinetic),
+            float(membrane),
+            float(bending),
+            float(potential),
+        )
+        return budget
+
+    def record(self, x_before: Array, v_before: Array) -> Budget:
+        """Add the works of the step just accepted; x, v (n_owned, 3) at its start."""
+        system = self._system
+        n, dt = system.points.n_owned, system.dt
+        v, x = system.v[:n], system.x[:n]
+        # residual at the new state, reached from the old one: v = v_{n+1}, v̇ = (v − v_n)/Δt
+        parts = system.forces_at_end((v - v_before) / dt)
+        self.reaction = sum(parts.values())  # type: ignore[assignment]
+        self.reaction[~system.mask[:n]] = 0.0
+        moved = x - x_before
+        external = -parts["loads"] - self._weight[:n] + self.reaction
+        if "wind" in parts:
+            external -= parts["wind"]
+        if "springs" in parts:
+            external -= parts["springs"]
+        local = np.array([float(np.vdot(external, moved)), 0.0])
+        if "damping" in parts:
+            local[1] = dt * float(np.vdot(v, parts["damping"]))
+        work, heat = system.points.comm.allreduce(local)
+        self.budget.external_work += float(work)
+        self.budget.dissipation += float(heat)
+        return self.measure()
