@@ -1,0 +1,173 @@
+"""Scenes for tests of the physics: built, stepped with fixed Δt, and gathered in mesh order."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.model import Model, build_model
+from lyra_petsc.output.phases import Phases
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.terms.term import Elastic
+
+Array = NDArray[np.float64]
+
+CLOTH = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0, "c33": 250.0}}
+"""The orthotropic cloth of reference A6, without bending."""
+
+TIGHT = {"force_tolerance": 1e-13, "step_tolerance": 1e-13}
+"""Newton goes on down to round-off."""
+
+REFERENCE = Path(__file__).parent / "reference"
+
+
+def reference(name: str) -> dict[str, Any]:
+    """A file of ``tests/reference``."""
+    content: dict[str, Any] = json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
+    return content
+
+
+def scene_of(content: dict[str, Any]) -> Scene:
+    """A checked scene; ``time`` and tight tolerances are filled in."""
+    defaults = {"time": {"end": 1e9, "step": 0.01}, "material": dict(CLOTH), "solver": dict(TIGHT)}
+    return Scene.model_validate(defaults | content)
+
+
+def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal") -> dict[str, Any]:
+    """A mesh block of one grid."""
+    return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": pattern}}
+
+
+def obj_file(path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]) -> dict[str, Any]:
+    """Write an .obj without ``vt`` (rest shape: the surface itself); the mesh block that names it."""
+    rows = [f"v {float(x)!r} {float(y)!r} {float(z)!r}" for x, y, z in vertices]
+    rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return {"file": str(path)}
+
+
+def equilateral(path: Path, radius: float = 1.0) -> dict[str, Any]:
+    """One equilateral triangle about the origin in the xy plane, circumradius in metres."""
+    angles = np.pi / 2 + 2 * np.pi / 3 * np.arange(3)
+    corners = radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
+    return obj_file(path, corners, [(0, 1, 2)])
+
+
+def rotation(axis: Sequence[float], angle: float) -> Array:
+    """Rotation matrix (Rodrigues) about an axis by an angle [rad]."""
+    a = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    k = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)
+
+
+class Simulation:
+    """A scene's model and stepper with a direct solver; a context manager, collective.
+
+    What it sets in the options database is removed again.
+
+    Parameters
+    ----------
+    content : dict
+        A scene's content, see ``scene_of``.
+    comm : MPI.Comm
+    options : dict
+        PETSc options beside or instead of the direct solver's.
+    """
+
+    def __init__(
+        self, content: dict[str, Any], comm: MPI.Comm = MPI.COMM_WORLD, options: dict[str, str] | None = None
+    ) -> None:
+        direct = {"pc_type": "lu"}
+        if comm.size > 1:
+            direct["pc_factor_mat_solver_type"] = "mumps"
+        self._options = (direct if options is None else options) | {"ksp_rtol": "1e-12"}
+        database = PETSc.Options()
+        for name, value in self._options.items():
+            database.setValue(name, value)
+        self.scene = scene_of(content)
+        self.comm = comm
+        self.model: Model = build_model(comm, self.scene, Phases())
+        self.system = self.model.system
+        outline = self.model.outline
+        self.stepper = Stepper(
+            self.scene, self.system, self.model.pattern, outline.spacing, self.system.roundoff(outline.reach)
+        )
+        self.stepper.start(0.0, 0)
+        self.time = 0.0
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is None:  # freeing is collective: a rank that fails must not wait for the others
+            self.stepper.destroy()
+            self.model.points.destroy()
+        database = PETSc.Options()
+        for name in [*self._options, *self.stepper.our_options]:
+            database.delValue(name)
+
+    # -- state -----------------------------------------------------------------------------------------
+
+    def gather(self, owned: Array) -> Array:
+        """Rows of the owned vertices in mesh order, on every rank."""
+        points = self.model.points
+        pieces = self.comm.allgather((points.original, np.array(owned[: points.n_owned])))
+        out = np.empty((points.n_global, *owned.shape[1:]))
+        for original, rows in pieces:
+            out[original] = rows
+        return out
+
+    @property
+    def x(self) -> Array:
+        """Positions (V, 3) [m] in mesh order, on every rank."""
+        return self.gather(self.system.x)
+
+    @property
+    def v(self) -> Array:
+        """Velocities (V, 3) [m/s] in mesh order, on every rank."""
+        return self.gather(self.system.v)
+
+    @property
+    def mass(self) -> Array:
+        """Masses (V,) [kg] in mesh order, on every rank."""
+        return self.gather(self.system.mass)
+
+    def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
+        """Replace positions or velocities, (V, 3) in mesh order."""
+        points = self.model.points
+        for target, values in ((self.system.x, x), (self.system.v, v)):
+            if values is not None:
+                target[: points.n_owned] = values[points.original]
+                points.update_ghosts(target)
+
+    def energy(self, name: str) -> float:
+        """Energy [J] of an elastic term, over all ranks."""
+        term = self.model.terms[name]
+        assert isinstance(term, Elastic)
+        return float(self.comm.allreduce(float(term.energies(self.system.x).sum())))
+
+    # -- steps -----------------------------------------------------------------------------------------
+
+    def step(self, dt: float) -> Attempt:
+        """One step, which must converge."""
+        self.system.begin(self.time)
+        end = self.time + dt
+        attempt = self.stepper.attempt(self.time, end)
+        assert attempt.converged, f"step to {end} s: {attempt}"
+        self.time = end
+        return attempt
+
+    def run(self, dt: float, steps: int) -> Array:
+        """So many steps; the positions (V, 3) after them."""
+        for _ in range(steps):
+            self.step(dt)
+        return self.x

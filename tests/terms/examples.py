@@ -1,0 +1,53 @@
+"""A scene fragment for every registered term: what the contract test walks.
+
+A new term needs an entry here; without one the contract test fails.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from physics import CLOTH, Simulation, obj_file
+from mpi4py import MPI
+import numpy as np
+
+BENDING = CLOTH | {"bending": [2.0e-3, 1.0e-3, 3.0e-3], "damping": 0.02, "warp_degrees": 25.0}
+
+FRAGMENTS: dict[str, dict[str, Any]] = {
+    "membrane": {},
+    "bending": {},
+    "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
+    "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},
+    "gravity": {"gravity": [0.3, -1.0, -9.0]},
+    "wind": {"wind": {"velocity": [1.0, 2.0, -3.0], "density": 1.2, "drag": 0.4}},
+    "pressure": {"loads": [{"pressure": 7.0}]},
+    "force": {"loads": [{"nodes": [3, 4], "force": [1.0, 2.0, 3.0]}, {"traction": [0.0, 5.0, -1.0]}]},
+}
+
+NX, NY = 3, 2
+
+
+def curved_sheet(path: Path) -> dict[str, Any]:
+    """A small cylindrical sheet whose rest shape is itself, its mesh irregular."""
+    rng = np.random.default_rng(7)
+    u, w = np.meshgrid(np.linspace(0.0, 1.0, NX + 1), np.linspace(0.0, 0.7, NY + 1))
+    flat = np.column_stack([u.ravel(), w.ravel()]) + rng.uniform(-0.05, 0.05, (u.size, 2))
+    radius = 0.8
+    vertices = np.column_stack(
+        [radius * np.sin(flat[:, 0] / radius), flat[:, 1], radius * (1.0 - np.cos(flat[:, 0] / radius))]
+    )
+    triangles = []
+    for j in range(NY):
+        for i in range(NX):
+            a, b = j * (NX + 1) + i, (j + 1) * (NX + 1) + i
+            triangles += [(a, a + 1, b + 1), (a, b + 1, b)]
+    return obj_file(path, vertices, triangles)
+
+
+def example(name: str, folder: Path) -> Simulation:
+    """The curved sheet with the term ``name`` active, on this process alone."""
+    content = {"mesh": curved_sheet(folder / "sheet.obj"), "material": BENDING} | FRAGMENTS[name]
+    simulation = Simulation(content, MPI.COMM_SELF)
+    simulation.system.begin_step(0.0, 0.01)
+    return simulation
