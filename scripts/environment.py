@@ -8,7 +8,7 @@
     The requirements of the project and of the extras that this interpreter does not meet.
 ``layer PYTHON_OF_VENV DIR…``
     Makes the virtual environment see the packages in DIR… below its own and prints the
-    constraints under which pip leaves them alone.
+    constraints under which pip leaves them alone (``constraints`` prints these of itself).
 
 Standard library only, and nothing newer than Python 3.8: it runs in whatever is there.
 """
@@ -107,11 +107,12 @@ def layer(python, folders):
         [python, "-Ic", "import sysconfig; print(sysconfig.get_path('purelib'))"], text=True
     ).strip()
     with open(os.path.join(site, "lyra-petsc-stack.pth"), "w", encoding="ascii") as file:
-        for folder in folders:  # ascii(): a .pth file is read in the locale's encoding
-            file.write(f"import site; site.addsitedir({ascii(folder)})\n")
-    ask = "import sys, importlib.metadata as m\nfor n in sys.argv[1:]:\n try: print(n, m.version(n), sep='==')\n"
-    ask += " except m.PackageNotFoundError: pass\n"
-    sys.stdout.write(subprocess.check_output([python, "-Ic", ask, *PINNED], text=True))
+        for folder in folders:  # !a, as a .pth file is read in the locale's encoding
+            file.write(f"import site; site.addsitedir({folder!a})\n")
+    # asked of the new environment, which sees the layers as pip will
+    sys.stdout.write(
+        subprocess.check_output([python, "-IB", os.path.abspath(__file__), "constraints"], text=True)
+    )
     return 0
 
 
@@ -123,6 +124,11 @@ def main(arguments):
         for line in requirements(rest[0], rest[1:]):
             if not is_met(line):
                 print(line)
+        return 0
+    if verb == "constraints":
+        for name in PINNED:
+            if version_of(name) is not None:
+                print(f"{name}=={version_of(name)}")
         return 0
     if verb == "layer":
         return layer(rest[0], rest[1:])

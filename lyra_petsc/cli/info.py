@@ -1,0 +1,186 @@
+"""What lyra_petsc runs on here, and what of it does not fit together."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import socket
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc import __version__
+from lyra_petsc.cli.fit import Facts, misfits
+
+EXTERNAL = (
+    "ptscotch",
+    "parmetis",
+    "hypre",
+    "ml",
+    "mumps",
+    "superlu_dist",
+    "suitesparse",
+    "hdf5",
+)
+"""Packages PETSc may have been built with that matter here (suitesparse brings CHOLMOD)."""
+
+
+def info(comm: Any) -> str:
+    """Versions, configuration and misfits as text.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+        Collective over it.
+
+    Returns
+    -------
+    str
+        Several lines, the same on every rank; a part that is missing or broken is named as such.
+    """
+    hosts = comm.allgather(socket.gethostname())
+    facts = Facts(
+        ranks=comm.size,
+        launched=launched_ranks(os.environ),
+        ranks_per_host=dict(Counter(hosts)),
+        cores=os.cpu_count() or 1,
+        threads=os.environ.get("OMP_NUM_THREADS", ""),
+    )
+    lines = [
+        ("lyra_petsc", f"{__version__} in {Path(__file__).resolve().parents[1]}"),
+        ("Python", f"{platform.python_version()} at {sys.executable}"),
+        ("system", f"{platform.system()} {platform.release()}, {platform.machine()}, {facts.cores} cores"),
+    ]
+    for name, describe in PARTS.items():
+        lines.append((name, _described(name, describe, facts)))
+    facts.mpi_libraries = loaded_mpi_libraries()
+    ranks = ", ".join(f"{count} on {host}" for host, count in facts.ranks_per_host.items())
+    lines.append(("ranks", ranks))
+    width = max(len(name) for name, _ in lines)
+    text = [f"{name:<{width}}  {value}" for name, value in lines]
+    found = misfits(facts)
+    text.append("")
+    text += (
+        ["What does not fit together:", *(f"- {misfit}" for misfit in found)]
+        if found
+        else ["All fits together."]
+    )
+    # what rank 0 found counts: h5py and the libraries are the same files on every rank
+    shared: str = comm.bcast("\n".join(text), root=0)
+    return shared
+
+
+def launched_ranks(environment: Mapping[str, str]) -> int:
+    """Number of ranks the launcher says it started; 1 without a launcher."""
+    for name in ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "MPI_LOCALNRANKS"):
+        if environment.get(name, "").isdigit():
+            return int(environment[name])
+    # only inside srun: sbatch sets SLURM_NTASKS for the batch script, which is one process, too
+    if environment.get("SLURM_STEP_NUM_TASKS", "").isdigit() and "SLURM_PROCID" in environment:
+        return int(environment["SLURM_STEP_NUM_TASKS"])
+    return 1
+
+
+def loaded_mpi_libraries() -> tuple[str, ...]:
+    """Files of the MPI libraries in this process; empty where the system does not tell."""
+    try:
+        maps = Path("/proc/self/maps").read_text(errors="replace")
+    except OSError:
+        return ()
+    files = {line.split(maxsplit=5)[5] for line in maps.splitlines() if len(line.split(maxsplit=5)) == 6}
+    names = ("libmpi.so", "libmpich.so", "libmpi_cray.so", "libmpi_gnu")
+    return tuple(sorted(file for file in files if Path(file).name.startswith(names)))
+
+
+def _described(name: str, describe: Callable[[Facts], str], facts: Facts) -> str:
+    try:
+        return describe(facts)
+    except ModuleNotFoundError:
+        facts.missing.append(name)
+        return "missing"
+    except Exception as error:  # a broken library may raise anything, and this verb is where it shows
+        facts.broken[name] = " ".join(str(error).split()) or type(error).__name__
+        return "broken"
+
+
+def _module_version(name: str) -> Callable[[Facts], str]:
+    def describe(facts: Facts) -> str:
+        module = importlib.import_module(name)
+        return str(getattr(module, "__version__", None) or importlib.metadata.version(name))
+
+    return describe
+
+
+def _mpi(facts: Facts) -> str:
+    import mpi4py
+    from mpi4py import MPI
+
+    library = MPI.Get_library_version().split("\n")[0].split(",")[0].strip("\0 ")
+    standard = ".".join(map(str, MPI.Get_version()))
+    return f"{mpi4py.__version__} with {library} (MPI {standard})"
+
+
+def _petsc(facts: Facts) -> str:
+    import petsc4py
+    from petsc4py import PETSc
+
+    facts.petsc = PETSc.Sys.getVersion()
+    facts.complex_scalars = PETSc.ScalarType().dtype.kind == "c"
+    scalar, index = PETSc.ScalarType().dtype.name, PETSc.IntType().dtype.name
+    version = ".".join(map(str, facts.petsc))
+    text = f"{version} (petsc4py {petsc4py.__version__}), {scalar} scalars, {index} indices"
+    debugging = _petsc_debugging(petsc4py.get_config())
+    if debugging is not None:
+        text += ", with debugging (slow)" if debugging else ", optimised"
+    return text
+
+
+def _petsc_debugging(config: Mapping[str, str]) -> bool | None:
+    """Whether PETSc was built with debugging; ``None`` where its headers are not installed."""
+    header = Path(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", ""), "include", "petscconf.h")
+    try:
+        return "#define PETSC_USE_DEBUG 1" in header.read_text(errors="replace")
+    except OSError:
+        return None
+
+
+def _petsc_folder(facts: Facts) -> str:
+    import petsc4py
+
+    config = petsc4py.get_config()
+    return os.path.join(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", "")).rstrip("/") or "not known"
+
+
+def _petsc_packages(facts: Facts) -> str:
+    from petsc4py import PETSc
+
+    present = [name for name in EXTERNAL if PETSc.Sys.hasExternalPackage(name)]
+    absent = [name for name in EXTERNAL if name not in present]
+    return f"{', '.join(present) or 'none'}; not: {', '.join(absent) or 'none'}"
+
+
+def _h5py(facts: Facts) -> str:
+    import h5py
+
+    facts.parallel_hdf5 = bool(h5py.get_config().mpi)
+    kind = "parallel" if facts.parallel_hdf5 else "serial"
+    return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
+
+
+PARTS: dict[str, Callable[[Facts], str]] = {
+    "mpi4py": _mpi,
+    "PETSc": _petsc,
+    "PETSc folder": _petsc_folder,
+    "PETSc packages": _petsc_packages,
+    "h5py": _h5py,
+    "gmsh": _module_version("gmsh"),
+    "numpy": _module_version("numpy"),
+    "numba": _module_version("numba"),
+    "pydantic": _module_version("pydantic"),
+    "ruamel.yaml": _module_version("ruamel.yaml"),
+}
+"""What is described, in this order; each may note facts on the way."""

@@ -1,0 +1,112 @@
+"""`info`: what it reports here, and what it makes of installations that do not fit."""
+
+import builtins
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lyra_petsc.cli import info as module
+from lyra_petsc.cli.fit import Facts, misfits
+from lyra_petsc.cli.info import info, launched_ranks
+
+
+def test_names_the_versions_in_use(comm):
+    import numba
+    import numpy as np
+    from petsc4py import PETSc
+
+    lines = dict(line.split(None, 1) for line in info(comm).splitlines() if "  " in line)
+    assert lines["PETSc"].strip()
+    text = info(comm)
+    assert ".".join(map(str, PETSc.Sys.getVersion())) in text
+    assert "float64 scalars" in text
+    assert lines["numpy"].strip() == np.__version__
+    assert lines["numba"].strip() == numba.__version__
+
+
+@pytest.mark.parallel
+def test_all_ranks_return_the_same_text_and_count_the_ranks(comm):
+    text = info(comm)
+    assert comm.allgather(text) == [text] * comm.size
+    (ranks,) = [line for line in text.splitlines() if line.startswith("ranks ")]
+    assert sum(int(part.split()[0]) for part in ranks.split(None, 1)[1].split(", ")) == comm.size
+    assert "each of them sees" not in text
+
+
+def test_a_missing_part_is_named_with_its_remedy(comm, monkeypatch):
+    genuine = builtins.__import__
+
+    def without_h5py(name, *arguments, **keywords):
+        if name.split(".")[0] == "h5py":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return genuine(name, *arguments, **keywords)
+
+    monkeypatch.setattr(builtins, "__import__", without_h5py)
+    text = info(comm)
+    assert "h5py is missing: install it from" in text
+
+
+def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
+    def describe(facts):
+        raise ImportError("libhdf5.so.103: cannot open\nshared object file")
+
+    monkeypatch.setitem(module.PARTS, "h5py", describe)
+    assert "- h5py is there but fails: libhdf5.so.103: cannot open shared object file." in info(comm)
+
+
+def test_all_fits_when_nothing_is_wrong():
+    facts = Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5), parallel_hdf5=True)
+    assert misfits(facts) == []
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        (Facts(ranks=1, launched=4), "started 4 ranks but each of them sees 1"),
+        (Facts(mpi_libraries=("/a/libmpi.so.12", "/b/libmpi.so.40")), "Two MPI libraries"),
+        (Facts(petsc=(3, 17, 4)), "PETSc 3.17.4 is too old: 3.18"),
+        (Facts(petsc=(3, 20, 0), complex_scalars=True), "complex scalars"),
+        (Facts(ranks=2, launched=2, parallel_hdf5=False), "h5py is serial"),
+        (Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=4, threads="4"), "OMP_NUM_THREADS=4"),
+        (Facts(missing=["numba"]), "numba is missing: pip install numba"),
+    ],
+)
+def test_each_misfit_is_one_line(facts, words):
+    (line,) = misfits(facts)
+    assert words in line
+    assert "\n" not in line
+
+
+def test_a_serial_h5py_is_right_for_one_rank():
+    assert misfits(Facts(ranks=1, parallel_hdf5=False)) == []
+
+
+@pytest.mark.parametrize(
+    ("environment", "ranks"),
+    [
+        ({}, 1),
+        ({"OMPI_COMM_WORLD_SIZE": "3"}, 3),
+        ({"PMI_SIZE": "2"}, 2),
+        ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0"}, 8),
+        ({"SLURM_NTASKS": "8"}, 1),
+        ({"OMPI_COMM_WORLD_SIZE": "many"}, 1),
+    ],
+)
+def test_reads_the_launchers_count(environment, ranks):
+    assert launched_ranks(environment) == ranks
+
+
+def test_importing_it_starts_neither_petsc_nor_mpi():
+    code = (
+        "import sys, lyra_petsc.cli.info;"
+        "print([name for name in sys.modules if name.startswith(('petsc4py', 'mpi4py'))])"
+    )
+    root = str(Path(module.__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": root + os.pathsep + os.environ.get("PYTHONPATH", "")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
