@@ -47,8 +47,10 @@ probe_distribution() {
 }
 
 find_stack() {
-    local candidate
-    if [[ -n ${PYTHON:-} && $(command -v -- "$PYTHON") != "$venv"/* && ! $PYTHON -ef /usr/bin/python3 ]]; then
+    local candidate chosen
+    chosen=$(command -v -- "${PYTHON:-}" || true)
+    # the distribution's own may not have its petsc4py yet, and our .venv stands for what it lies over
+    if [[ -n ${PYTHON:-} && ! $chosen =~ ^(/usr)?/bin/python3?$ && $chosen != "$venv"/* ]]; then
         probe "$PYTHON" || give_up "PYTHON=$PYTHON does not see petsc4py and mpi4py;" \
             "install them there, or unset PYTHON to use another interpreter"
         return

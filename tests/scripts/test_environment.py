@@ -1,0 +1,175 @@
+"""The set-up scripts against made-up environments: what is used, what is refused, what stays untouched."""
+
+import os
+import re
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+HELPER = ROOT / "scripts" / "environment.py"
+NEEDED = {
+    "numpy": "1.26.0",
+    "numba": "0.60.0",
+    "pydantic": "2.9",
+    "ruamel.yaml": "0.18.6",
+    "click": "8.1.7",
+    "rich": "13.9",
+    "h5py": "3.11",
+    "gmsh": "4.12",
+    "mpi4py": "4.0.0",
+    "petsc4py": "3.20.1",
+}
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")
+
+
+def site_packages(environment: Path) -> Path:
+    return environment / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+
+
+def put(environment: Path, name: str, version: str) -> None:
+    """A package that only exists: a module and its metadata."""
+    site = site_packages(environment)
+    module = site.joinpath(*name.split("."))
+    module.mkdir(parents=True)
+    (module / "__init__.py").write_text(f"__version__ = {version!r}\n")
+    metadata = site / f"{name}-{version}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """An environment with all that is needed, none of it real, and a launcher that only speaks."""
+    folder = tmp_path / "own environment"
+    venv.create(folder, symlinks=True)
+    for name, version in NEEDED.items():
+        put(folder, name, version)
+    launcher = folder / "bin" / "mpirun"
+    launcher.write_text('#!/bin/sh\necho "launched in $PWD: $*"\nexit "${LAUNCHER_EXIT:-0}"\n')
+    launcher.chmod(0o755)
+    return folder
+
+
+def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
+    clean = {name: value for name, value in os.environ.items() if name not in names}
+    return subprocess.run(
+        ["bash", str(ROOT / "scripts" / script), *arguments],
+        cwd=cwd,
+        env={**clean, "LYRA_VENV": str(cwd / "laid over"), **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def activated(environment: Path) -> dict[str, str]:
+    return {"PATH": f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+
+
+def listing(folder: Path) -> list[tuple[str, float]]:
+    return sorted((str(path), path.lstat().st_mtime) for path in folder.rglob("*"))
+
+
+def test_an_environment_that_has_everything_is_used_and_left_as_it_was(environment, tmp_path):
+    before = listing(environment)
+    done = call("run.sh", "my scene.yaml", "-ts_monitor", cwd=tmp_path, **activated(environment))
+    python = environment / "bin" / "python3"
+    expected = f"launched in {tmp_path}: -n 2 {python} -m lyra_petsc run my scene.yaml -ts_monitor"
+    assert done.stdout.strip() == expected, done.stderr
+    assert done.stderr == ""
+    assert listing(environment) == before
+    assert not (tmp_path / "laid over").exists()
+
+
+def test_python_variable_ranks_and_exit_code(environment, tmp_path):
+    python = str(environment / "bin" / "python")
+    done = call("run.sh", cwd=tmp_path, PYTHON=python, RANKS="5", LAUNCHER_EXIT="3")
+    assert f"-n 5 {python} -m lyra_petsc run" in done.stdout
+    assert done.returncode == 3
+
+
+def test_python_variable_without_the_stack_is_refused(tmp_path):
+    venv.create(tmp_path / "empty", symlinks=True)
+    done = call("run.sh", cwd=tmp_path, PYTHON=str(tmp_path / "empty" / "bin" / "python"))
+    assert done.returncode == 1
+    assert "does not see petsc4py and mpi4py" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("ranks", ["0", "two", "-1", ""])
+def test_ranks_must_be_a_number(ranks, environment, tmp_path):
+    done = call("run.sh", cwd=tmp_path, RANKS=ranks, **activated(environment))
+    assert (done.returncode == 0) == (ranks == "")  # empty counts as unset
+    if ranks:
+        assert f"RANKS={ranks} is not a number of ranks" in done.stderr
+
+
+def test_an_old_petsc4py_is_refused_in_one_line(environment, tmp_path):
+    metadata = site_packages(environment) / "petsc4py-3.20.1.dist-info"
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: petsc4py\nVersion: 3.15.1\n")
+    done = call("run.sh", cwd=tmp_path, **activated(environment))
+    assert done.returncode == 1
+    assert re.search(r"petsc4py of .* is 3\.15\.1, lyra_petsc needs 3\.18 or newer", done.stderr)
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_folder_that_is_not_ours_is_left_alone(environment, tmp_path):
+    (site_packages(environment) / "rich" / "__init__.py").unlink()
+    (site_packages(environment) / "rich").rmdir()
+    mine = tmp_path / "laid over" / "pyvenv.cfg"
+    mine.parent.mkdir()
+    mine.write_text("made by hand")
+    done = call("run.sh", cwd=tmp_path, **activated(environment))
+    assert done.returncode == 1
+    assert "was not made by these scripts and is left alone" in done.stderr
+    assert mine.read_text() == "made by hand"
+
+
+def test_missing_launcher_is_named(environment, tmp_path):
+    done = call("run.sh", cwd=tmp_path, MPIRUN="no-such-mpirun", **activated(environment))
+    assert done.returncode == 1
+    assert "no-such-mpirun not found" in done.stderr
+
+
+def test_missing_lists_what_is_old_absent_or_cut_short(environment):
+    site = site_packages(environment)
+    (site / "click-8.1.7.dist-info" / "METADATA").write_text("Name: click\nVersion: 7.9\n")
+    (site / "rich-13.9.dist-info" / "METADATA").unlink()
+    (site / "rich-13.9.dist-info").rmdir()  # the module is there, its metadata never came
+    (site / "h5py-3.11.dist-info" / "METADATA").unlink()
+    (site / "h5py-3.11.dist-info").rmdir()  # as Debian's: no metadata under this name
+    (site / "numba" / "__init__.py").unlink()
+    (site / "numba").rmdir()
+    command = [environment / "bin" / "python", "-B", HELPER, "missing", ROOT / "pyproject.toml", "stack"]
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=clean)
+    assert {line.split(">=")[0] for line in done.stdout.splitlines()} == {"click", "rich", "numba"}
+
+
+def test_a_layer_shows_the_packages_below_and_pins_them(environment, tmp_path):
+    over = tmp_path / "über"
+    venv.create(over, symlinks=True)
+    python = str(over / "bin" / "python")
+    command = [sys.executable, "-B", str(HELPER), "layer", python, str(site_packages(environment))]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    pinned = set(done.stdout.split())
+    assert pinned == {"numpy==1.26.0", "mpi4py==4.0.0", "petsc4py==3.20.1", "h5py==3.11", "gmsh==4.12"}
+    shown = subprocess.run(
+        [python, "-Ic", "import petsc4py; print(petsc4py.__file__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert shown.stdout.startswith(str(environment))
+
+
+@pytest.mark.parametrize("script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", ".ci/run"])
+def test_shell_syntax(script):
+    done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
