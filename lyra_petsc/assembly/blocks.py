@@ -47,15 +47,17 @@ def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyped-def]
-    """Zero the rows and columns of prescribed coordinates, but for their diagonal entries."""
+    """Zero the rows and columns of prescribed coordinates; their diagonal gets its block's largest size."""
     for t in range(len(touched)):
         row = touched[t]
         for k in range(indptr[row], indptr[row + 1]):
             c = columns[k]
+            # an exact Hessian may be negative here, which would make the whole matrix indefinite
+            size = max(abs(values[k, 0, 0]), abs(values[k, 1, 1]), abs(values[k, 2, 2]))
             for i in range(3):
                 for j in range(3):
-                    if (mask[row, i] or mask[c, j]) and not (row == c and i == j):
-                        values[k, i, j] = 0.0
+                    if mask[row, i] or mask[c, j]:
+                        values[k, i, j] = size if row == c and i == j else 0.0
 
 
 class BlockRows:
@@ -115,8 +117,8 @@ class BlockRows:
         return np.unique(rows[held[self.pattern.columns] | held[rows]])
 
     def constrain(self, values: Array, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> None:
-        """Decouple prescribed coordinates, keeping their own diagonal entries.
+        """Decouple prescribed coordinates, with a positive diagonal of the size of their neighbours.
 
-        The diagonal of the size of its neighbours is what multigrid and incomplete factors need.
+        That size is what multigrid and incomplete factors need.
         """
         _constrain(self.pattern.indptr, self.pattern.columns, rows, mask, values)
