@@ -83,6 +83,7 @@ class ReducedSystem:
         self._prescribed = np.zeros((n_owned, 3))
         self._goal = np.zeros((n_owned, 3))
         self._active: tuple[int, ...] | None = None
+        self._energy_scales: list[Array] = []
         self.dt = 0.0
         self.t0 = self.t1 = 0.0
 
@@ -119,6 +120,8 @@ class ReducedSystem:
         self._constrain(t0, t1)
         for term in self.elastic:
             term.prepare(t0, t1)
+        reach = float(np.abs(self.x).max(initial=0.0))
+        self._energy_scales = [reach * term.force_scale(reach)[: term.n_owned] for term in self.elastic]
         self._force[:] = 0.0
         for load in self.loads:
             load.add_force(self.x, t0, t1, self._force)
@@ -250,21 +253,29 @@ class ReducedSystem:
         self._blocks.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
 
     def objective(self, v: Array, sigma: float) -> tuple[float, float]:
-        """The function whose gradient F is (backward Euler), and the size of its summands [W]; collective."""
+        """The function whose gradient F is (backward Euler), and what its round-off is relative to [W]; collective.
+
+        That is the size of its summands, and for each elastic energy the root of itself times the energy
+        at which strains are of order one: small strains are small differences of large coordinates.
+        """
         n = self.points.n_owned
         x, vs = self._stage(v, sigma)
         change = v - self.v[:n]
         inertia = 0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))
-        energies = [float(term.energies(x).sum()) for term in self.elastic]
+        energies, square = [], 0.0
+        for term, scale in zip(self.elastic, self._energy_scales, strict=True):
+            each = term.energies(x)
+            energies.append(float(each.sum()))
+            square += 2.0 * float(np.vdot(each, scale))
         work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
         parts = [inertia, *(sigma * e for e in energies), -sigma * work]
         if self._damping is not None:
             parts.append(0.5 * float(np.vdot(v, self._blocks.product(self._damping, vs))))
         if not self._explicit:
             parts += [float(wind.potentials(vs).sum()) for wind in self.viscous]
-        local = np.array([sum(parts), sum(abs(part) for part in parts)])
-        value, size = self.points.comm.allreduce(local)
-        return float(value), float(size)
+        local = np.array([sum(parts), sum(abs(part) for part in parts), sigma * sigma * square])
+        value, size, square = self.points.comm.allreduce(local)
+        return float(value), float(size) + float(np.sqrt(square))
 
     def roundoff(self, size: float) -> float:
         """Norm [N] that round-off alone may give the residual: 10 ε of the internal force scale.
