@@ -1,0 +1,41 @@
+"""Failures of file operations: in words, and shared by all ranks."""
+
+from __future__ import annotations
+
+import os
+
+from mpi4py import MPI
+
+from lyra_petsc.errors import LyraError
+
+# what h5py raises when the library reports a failure, depending on the call and its version
+HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
+
+
+def reason(error: BaseException) -> str:
+    """The cause of a failed file operation, in a few words on one line."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
+    """Raise on every rank the problem of the lowest rank that has one. Collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+        All ranks that took part.
+    problem : LyraError or None
+        This rank's problem.
+
+    Raises
+    ------
+    LyraError
+        The same on every rank, if any rank has one.
+    """
+    first = comm.allreduce(comm.size if problem is None else comm.rank, MPI.MIN)
+    if first == comm.size:
+        return
+    shared = comm.bcast(problem, root=first)
+    raise shared

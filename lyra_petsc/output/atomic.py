@@ -1,0 +1,30 @@
+"""Small text files that are old or new, never half."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.agreement import reason
+
+
+def replace_text(path: str | os.PathLike[str], text: str) -> None:
+    """Put ``text`` into a file in one instant. Call on one rank.
+
+    Raises
+    ------
+    OutputError
+        If it could not be written; what stood there before stands.
+    """
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error

@@ -1,0 +1,176 @@
+"""checkpoint.h5: all that a run needs to go on, on any number of ranks."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.hdf5 import read_slab, write_collective
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.parallel import on_root
+
+CHECKPOINT = "checkpoint.h5"
+PREVIOUS = "checkpoint-previous.h5"
+NEXT = "checkpoint-next.h5"
+FORMAT = 1
+
+Scalars = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What was read back.
+
+    Attributes
+    ----------
+    arrays : dict of str to (n_owned, ...) array
+        Vertex arrays by name, in this rank's numbering.
+    scalars : dict
+        As given to ``write_checkpoint``.
+    file : Path
+        The file read: the newest that is whole.
+    note : str or None
+        Why it is not the newest one, for the user.
+    """
+
+    arrays: dict[str, NDArray[Any]]
+    scalars: Scalars
+    file: Path
+    note: str | None = None
+
+
+def write_checkpoint(
+    folder: str | os.PathLike[str],
+    order: FileOrder,
+    arrays: Mapping[str, NDArray[Any]],
+    scalars: Mapping[str, Any],
+) -> None:
+    """Replace the checkpoint by a complete newer one; the old one is kept as the previous.
+
+    Parameters
+    ----------
+    folder : path
+        The run's folder.
+    order : FileOrder
+        Order of the vertices each rank owns; collective over its ranks.
+    arrays : mapping of str to (n_owned, ...) array of float64 or int64
+        Vertex arrays: ``position`` [m], ``velocity`` [m/s], and what the integrator remembers.
+    scalars : mapping
+        What JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
+        works, …; read on rank 0.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if it could not be written; the old one stands.
+    """
+    folder = Path(folder)
+    slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
+    sums = {name: _sum(slab, order.comm) for name, slab in slabs.items()}
+    attributes: dict[str, dict[str, int | float | str]] = {
+        "/": {"format": FORMAT, "n_vertices": order.n_global, "scalars": json.dumps(dict(scalars))},
+        **{name: {"sum": str(value)} for name, value in sums.items()},
+    }
+    write_collective(folder / NEXT, slabs, attributes, order.comm)
+
+    def rotate() -> None:
+        try:
+            if (folder / CHECKPOINT).exists():
+                os.replace(folder / CHECKPOINT, folder / PREVIOUS)
+            os.replace(folder / NEXT, folder / CHECKPOINT)
+        except OSError as error:
+            raise OutputError(f"{folder / CHECKPOINT}: cannot be replaced: {reason(error)}") from error
+
+    on_root(order.comm, rotate)
+
+
+def read_checkpoint(folder: str | os.PathLike[str], order: FileOrder) -> Checkpoint:
+    """The newest whole checkpoint of a run, whatever number of ranks wrote it.
+
+    Parameters
+    ----------
+    folder : path
+        The run's folder.
+    order : FileOrder
+        Order of the vertices each rank owns now; collective over its ranks.
+
+    Raises
+    ------
+    InputError
+        On every rank, if there is none, if all are damaged, or if it is of another mesh.
+    """
+    newest: InputError | None = None
+    for file in checkpoint_files(folder, order.comm):
+        try:
+            scalars, names, sums = on_root(order.comm, lambda f=file: _head(f, order)) or ({}, [], {})  # type: ignore[misc]
+            arrays = {name: _rows(file, name, sums[name], order) for name in names}
+        except InputError as error:
+            newest = newest or error
+            continue
+        note = f"{newest}; going on from the one before" if newest else None
+        return Checkpoint(arrays, scalars, file, note)
+    if newest is None:
+        raise InputError("holds no checkpoint to resume from; run without --resume", file=folder)
+    raise InputError(
+        f"{newest.message}, and no earlier checkpoint can be used: run without --resume, into a new folder",
+        file=newest.file,
+    )
+
+
+def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = None) -> list[Path]:
+    """The checkpoints of a run that exist, newest first; with ``comm`` as rank 0 sees them."""
+
+    def work() -> list[Path]:
+        # a kill between the two replacements of a write leaves the newest under NEXT
+        files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
+        return [file for file in files if file.is_file()]
+
+    return work() if comm is None else on_root(comm, work) or []
+
+
+def _head(file: Path, order: FileOrder) -> tuple[Scalars, list[str], dict[str, int]]:
+    try:
+        with import_h5py().File(file, "r") as content:
+            version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
+            scalars = json.loads(content.attrs["scalars"])
+            arrays = content["vertices"]
+            sums = {name: int(data.attrs["sum"]) for name, data in arrays.items()}
+    except HDF5_ERRORS as error:
+        raise InputError(f"checkpoint is damaged: {reason(error)}", file=file) from error
+    if version != FORMAT:
+        raise InputError(f"checkpoint has format {version}, this version reads {FORMAT}", file=file)
+    if n_vertices != order.n_global:
+        raise InputError(
+            f"checkpoint has {n_vertices} vertices, the scene's mesh {order.n_global}: "
+            "resume with the scene it was written by",
+            file=file,
+        )
+    return scalars, sorted(sums), sums
+
+
+def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
+    slab = read_slab(file, f"vertices/{name}", order)
+    if _sum(slab, order.comm) != expected:
+        raise InputError(f"checkpoint is damaged: the check sum of {name} does not fit", file=file)
+    return order.from_slab(slab)
+
+
+def _sum(slab: NDArray[Any], comm: MPI.Comm) -> int:
+    """Sum of all 64-bit words of a distributed array, modulo 2⁶⁴: the same on any number of ranks."""
+    if slab.dtype.itemsize != 8:
+        raise ValueError("checkpoints hold float64 and int64")
+    words = np.ascontiguousarray(slab).reshape(-1).view(np.uint64)
+    total = np.empty(1, np.uint64)
+    comm.Allreduce(np.array([words.sum(dtype=np.uint64)]), total, MPI.SUM)
+    return int(total[0])

@@ -1,0 +1,18 @@
+"""The one place that imports h5py."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+
+def import_h5py() -> Any:
+    """h5py, with HDF5's file locks off: they fail on some cluster file systems.
+
+    Nothing is lost with them: files are written under a name nobody else opens, and have
+    their final name only when complete. ``HDF5_USE_FILE_LOCKING`` set by the user stands.
+    """
+    os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
+    import h5py
+
+    return h5py

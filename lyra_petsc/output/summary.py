@@ -1,0 +1,85 @@
+"""summary.json: what ran, with what, how long, and how it ended."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+import lyra_petsc
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.parallel import on_root
+
+
+def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm: MPI.Comm) -> None:
+    """Write a summary in one instant, so that a reader finds the old or the new one.
+
+    Parameters
+    ----------
+    path : path
+        ``summary.json`` of the run's folder.
+    content : mapping
+        Numbers, text, arrays, lists and mappings; a number that is not finite becomes ``null``.
+        Read on rank 0.
+    comm : MPI.Comm
+        All ranks; collective.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if it could not be written.
+    """
+
+    def work() -> None:
+        text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+        replace_text(path, text + "\n")
+
+    on_root(comm, work)
+
+
+def versions() -> dict[str, str]:
+    """Names and versions of what takes part in a run; numba only if a term has loaded it."""
+    import mpi4py
+    import petsc4py
+    from petsc4py import PETSc
+
+    h5py = import_h5py()
+    found = {
+        "lyra_petsc": lyra_petsc.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
+        "petsc4py": petsc4py.__version__,
+        "mpi4py": mpi4py.__version__,
+        "mpi": MPI.Get_library_version().split("\n")[0].split(",")[0].strip("\0 "),
+        "h5py": f"{h5py.version.version} ({'MPI' if h5py.get_config().mpi else 'serial'})",
+        "hdf5": h5py.version.hdf5_version,
+    }
+    if "numba" in sys.modules:
+        found["numba"] = sys.modules["numba"].__version__
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """The value in JSON's own types."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value

@@ -1,0 +1,108 @@
+import resource
+
+import numpy as np
+import pytest
+
+from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.hdf5 import SERIAL_VARIABLE, read_slab, write_collective, writes_collectively
+from lyra_petsc.output.ordering import FileOrder
+
+pytestmark = pytest.mark.parallel
+
+h5py = import_h5py()
+
+
+@pytest.fixture(params=["library's choice", "through rank 0"])
+def path_of_writing(request, monkeypatch):
+    monkeypatch.setenv(SERIAL_VARIABLE, "1" if request.param == "through rank 0" else "0")
+    return request.param
+
+
+def whole(n):
+    return np.random.default_rng(1).normal(size=(n, 3))
+
+
+def slab_of(comm, array):
+    n = len(array)
+    return array[comm.rank * n // comm.size : (comm.rank + 1) * n // comm.size]
+
+
+def everything(path):
+    with h5py.File(path, "r") as file:
+        found = {}
+        file.visititems(lambda name, item: found.update({name: item[()]} if hasattr(item, "shape") else {}))
+        return found
+
+
+def test_the_path_under_test_is_the_one_taken(comm, path_of_writing):
+    able = comm.size > 1 and h5py.get_config().mpi
+    assert writes_collectively(comm) == (able and path_of_writing == "library's choice")
+
+
+@pytest.mark.parametrize("n", [1, 2, 1001])
+def test_slabs_become_one_array(comm, shared_tmp, path_of_writing, n):
+    x, owner = whole(n), np.arange(n, dtype=np.int32)
+    attributes = {"states/000000": {"time": 0.1, "step": 3}, "states/000000/x": {"unit": "m"}}
+    path = shared_tmp / "a.h5"
+    write_collective(
+        path,
+        {"states/000000/x": slab_of(comm, x), "states/000000/owner": slab_of(comm, owner)},
+        attributes,
+        comm,
+    )
+    found = everything(path)
+    np.testing.assert_array_equal(found["states/000000/x"], x)
+    np.testing.assert_array_equal(found["states/000000/owner"], owner)
+    assert found["states/000000/owner"].dtype == np.int32
+    with h5py.File(path, "r") as file:
+        assert dict(file["states/000000"].attrs) == {"time": 0.1, "step": 3}
+        assert file["states/000000/x"].attrs["unit"] == "m"
+    comm.Barrier()
+    assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
+
+
+def test_ranks_without_rows(comm, shared_tmp, path_of_writing):
+    x = whole(10)
+    mine = x if comm.rank == comm.size - 1 else x[:0]
+    write_collective(shared_tmp / "a.h5", {"x": mine}, {}, comm)
+    np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
+
+
+def test_read_on_another_cut_of_rows(comm, shared_tmp, path_of_writing):
+    x = whole(50)
+    write_collective(shared_tmp / "a.h5", {"x": x if comm.rank == 0 else x[:0]}, {}, comm)
+    mine = np.arange(comm.rank, 50, comm.size)[::-1]
+    order = FileOrder(comm, mine, 50)
+    np.testing.assert_array_equal(order.from_slab(read_slab(shared_tmp / "a.h5", "x", order)), x[mine])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_slab(shared_tmp / "a.h5", "y", order)
+    with pytest.raises(InputError, match="50 rows, 51 are expected"):
+        read_slab(shared_tmp / "a.h5", "x", FileOrder(comm, np.arange(comm.rank, 51, comm.size), 51))
+
+
+@pytest.mark.parametrize("limited", ["first", "last"])
+def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, path_of_writing, limited):
+    """A limit on the size of files, met by one rank, stands for the full disk."""
+    path = shared_tmp / "a.h5"
+    write_collective(path, {"x": slab_of(comm, whole(4))}, {}, comm)
+    full = 0 if limited == "first" or not writes_collectively(comm) else comm.size - 1
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if comm.rank == full:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match=r"a\.h5: cannot be written"):
+            write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    comm.Barrier()
+    assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
+    np.testing.assert_array_equal(everything(path)["x"], whole(4))
+    comm.Barrier()
+    write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
+    np.testing.assert_array_equal(everything(path)["x"], whole(20_000))
+
+
+def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, path_of_writing):
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_collective(shared_tmp / "missing" / "a.h5", {"x": slab_of(comm, whole(4))}, {}, comm)
