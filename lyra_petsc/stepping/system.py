@@ -46,6 +46,8 @@ class ReducedSystem:
         Positions [m] and velocities [m/s] at the start of the step, ghosts up to date.
     mask : (n_local, 3) bool
         Prescribed coordinates of the step.
+    anchored : float
+        Energy [J] of this rank's clamps at the start of the step, against where they stand at its end.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class ReducedSystem:
         self._prescribed = np.zeros((n_owned, 3))
         self._goal = np.zeros((n_owned, 3))
         self._active: tuple[int, ...] | None = None
+        self.anchored = 0.0
         self._energy_scales: list[Array] = []
         self.dt = 0.0
         self.t0 = self.t1 = 0.0
@@ -120,16 +123,17 @@ class ReducedSystem:
         self._constrain(t0, t1)
         for term in self.elastic:
             term.prepare(t0, t1)
+        self.anchored = sum(float(t.energies(self.x).sum()) for t in self.elastic if t.name == "clamp")
         reach = float(np.abs(self.x).max(initial=0.0))
         self._energy_scales = [reach * term.force_scale(reach)[: term.n_owned] for term in self.elastic]
         self._force[:] = 0.0
         for load in self.loads:
             load.add_force(self.x, t0, t1, self._force)
-        for term in self.viscous:
-            term.freeze(self.x, self.v)
+        for wind in self.viscous:
+            wind.freeze(self.x, self.v)
             if self._explicit:
                 push = np.zeros_like(self._force)
-                term.add_gradient(self.v, push)
+                wind.add_gradient(self.v, push)
                 self._force -= push
         self._force[n:] = 0.0
         if self._damping is not None:
@@ -243,20 +247,26 @@ class ReducedSystem:
             self._add_stiffness(term, x, blend, 1.0 / sigma, values)
         if not self._explicit:
             for wind in self.viscous:
-                self._blocks.add(wind.name, lambda lo, hi, out, w=wind: w.hessians(vs, lo, hi, out), 1.0, values)
+                self._add_wind(wind, vs, values)
         self._blocks.add_diagonal(sigma * self.mass, values)
         if len(self._held_rows):
             self._blocks.constrain(values, self.mask, self._held_rows)
         return values
 
-    def _add_stiffness(self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array) -> None:
+    def _add_stiffness(
+        self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
+    ) -> None:
         self._blocks.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
 
-    def objective(self, v: Array, sigma: float) -> tuple[float, float]:
-        """The function whose gradient F is (backward Euler), and what its round-off is relative to [W]; collective.
+    def _add_wind(self, wind: Viscous, v: Array, values: Array) -> None:
+        self._blocks.add(wind.name, lambda lo, hi, out: wind.hessians(v, lo, hi, out), 1.0, values)
 
-        That is the size of its summands, and for each elastic energy the root of itself times the energy
-        at which strains are of order one: small strains are small differences of large coordinates.
+    def objective(self, v: Array, sigma: float) -> tuple[float, float]:
+        """The function whose gradient F is (backward Euler), and what its round-off is relative to [W].
+
+        Collective. The latter is the size of its summands, and for each elastic energy the root of itself
+        times the energy at which strains are of order one: small strains are small differences of large
+        coordinates.
         """
         n = self.points.n_owned
         x, vs = self._stage(v, sigma)

@@ -51,6 +51,7 @@ class Ledger:
         for load in system.loads:
             if isinstance(load, Gravity):
                 load.add_force(system.x, 0.0, 0.0, self._weight)
+        self._anchored = 0.0
         self.measure()
 
     def measure(self) -> Budget:
@@ -62,7 +63,10 @@ class Ledger:
         local[0] = 0.5 * float(np.sum(system.mass[:, None] * system.v[:n] ** 2))
         for term in system.elastic:
             if term.name in names:
-                local[names[term.name]] += float(term.energies(system.x).sum())
+                energy = float(term.energies(system.x).sum())
+                local[names[term.name]] += energy
+                if term.name == "clamp":
+                    self._anchored = energy
         local[3] = sum(load.potential(system.x) for load in system.loads)
         kinetic, membrane, bending, potential = system.points.comm.allreduce(local)
         budget = self.budget
@@ -89,7 +93,9 @@ class Ledger:
             external -= parts["wind"]
         if "springs" in parts:
             external -= parts["springs"]
-        local = np.array([float(np.vdot(external, moved)), 0.0])
+        # a clamp's plane turns with its handle, which works on the sheet through it
+        turned = system.anchored - self._anchored
+        local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         if "damping" in parts:
             local[1] = dt * float(np.vdot(v, parts["damping"]))
         work, heat = system.points.comm.allreduce(local)

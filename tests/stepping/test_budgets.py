@@ -1,0 +1,134 @@
+"""Energy and momentum of every step add up, whatever acts on the sheet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import CLOTH, Simulation, grid
+
+from lyra_petsc.stepping.work import Budget, Ledger
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+DT = 0.01
+
+BASE: dict[str, Any] = {
+    "mesh": grid(1.0, 0.8, 5, 4, "alternating"),
+    "material": CLOTH | {"bending": 2e-3},
+    "initial": {"velocity": [0.2, -0.1, 0.3], "angular_velocity": [1.0, 0.5, -2.0], "noise": 0.005, "seed": 2},
+}
+TURN = [{"time": 0}, {"time": 0.3, "rotate": {"axis": [0, 1, 0], "degrees": 40}, "translate": [0.0, 0.1, 0.05]}]
+SIDE = {"box": [[-0.01, -0.1, -0.1], [0.01, 1.0, 0.1]]}
+
+SCENES: dict[str, dict[str, Any]] = {
+    "free": {},
+    "gravity": {"gravity": [0, 0, -9.81]},
+    "damping": {"material": CLOTH | {"bending": 2e-3, "damping": 0.05}},
+    "wind": {"wind": {"velocity": [1, 3, 6], "density": 1.2, "drag": 0.4}},
+    "held": {"gravity": [0, 0, -9.81], "handles": [{"nodes": [0, 29]}, {"nodes": [5], "axes": ["z"]}]},
+    "moving": {"gravity": [0, 0, -9.81], "handles": [SIDE | {"motion": "turn"}], "motions": {"turn": TURN}},
+    "spring": {"handles": [SIDE | {"motion": "turn", "stiffness": 100.0}], "motions": {"turn": TURN}},
+    "loads": {"loads": [{"nodes": [3], "force": [0, 1, 2]}, {"pressure": 8.0}, {"traction": [0, 0.5, 0]}]},
+    "clamp": {"gravity": [0, 0, -9.81], "handles": [SIDE | {"clamp": True}]},
+    "moving clamp": {"handles": [SIDE | {"clamp": True, "motion": "turn"}], "motions": {"turn": TURN}},
+    "released clamp": {"handles": [SIDE | {"clamp": True, "motion": "turn", "until": 0.06}], "motions": {"turn": TURN}},
+}
+SCENES["all"] = SCENES["moving"] | SCENES["wind"] | SCENES["loads"] | SCENES["damping"]
+
+
+def total(budget: Budget) -> float:
+    return budget.kinetic + budget.membrane + budget.bending + budget.potential
+
+
+def bracket(simulation: Simulation, before: Array) -> float:
+    """E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx [J] of the shell's elastic terms, in the step just made."""
+    system = simulation.system
+    n = system.points.n_owned
+    change = 0.0
+    gradient = np.zeros_like(system.x)
+    for term in system.elastic:
+        if term.name != "spring":
+            change += float(term.energies(system.x).sum() - term.energies(before).sum())
+            term.add_gradient(system.x, gradient)
+    change -= float(np.vdot(gradient[:n], system.x[:n] - before[:n]))
+    return float(simulation.comm.allreduce(change))
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_energy_identity_of_backward_euler_in_every_step(comm: MPI.Comm, name: str) -> None:
+    with Simulation(BASE | SCENES[name], comm) as simulation:
+        system = simulation.system
+        n = system.points.n_owned
+        ledger = Ledger(system)
+        size = max(total(ledger.budget), 0.1)
+        for _ in range(10):
+            x, v, old = system.x.copy(), system.v[:n].copy(), Budget(**vars(ledger.budget))
+            simulation.step(DT)
+            new = ledger.record(x[:n], v)
+            jump = system.mass[:, None] * (system.v[:n] - v) ** 2
+            lost = 0.5 * comm.allreduce(float(jump.sum()))
+            heat, work = new.dissipation - old.dissipation, new.external_work - old.external_work
+            change = total(new) - total(old)
+            assert change == pytest.approx(-lost - heat + bracket(simulation, x) + work, abs=1e-9 * size)
+            assert heat >= 0.0
+            if name == "damping":
+                assert heat > 1e-9
+
+
+@pytest.mark.parametrize("name", ["free", "damping"])
+def test_a_free_sheet_never_gains_energy_but_through_its_bracket(comm: MPI.Comm, name: str) -> None:
+    with Simulation(BASE | SCENES[name], comm) as simulation:
+        system = simulation.system
+        n = system.points.n_owned
+        ledger = Ledger(system)
+        first = total(ledger.budget)
+        fed = 0.0
+        for _ in range(10):
+            x, v = system.x.copy(), system.v[:n].copy()
+            simulation.step(DT)
+            ledger.record(x[:n], v)
+            fed += max(0.0, bracket(simulation, x))
+        assert ledger.budget.external_work == pytest.approx(0.0, abs=1e-12)
+        assert total(ledger.budget) < first + fed
+        assert total(ledger.budget) > 0.0
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if "clamp" not in name])
+def test_forces_and_reactions_are_the_change_of_momentum(comm: MPI.Comm, name: str) -> None:
+    with Simulation(BASE | SCENES[name], comm) as simulation:
+        system = simulation.system
+        n = system.points.n_owned
+        ledger = Ledger(system)
+        for _ in range(5):
+            x, v = system.x[:n].copy(), system.v[:n].copy()
+            simulation.step(DT)
+            ledger.record(x, v)
+            parts = system.forces_at_end((system.v[:n] - v) / DT)
+            outer = ledger.reaction - sum(parts[key] for key in ("loads", "wind", "springs") if key in parts)
+            force = comm.allreduce(outer.sum(axis=0))
+            momentum = comm.allreduce((system.mass[:, None] * (system.v[:n] - v)).sum(axis=0))
+            np.testing.assert_allclose(momentum / DT, force, atol=1e-7 * max(1.0, np.abs(force).max()))
+
+
+def test_reactions_of_a_sheet_at_rest_carry_its_weight(comm: MPI.Comm) -> None:
+    content = BASE | {"initial": {}, "gravity": [0, -9.81, 0], "handles": [{"box": [[-1, 0.79, -1], [2, 1, 1]]}]}
+    with Simulation(content, comm) as simulation:
+        system = simulation.system
+        n = system.points.n_owned
+        ledger = Ledger(system)
+        for _ in range(12):
+            x, v = system.x[:n].copy(), system.v[:n].copy()
+            simulation.step(10.0)
+        ledger.record(x, v)
+        reaction = comm.allreduce(ledger.reaction.sum(axis=0))
+        np.testing.assert_allclose(reaction, [0.0, 0.2 * 0.8 * 9.81, 0.0], atol=1e-7)
+        # only where a handle holds
+        held = np.abs(ledger.reaction).max(axis=1, initial=0.0) > 0.0
+        assert comm.allreduce(int(held.sum())) == 6
+        assert ledger.budget.kinetic < 1e-15
