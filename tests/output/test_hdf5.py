@@ -1,9 +1,11 @@
+import errno
 import resource
 
 import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output import slabs
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import SERIAL_VARIABLE, read_slab, write_collective, writes_collectively
 from lyra_petsc.output.ordering import FileOrder
@@ -81,26 +83,44 @@ def test_read_on_another_cut_of_rows(comm, shared_tmp, path_of_writing):
         read_slab(shared_tmp / "a.h5", "x", FileOrder(comm, np.arange(comm.rank, 51, comm.size), 51))
 
 
-@pytest.mark.parametrize("limited", ["first", "last"])
-def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, path_of_writing, limited):
-    """A limit on the size of files, met by one rank, stands for the full disk."""
+def still_there(comm, path, x):
+    comm.Barrier()
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+    np.testing.assert_array_equal(everything(path)["x"], x)
+    comm.Barrier()
+
+
+def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, path_of_writing):
+    """A limit on the size of files stands for the full disk."""
     path = shared_tmp / "a.h5"
     write_collective(path, {"x": slab_of(comm, whole(4))}, {}, comm)
-    full = 0 if limited == "first" or not writes_collectively(comm) else comm.size - 1
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    if comm.rank == full:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
-        with pytest.raises(OutputError, match=r"a\.h5: cannot be written"):
+        with pytest.raises(OutputError, match=r"a\.h5: cannot be written: File too large"):
             write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    comm.Barrier()
-    assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
-    np.testing.assert_array_equal(everything(path)["x"], whole(4))
-    comm.Barrier()
+    still_there(comm, path, whole(4))
     write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
-    np.testing.assert_array_equal(everything(path)["x"], whole(20_000))
+    still_there(comm, path, whole(20_000))
+
+
+def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, path_of_writing, monkeypatch):
+    path = shared_tmp / "a.h5"
+    write_collective(path, {"x": slab_of(comm, whole(4))}, {}, comm)
+    failing = comm.size - 1 if writes_collectively(comm) else 0
+    write_rows = slabs._write_rows
+
+    def write_and_fail(*arguments):
+        write_rows(*arguments)
+        if comm.rank == failing:
+            raise OSError(errno.ENOSPC, "as the library words it")
+
+    monkeypatch.setattr(slabs, "_write_rows", write_and_fail)
+    with pytest.raises(OutputError, match=r"a\.h5: cannot be written: No space left on device"):
+        write_collective(path, {"x": slab_of(comm, whole(100)), "y": slab_of(comm, whole(7))}, {}, comm)
+    still_there(comm, path, whole(4))
 
 
 def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, path_of_writing):

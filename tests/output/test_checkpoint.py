@@ -1,0 +1,109 @@
+import math
+
+import numpy as np
+import pytest
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, read_checkpoint, write_checkpoint
+from lyra_petsc.output.ordering import FileOrder
+
+pytestmark = pytest.mark.parallel
+
+N = 101
+X = np.random.default_rng(3).normal(size=(N, 3))
+SCALARS = {
+    "step": 7,
+    "time": 0.1 + 0.2,
+    "dt": 1e-3,
+    "works": {"wind": -1.5},
+    "history": [1, 2.5, None],
+    "note": "ü",
+}
+
+
+def dealt(comm):
+    return np.random.default_rng(5).permutation(N)[comm.rank :: comm.size]
+
+
+def write(comm, folder, factor=1.0, **scalars):
+    mine = dealt(comm)
+    arrays = {"position": factor * X[mine], "velocity": -factor * X[mine], "kind": mine % 3}
+    write_checkpoint(folder, FileOrder(comm, mine, N), arrays, {**SCALARS, **scalars})
+
+
+def change(comm, work):
+    comm.Barrier()
+    if comm.rank == 0:
+        work()
+    comm.Barrier()
+
+
+def cut(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    place = content.find(X[50].tobytes())
+    assert place > 0
+    content[place + 3] ^= 16
+    path.write_bytes(content)
+
+
+def test_read_back_by_other_owners(comm, shared_tmp):
+    write(comm, shared_tmp)
+    mine = np.arange(N)[::-1] if comm.rank == comm.size - 1 else np.arange(0)
+    found = read_checkpoint(shared_tmp, FileOrder(comm, mine, N))
+    np.testing.assert_array_equal(found.arrays["position"], X[mine])
+    np.testing.assert_array_equal(found.arrays["velocity"], -X[mine])
+    np.testing.assert_array_equal(found.arrays["kind"], mine % 3)
+    assert found.scalars == SCALARS
+    assert math.copysign(1, found.scalars["works"]["wind"]) == -1
+    assert (found.file.name, found.note) == (CHECKPOINT, None)
+
+
+def test_the_newest_counts_and_the_one_before_is_kept(comm, shared_tmp):
+    for step in (1, 2, 3):
+        write(comm, shared_tmp, factor=step, step=step)
+    order = FileOrder(comm, dealt(comm), N)
+    assert read_checkpoint(shared_tmp, order).scalars["step"] == 3
+    change(comm, (shared_tmp / CHECKPOINT).unlink)
+    found = read_checkpoint(shared_tmp, order)
+    assert found.scalars["step"] == 2
+    np.testing.assert_array_equal(found.arrays["position"], 2 * X[dealt(comm)])
+
+
+@pytest.mark.parametrize(
+    "damage", [cut, flip, lambda path: path.write_bytes(b"")], ids=["cut", "flip", "empty"]
+)
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(comm, shared_tmp, damage):
+    write(comm, shared_tmp, step=1)
+    write(comm, shared_tmp, step=2)
+    order = FileOrder(comm, dealt(comm), N)
+    change(comm, lambda: damage(shared_tmp / CHECKPOINT))
+    found = read_checkpoint(shared_tmp, order)
+    assert found.scalars["step"] == 1
+    assert found.file.name == PREVIOUS
+    assert "damaged" in found.note
+    assert "\n" not in found.note
+    change(comm, lambda: damage(shared_tmp / PREVIOUS))
+    with pytest.raises(InputError, match="run without --resume"):
+        read_checkpoint(shared_tmp, order)
+
+
+def test_a_kill_between_the_two_renamings_loses_nothing(comm, shared_tmp):
+    write(comm, shared_tmp, step=1)
+    write(comm, shared_tmp, step=2)
+    change(comm, lambda: (shared_tmp / PREVIOUS).unlink())
+    change(comm, lambda: (shared_tmp / CHECKPOINT).rename(shared_tmp / NEXT))
+    assert read_checkpoint(shared_tmp, FileOrder(comm, dealt(comm), N)).scalars["step"] == 2
+
+
+def test_of_another_mesh_or_none_at_all(comm, shared_tmp):
+    order = FileOrder(comm, np.arange(comm.rank, N + 1, comm.size), N + 1)
+    with pytest.raises(InputError, match="holds no checkpoint"):
+        read_checkpoint(shared_tmp, order)
+    write(comm, shared_tmp)
+    with pytest.raises(InputError, match=f"{N} vertices, the scene's mesh {N + 1}"):
+        read_checkpoint(shared_tmp, order)

@@ -1,0 +1,100 @@
+import io
+from types import SimpleNamespace
+
+import pytest
+
+from lyra_petsc.cli.progress import Progress, closing_table, duration
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+FIRST, SECOND = SimpleNamespace(rank=0), SimpleNamespace(rank=1)
+
+
+def run(stream, seconds_per_step, steps=100, comm=FIRST, **options):
+    clock = Clock()
+    with Progress(comm, 4.0, stream=stream, clock=clock, **options) as progress:
+        for step in range(1, steps + 1):
+            clock.now += seconds_per_step
+            progress.update(step, 4.0 * step / steps, 3, 17, 0.25)
+    return stream.getvalue()
+
+
+def test_plain_lines_tell_everything():
+    lines = run(io.StringIO(), 0.5).splitlines()
+    assert lines[0] == "  1%  t 0.04 of 4 s  step 1  Newton 3  linear 17  energy 0.25 J  0:50 left"
+    assert lines[-1].startswith("100%  t 4 of 4 s  step 100")
+    assert lines[-1].endswith("0:00 left")
+
+
+@pytest.mark.parametrize(
+    ("seconds_per_step", "expected"),
+    [
+        (0.001, 2),  # over before two seconds have passed: first and last
+        (0.5, 21),  # each 5 %, first, last
+        (120.0, 100),  # slow: each step after a minute
+    ],
+)
+def test_plain_lines_are_few_but_steady(seconds_per_step, expected):
+    assert len(run(io.StringIO(), seconds_per_step).splitlines()) == expected
+
+
+def test_a_bar_on_a_terminal_and_lines_beside_petsc_monitors():
+    drawn = run(Terminal(), 0.5)
+    assert "\x1b[" in drawn
+    assert "100%" in drawn
+    assert "\x1b[" not in run(Terminal(), 0.5, plain=True)
+
+
+def test_a_message_between_steps_comes_through_as_it_is():
+    for stream in (io.StringIO(), Terminal()):
+        with Progress(FIRST, 1.0, stream=stream) as progress:
+            progress.update(1, 0.5, 1, 1, 0.0)
+            progress.say("step [1] retried")
+        assert "step [1] retried" in stream.getvalue()
+
+
+def test_other_ranks_are_silent():
+    stream = Terminal()
+    assert run(stream, 0.5, comm=SECOND) == ""
+    Progress(SECOND, 1.0, stream=stream).say("hello")
+    closing_table(SECOND, {"solve": 1.0}, "runs/flag", "done", stream=stream)
+    assert stream.getvalue() == ""
+
+
+def test_time_left_on_resume_counts_from_where_it_goes_on():
+    stream, clock = io.StringIO(), Clock()
+    with Progress(FIRST, 4.0, start=3.0, stream=stream, clock=clock) as progress:
+        clock.now = 10.0
+        progress.update(90, 3.5, 1, 1, 0.0)
+    assert stream.getvalue().splitlines()[0].startswith(" 50%")
+    assert stream.getvalue().splitlines()[0].endswith("0:10 left")
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()], ids=["file", "terminal"])
+def test_closing_table(stream):
+    folder = "runs/" + "a-long-name-" * 12
+    closing_table(
+        FIRST, {"mesh": 0.5, "solve": 1.5, "other": 0.001}, folder, "done: 4 s in 100 steps", stream=stream
+    )
+    text = stream.getvalue()
+    assert "25%" in text
+    assert "75%" in text
+    assert "2.00 s" in text
+    assert "other" not in text
+    assert "done: 4 s in 100 steps" in text
+    assert f"paraview {folder}/states.xdmf" in text
+
+
+def test_duration():
+    assert [duration(s) for s in (0, 65.4, 3909, float("nan"))] == ["0:00", "1:05", "1:05:09", "?"]

@@ -1,0 +1,232 @@
+import xml.etree.ElementTree as ElementTree
+
+import meshio
+import numpy as np
+import pytest
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.output import slabs
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.hdf5 import SERIAL_VARIABLE
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.states import XDMF_FILE, StateWriter
+
+pytestmark = pytest.mark.parallel
+
+h5py = import_h5py()
+
+REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=float)
+TRIANGLES = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
+
+
+def strip(seam: float = 0.0) -> Mesh:
+    uv = REST[TRIANGLES][..., :2].copy()
+    uv[1] += seam
+    return Mesh(REST + 1.0, REST, TRIANGLES, uv, np.ones(3, dtype=bool))
+
+
+class Run:
+    """A writer for the strip, its vertices and triangles dealt to the ranks."""
+
+    def __init__(self, comm, folder, resume_after=None):
+        self.vertices = np.arange(5)[::-1][comm.rank :: comm.size]
+        self.triangles = np.arange(3)[comm.rank :: comm.size]
+        self.writer = StateWriter(
+            folder,
+            FileOrder(comm, self.vertices, 5),
+            FileOrder(comm, self.triangles, 3),
+            n_triangles=3,
+            resume_after=resume_after,
+        )
+
+    def write(self, step):
+        return self.writer.write(
+            step,
+            0.1 * step,
+            position(step)[self.vertices],
+            {"velocity": -position(step)[self.vertices], "mass": np.arange(5.0)[self.vertices]},
+            {
+                "rank": np.arange(3, dtype=np.int32)[self.triangles],
+                "green_strain": strain(step)[self.triangles],
+            },
+        )
+
+
+def position(step):
+    return REST + [0, 0, step]
+
+
+def strain(step):
+    return step + np.arange(9.0).reshape(3, 3)
+
+
+def announced(folder):
+    """Every state of the XDMF file as an independent reader sees it: time and meshio's mesh."""
+    document = ElementTree.parse(folder / XDMF_FILE)
+    states = []
+    for grid in document.iterfind("Domain/Grid/Grid"):
+        stamp = grid.find("Time")
+        time = float(stamp.get("Value"))
+        grid.remove(stamp)  # which meshio knows in its own kind of series only
+        one = ElementTree.Element("Xdmf", Version="3.0")
+        ElementTree.SubElement(one, "Domain").append(grid)
+        name = folder / "one state.xdmf"
+        ElementTree.ElementTree(one).write(name)
+        states.append((time, meshio.read(name)))
+        name.unlink()
+    return states
+
+
+def on_first(comm, check):
+    """Look at files on rank 0 while the others wait."""
+    comm.Barrier()
+    try:
+        if comm.rank == 0:
+            check()
+    finally:
+        comm.Barrier()
+
+
+@pytest.mark.parametrize("serial", ["0", "1"])
+def test_states_read_back_as_a_time_series(comm, shared_tmp, monkeypatch, serial):
+    monkeypatch.setenv(SERIAL_VARIABLE, serial)
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    assert [run.write(step) for step in (0, 4, 9)] == [0, 1, 2]
+
+    def check():
+        states = announced(shared_tmp)
+        assert [time for time, _ in states] == [0.0, 0.4, 0.9]
+        for step, (_, mesh) in zip((0, 4, 9), states, strict=True):
+            np.testing.assert_array_equal(mesh.points, position(step))
+            np.testing.assert_array_equal(mesh.cells_dict["triangle"], TRIANGLES)
+            np.testing.assert_array_equal(mesh.point_data["velocity"], -position(step))
+            np.testing.assert_array_equal(mesh.point_data["mass"], np.arange(5.0))
+            np.testing.assert_array_equal(mesh.point_data["rest"], REST)
+            np.testing.assert_array_equal(mesh.cell_data["rank"][0], np.arange(3))
+            np.testing.assert_array_equal(mesh.cell_data["green_strain"][0], strain(step))
+        with h5py.File(shared_tmp / "states-0001.h5", "r") as file:
+            group = file["states/000001"]
+            assert dict(group.attrs) == {"time": 0.4, "step": 4}
+            assert (group["position"].attrs["time"], group["position"].attrs["step"]) == (0.4, 4)
+            assert group["position"].dtype == np.float64
+
+    on_first(comm, check)
+
+
+def test_vtk_reads_the_time_series(comm, shared_tmp):
+    vtk = pytest.importorskip("vtk", reason="ParaView's own reader; meshio's is tested above")
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    for step in (0, 4, 9):
+        run.write(step)
+
+    def check():
+        from vtk.util.numpy_support import vtk_to_numpy
+
+        reader = vtk.vtkXdmfReader()
+        reader.SetFileName(str(shared_tmp / XDMF_FILE))
+        reader.UpdateInformation()
+        assert reader.GetOutputInformation(0).Get(vtk.vtkStreamingDemandDrivenPipeline.TIME_STEPS()) == (
+            0,
+            0.4,
+            0.9,
+        )
+        for step in (9, 0, 4):
+            reader.UpdateTimeStep(0.1 * step)
+            grid = reader.GetOutputDataObject(0)
+            assert (grid.GetNumberOfPoints(), grid.GetNumberOfCells()) == (5, 3)
+            np.testing.assert_array_equal(vtk_to_numpy(grid.GetPoints().GetData()), position(step))
+            np.testing.assert_array_equal(
+                vtk_to_numpy(grid.GetPointData().GetArray("velocity")), -position(step)
+            )
+            np.testing.assert_array_equal(
+                vtk_to_numpy(grid.GetCellData().GetArray("green_strain")), strain(step)
+            )
+
+    on_first(comm, check)
+
+
+def test_a_state_cut_short_is_never_announced(comm, shared_tmp, monkeypatch):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    run.write(0)
+    write_rows = slabs._write_rows
+
+    def write_and_fail(*arguments):
+        write_rows(*arguments)
+        raise OSError(28, "disk full")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(slabs, "_write_rows", write_and_fail)
+        with pytest.raises(OutputError, match=r"states-0001\.h5: cannot be written: No space left"):
+            run.write(1)
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0]))
+    assert run.write(2) == 1
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.2]))
+
+
+def assert_times(folder, times):
+    assert [time for time, _ in announced(folder)] == pytest.approx(times)
+
+
+def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    for step in (0, 3, 6, 9):
+        run.write(step)
+    comm.Barrier()
+    if comm.rank == 0:
+        (shared_tmp / XDMF_FILE).write_text("<Xdmf")
+    comm.Barrier()
+    resumed = Run(comm, shared_tmp, resume_after=5)
+    assert resumed.writer.count == 2
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.3]))
+    assert not (shared_tmp / "states-0002.h5").exists()
+    comm.Barrier()
+    resumed.write(7)
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.3, 0.7]))
+    on_first(comm, lambda: np.testing.assert_array_equal(announced(shared_tmp)[1][1].points, position(3)))
+
+
+def test_resume_passes_over_a_damaged_state(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    for step in (0, 1, 2):
+        run.write(step)
+    comm.Barrier()
+    if comm.rank == 0:
+        (shared_tmp / "states-0001.h5").write_bytes(b"")
+    comm.Barrier()
+    assert Run(comm, shared_tmp, resume_after=2).writer.count == 3
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.2]))
+
+
+def test_more_than_9999_states(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    run.write(0)
+    run.writer._next = 9999
+    assert [run.write(1), run.write(2)] == [9999, 10000]
+    resumed = Run(comm, shared_tmp, resume_after=2)
+    assert resumed.writer.count == 10001
+    resumed.write(3)
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3]))
+
+
+def test_material_coordinates_are_those_of_vertices_unless_there_are_seams(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+
+    def check(**expected):
+        with h5py.File(shared_tmp / "mesh.h5", "r") as file:
+            found = {name: data[()] for name, data in file["mesh"].items()}
+        assert found.keys() == expected.keys()
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[name], values)
+
+    on_first(comm, lambda: check(triangles=TRIANGLES, rest=REST, uv=REST[:, :2]))
+    write_mesh(shared_tmp, strip(seam=10.0) if comm.rank == 0 else None, comm)
+    corners = strip(seam=10.0).triangle_uv
+    on_first(comm, lambda: check(triangles=TRIANGLES, rest=REST, corner_uv=corners))

@@ -1,0 +1,54 @@
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.summary import versions, write_summary
+
+pytestmark = pytest.mark.parallel
+
+
+def test_anything_a_run_collects_becomes_plain_json(comm, shared_tmp):
+    path = shared_tmp / "summary.json"
+    write_summary(path, {"outcome": "running"}, comm)
+    content = {
+        "outcome": "done",
+        "vertices": np.int64(4),
+        "seconds": {"solve": np.float64(0.5), "other": float("nan")},
+        "sizes": np.arange(3),
+        "terms": ("membrane", "wind"),
+        "folder": path.parent,
+        "resumed": False,
+    }
+    write_summary(path, content, comm)
+    comm.Barrier()
+    assert json.loads(path.read_text()) == {
+        "outcome": "done",
+        "vertices": 4,
+        "seconds": {"solve": 0.5, "other": None},
+        "sizes": [0, 1, 2],
+        "terms": ["membrane", "wind"],
+        "folder": str(path.parent),
+        "resumed": False,
+    }
+    assert [entry.name for entry in shared_tmp.iterdir()] == ["summary.json"]
+
+
+def test_a_summary_that_cannot_be_written_is_an_output_error_on_every_rank(comm, shared_tmp):
+    with pytest.raises(OutputError, match="No such file"):
+        write_summary(shared_tmp / "missing" / "summary.json", {}, comm)
+
+
+def test_versions_name_what_takes_part(monkeypatch):
+    from petsc4py import PETSc
+
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    found = versions()
+    assert found["petsc"] == "{}.{}.{}".format(*PETSc.Sys.getVersion())
+    assert found["numpy"] == np.__version__
+    assert found["python"] == sys.version.split()[0]
+    assert found["h5py"].endswith(("(MPI)", "(serial)"))
+    assert {"lyra_petsc", "petsc4py", "mpi4py", "mpi", "hdf5"} <= found.keys()
+    assert "numba" not in found
