@@ -1,0 +1,313 @@
+"""Handles as exact constraints: where held vertices are, whatever the sheet does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import CLOTH, Simulation, grid, rotation
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.handles.motion import Motion, Window, motion_of
+from lyra_petsc.scene.forcing import Keyframe
+from lyra_petsc.terms.spring import Spring
+
+Array = NDArray[np.float64]
+
+DT = 0.05
+MESH = grid(1.0, 0.6, 4, 3)
+
+
+def keyframes(*rows: dict[str, Any]) -> list[Keyframe]:
+    return [Keyframe.model_validate(row) for row in rows]
+
+
+def turn(degrees: float, axis: list[float] | None = None) -> dict[str, Any]:
+    return {"axis": axis or [0, 0, 1], "degrees": degrees}
+
+
+# -- motions -------------------------------------------------------------------------------------------
+
+
+def test_linear_translation_is_a_straight_line() -> None:
+    motion = Motion(keyframes({"time": 1}, {"time": 3, "translate": [2, 0, -4]}), "linear")
+    points = np.array([[0.1, 0.2, 0.3]])
+    for t, share in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.25), (2.5, 0.75), (3.0, 1.0), (9.0, 1.0)):
+        np.testing.assert_allclose(motion.carried(points, 0.0, t) - points, [[2 * share, 0, -4 * share]], atol=1e-15)
+    np.testing.assert_allclose(motion.velocity(points, 0.0, 2.0), [[1, 0, -2]], rtol=1e-8)
+    np.testing.assert_allclose(motion.velocity(points, 0.0, 4.0), 0.0)
+
+
+def test_hermite_starts_and_ends_at_rest_and_passes_with_the_central_difference() -> None:
+    motion = Motion(
+        keyframes({"time": 0}, {"time": 1, "translate": [1, 0, 0]}, {"time": 3, "translate": [4, 0, 0]}), "hermite"
+    )
+    origin = np.zeros((1, 3))
+    slope = 4.0 / 3.0
+    for t in np.linspace(0.05, 0.95, 7):
+        expected = 3 * t**2 - 2 * t**3 + slope * (t**3 - t**2)
+        assert motion.carried(origin, 0.0, t)[0, 0] == pytest.approx(expected, rel=1e-13)
+    assert motion.velocity(origin, 0.0, 0.0)[0, 0] == pytest.approx(0.0, abs=1e-4)
+    assert motion.velocity(origin, 0.0, 1.0)[0, 0] == pytest.approx(slope, rel=1e-5)
+    assert motion.velocity(origin, 0.0, 3.0)[0, 0] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_keyframe_velocity_replaces_the_tangent() -> None:
+    motion = Motion(
+        keyframes({"time": 0, "velocity": [1, 0, 0]}, {"time": 2, "translate": [2, 0, 0], "velocity": [1, 0, 0]}),
+        "hermite",
+    )
+    for t in (0.3, 1.0, 1.7):
+        assert motion.carried(np.zeros((1, 3)), 0.0, t)[0, 0] == pytest.approx(t, rel=1e-13)
+
+
+@pytest.mark.parametrize("degrees", [45.0, -120.0, 200.0, 300.0])
+@pytest.mark.parametrize("kind", ["linear", "hermite"])
+def test_half_way_through_a_turn_is_half_the_angle(degrees: float, kind: str) -> None:
+    motion = Motion(keyframes({"time": 0}, {"time": 2, "rotate": turn(degrees, [1, 1, 0])}), kind)
+    points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    for t, part in ((1.0, 0.5), (2.0, 1.0), (0.0, 0.0)):
+        expected = points @ rotation([1, 1, 0], np.radians(part * degrees)).T
+        np.testing.assert_allclose(motion.carried(points, 0.0, t), expected, atol=1e-13)
+    middle = motion.carried(points, 0.0, 0.7)
+    np.testing.assert_allclose(np.linalg.norm(middle, axis=1), np.linalg.norm(points, axis=1), rtol=1e-13)
+
+
+def test_transform_scales_then_turns_then_translates() -> None:
+    rows = keyframes({"time": 0, "scale": [2, 1, 3], "rotate": turn(90), "translate": [0, 0, 1]})
+    matrix, offset = Motion(rows, "linear").transform(0.0)
+    np.testing.assert_allclose(matrix @ [1, 1, 1] + offset, [-1, 2, 4], atol=1e-15)
+
+
+def test_a_motion_is_relative_to_the_handles_start() -> None:
+    motion = Motion(keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear")
+    np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 2.0), [[1, 0, 0]])
+    np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
+
+
+def test_keyframes_a_full_turn_apart_are_refused() -> None:
+    with pytest.raises(InputError, match="full turn") as refused:
+        Motion(keyframes({"time": 0}, {"time": 1}, {"time": 2, "rotate": turn(360)}), "hermite", key="motions.swing")
+    assert refused.value.key == "motions.swing"
+    content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "m"}]}
+    content["motions"] = {"m": [{"time": 0}, {"time": 1, "rotate": turn(-360)}]}
+    with pytest.raises(InputError, match="put a keyframe between") as refused:
+        Simulation(content, MPI.COMM_SELF)
+    assert refused.value.key == "motions.m"
+
+
+def test_two_halves_make_a_full_turn() -> None:
+    motion = Motion(
+        keyframes({"time": 0}, {"time": 1, "rotate": turn(180)}, {"time": 2, "rotate": turn(360)}), "hermite"
+    )
+    points = np.array([[1.0, 0.0, 0.0]])
+    angles = np.unwrap([np.arctan2(*motion.carried(points, 0.0, t)[0, 1::-1]) for t in np.linspace(0, 2, 41)])
+    assert np.all(np.diff(angles) > 0.0)
+    assert angles[-1] - angles[0] == pytest.approx(2 * np.pi)
+
+
+def test_window_and_fade() -> None:
+    window = Window(1.0, 2.0, 0.5)
+    assert [window.holds(*step) for step in ((0.9, 1.0), (1.0, 1.1), (1.9, 2.0), (1.95, 2.05))] == [
+        False,
+        True,
+        True,
+        False,
+    ]
+    assert window.strength(1.5, 1.6) == 1.0
+    assert window.strength(2.0, 2.25) == pytest.approx(0.5**4)
+    assert window.strength(2.4, 2.5) == 0.0
+    assert window.strength(0.5, 0.6) == 0.0
+    assert window.events() == [1.0, 2.0, 2.5]
+
+
+# -- on a sheet ----------------------------------------------------------------------------------------
+
+
+def held_scene(handles: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    motions = {
+        "swing": [
+            {"time": 0.1},
+            {"time": 0.4, "rotate": turn(45, [0, 1, 0]), "translate": [0.1, 0, 0.2], "scale": 1.2},
+            {"time": 0.8, "rotate": turn(90, [0, 1, 0])},
+        ]
+    }
+    return {"mesh": MESH, "gravity": [0, 0, -9.81], "handles": handles, "motions": motions} | more
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
+@pytest.mark.parametrize("interpolation", ["linear", "hermite"])
+def test_held_vertices_are_where_the_motion_says_at_every_step(
+    comm: MPI.Comm, integrator: str, interpolation: str
+) -> None:
+    nodes = [0, 5, 10, 15, 7]
+    content = held_scene(
+        [{"nodes": nodes, "motion": "swing", "interpolation": interpolation}],
+        time={"end": 1.0, "step": DT, "integrator": integrator},
+    )
+    with Simulation(content, comm) as simulation:
+        motion, start = motion_of(simulation.scene, 0), simulation.x[nodes]
+        for step in range(1, 19):
+            simulation.step(DT)
+            expected = motion.carried(start, 0.0, simulation.time)
+            np.testing.assert_allclose(simulation.x[nodes], expected, rtol=0.0, atol=1e-15)
+            written = simulation.gather(simulation.system.written_velocity())[nodes]
+            np.testing.assert_allclose(written, motion.velocity(start, 0.0, simulation.time), atol=1e-12)
+            assert step < 2 or np.abs(simulation.x[19] - start[0]).max() > 0.0
+
+
+@pytest.mark.parallel
+def test_one_axis_held_leaves_the_others_free(comm: MPI.Comm) -> None:
+    with Simulation(held_scene([{"group": "sheet", "axes": ["x", "y"]}]), comm) as simulation:
+        before = simulation.x
+        fallen = simulation.run(DT, 4) - before
+        np.testing.assert_array_equal(fallen[:, :2], 0.0)
+        np.testing.assert_allclose(fallen[:, 2], -9.81 * DT**2 * 10, rtol=1e-10)
+
+
+@pytest.mark.parallel
+def test_a_handle_starts_late_from_where_the_sheet_is_and_lets_go(comm: MPI.Comm) -> None:
+    handle = {"nodes": [0, 4], "from": 0.1, "until": 0.2}
+    with Simulation(held_scene([handle]), comm) as simulation:
+        start = simulation.x
+        caught = simulation.run(DT, 2)
+        np.testing.assert_allclose(caught[:, 2] - start[:, 2], -9.81 * DT**2 * 3, rtol=1e-10)
+        held = simulation.run(DT, 2)
+        np.testing.assert_array_equal(held[[0, 4]], caught[[0, 4]])
+        assert np.all(held[[10, 12], 2] < caught[[10, 12], 2])
+        released = simulation.run(DT, 2)
+        assert np.all(released[[0, 4], 2] < held[[0, 4], 2])
+
+
+@pytest.mark.parallel
+def test_a_late_moving_handle_goes_the_rest_of_its_way(comm: MPI.Comm) -> None:
+    handle = {"nodes": [0, 4], "from": 0.1, "motion": "swing"}
+    with Simulation(held_scene([handle], initial={"velocity": [0.5, 0, 0]}), comm) as simulation:
+        motion = motion_of(simulation.scene, 0)
+        caught = simulation.run(DT, 2)[[0, 4]]
+        for _ in range(5):
+            simulation.step(DT)
+            np.testing.assert_allclose(
+                simulation.x[[0, 4]], motion.carried(caught, 0.1, simulation.time), rtol=0.0, atol=1e-15
+            )
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_later_handle_in_the_scene_counts(comm: MPI.Comm, order: tuple[int, int]) -> None:
+    handles = [{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "swing"}]
+    with Simulation(held_scene([handles[i] for i in order]), comm) as simulation:
+        start = simulation.x
+        motion = motion_of(simulation.scene, order.index(1))
+        end = simulation.run(DT, 6)
+        moved = motion.carried(start[[1, 2]], 0.0, 0.3)
+        np.testing.assert_allclose(end[0], start[0])
+        np.testing.assert_allclose(end[2], moved[1], atol=1e-15)
+        np.testing.assert_allclose(end[1], moved[0] if order == (0, 1) else start[1], atol=1e-15)
+
+
+@pytest.mark.parallel
+def test_noise_moves_no_held_vertex_and_no_handles_start(comm: MPI.Comm) -> None:
+    content = held_scene([{"nodes": [0, 1]}], initial={"noise": 0.01})
+    with Simulation(content, comm) as simulation, Simulation(held_scene([]), comm) as flat:
+        np.testing.assert_array_equal(simulation.x[[0, 1]], flat.x[[0, 1]])
+        simulation.step(DT)
+        np.testing.assert_array_equal(simulation.x[[0, 1]], flat.x[[0, 1]])
+
+
+# -- springs and fading --------------------------------------------------------------------------------
+
+
+def test_a_soft_handle_settles_where_springs_carry_the_weight() -> None:
+    handle = {"group": "sheet", "stiffness": 50.0, "axes": ["z"]}
+    side = {"group": "sheet", "axes": ["x", "y"]}
+    stiff_shear = {"c11": 1e-3, "c22": 1e-3, "c12": 0.0, "c33": 1e-3}  # each vertex nearly for itself
+    content = held_scene([handle, side], material=CLOTH | {"membrane": stiff_shear})
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        start = simulation.x
+        sag = start - simulation.run(10.0, 6)
+        np.testing.assert_allclose(sag[:, 2], simulation.mass * 9.81 / 50.0, rtol=1e-3)
+
+
+def test_a_soft_handle_pulls_towards_the_moving_target() -> None:
+    content = held_scene([{"nodes": [0, 1], "stiffness": 1e7, "motion": "swing"}], gravity=None)
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        start = simulation.x[:2]
+        for _ in range(10):
+            simulation.step(DT)
+            target = motion_of(simulation.scene, 0).carried(start, 0.0, simulation.time)
+            np.testing.assert_allclose(simulation.x[:2], target, atol=2e-5)
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_a_fading_handle_weakens_as_the_fourth_power_and_then_is_gone(soft: bool) -> None:
+    handle = {"nodes": [0], "until": 0.1, "fade": 0.2} | ({"stiffness": 400.0} if soft else {})
+    with Simulation(held_scene([handle]), MPI.COMM_SELF) as simulation:
+        spring = simulation.model.terms["spring"]
+        assert isinstance(spring, Spring)
+        full = 400.0 if soft else 1000.0
+        start = simulation.x[0]
+        for step in range(1, 9):
+            simulation.step(DT)
+            t = step * DT
+            block = np.empty((1, 1, 1, 3, 3))
+            spring.hessians(simulation.system.x, 0, 1, 0.0, block)
+            share = 1.0 if t <= 0.1 + 1e-12 else max(0.0, 1.0 - (t - 0.1) / 0.2) ** 4
+            if not soft and t <= 0.1 + 1e-12:
+                share = 0.0  # held exactly: no spring yet
+                np.testing.assert_array_equal(simulation.x[0], start)
+            np.testing.assert_allclose(block[0, 0, 0], full * share * np.eye(3), rtol=1e-9, atol=1e-9)
+        assert simulation.x[0, 2] < start[2] - 0.05
+
+
+# -- clamps --------------------------------------------------------------------------------------------
+
+
+def tip_deflection(nx: int, clamp: bool, pattern: str = "criss-cross") -> float:
+    """Of a cantilever strip over P L³/(3 B w), P small."""
+    length, width, b = 1.0, 1.0 / nx, 0.5  # one square cell wide: a wide clamp would stiffen its surroundings
+    load = 1e-6
+    stiff = {"c11": 1e4, "c22": 1e4, "c12": 0.0, "c33": 5e3}
+    content = {
+        "mesh": grid(length, width, nx, 1, pattern),
+        "material": {"density": 0.1, "membrane": stiff, "bending": b},
+        "handles": [{"group": "left", "clamp": clamp}]
+        if clamp
+        else [{"box": [[-1, -1, -1], [1.001 * length / nx, 1, 1]]}],
+        "loads": [{"group": "right", "force": [0, 0, load]}],
+    }
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        x = simulation.run(1e6, 3)  # so long a step is the static answer
+        tip = x[np.isclose(x[:, 0], length, atol=1e-3), 2].mean()
+    return float(tip / (load * length**3 / (3.0 * b * width)))
+
+
+@pytest.mark.parametrize(("pattern", "stiffness"), [("criss-cross", 1.0), ("diagonal", 0.8), ("alternating", 0.8)])
+def test_clamped_cantilever_converges_to_the_beam(pattern: str, stiffness: float) -> None:
+    """With the stiffness that a strip with free edges has on each family of meshes, in B."""
+    errors = [abs(tip_deflection(nx, clamp=True, pattern=pattern) * stiffness - 1.0) for nx in (10, 20, 40)]
+    assert errors[2] < 3e-4
+    assert errors[0] > 3.5 * errors[1] > 12.0 * errors[2]
+
+
+def test_without_the_half_hinge_two_held_rows_are_a_worse_clamp() -> None:
+    held_rows = abs(tip_deflection(20, clamp=False) - 1.0)
+    assert held_rows > 3.0 * abs(tip_deflection(20, clamp=True) - 1.0)
+
+
+def test_a_clamp_turns_with_its_handle() -> None:
+    content = {
+        "mesh": grid(1.0, 0.2, 10, 2),
+        "material": CLOTH | {"bending": 0.5, "damping": 0.05},
+        "handles": [{"group": "left", "clamp": True, "motion": "tip"}],
+        "motions": {"tip": [{"time": 0}, {"time": 1, "rotate": turn(-60, [0, 1, 0])}]},
+    }
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        start = simulation.x
+        simulation.run(0.1, 10)
+        end = simulation.run(1.0, 30)  # held still by now: the strip comes to rest, straight
+        np.testing.assert_allclose(end, start @ rotation([0, 1, 0], -np.pi / 3).T, atol=1e-6)
