@@ -1,0 +1,125 @@
+"""The order of the house: imports point one way, modules stay small, only the terminal's room prints."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
+
+LEVELS = [
+    {"errors", "nearest"},
+    {"parallel"},
+    {"materials"},
+    {"scene"},
+    {"meshing"},
+    {"handles"},
+    {"partition"},
+    {"terms"},
+    {"assembly"},
+    {"solvers"},
+    {"stepping"},
+    {"output"},
+    {"start"},
+    {"model"},
+    {"fields"},
+    {"simulation"},
+    {"cli"},
+    {"__main__"},
+]
+RANK = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
+
+#: output knows arrays and files; of the rest of the house only the mesh as plain data
+OUTPUT_MAY_USE = {"lyra_petsc.errors", "lyra_petsc.parallel", "lyra_petsc.meshing.mesh"}
+
+LONGEST = 350
+"""Lines of a module."""
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room(module: str) -> str:
+    """The room of a module of the package; empty for the package itself."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else ""
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and name of every module of ours that is imported, wherever it stands."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.split(".")[0] == PACKAGE.name:
+                    yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"relative import in line {node.lineno}"
+            if node.module and node.module.split(".")[0] == PACKAGE.name:
+                for alias in node.names:
+                    inner = PACKAGE.parent.joinpath(*node.module.split("."), alias.name)
+                    is_module = inner.is_dir() or inner.with_suffix(".py").is_file()
+                    yield node.lineno, f"{node.module}.{alias.name}" if is_module else node.module
+
+
+def upward(source: str, name: str) -> list[str]:
+    """The imports of a module that point up the house."""
+    wrong = []
+    mine = room(name)
+    for line, other in imported(ast.parse(source)):
+        theirs = room(other)
+        if theirs in ("", mine):
+            continue
+        if RANK[theirs] >= RANK[mine] or (mine == "output" and other not in OUTPUT_MAY_USE):
+            wrong.append(f"line {line}: {other}")
+    return wrong
+
+
+@pytest.mark.parametrize("path", MODULES, ids=[module_name(path) for path in MODULES])
+def test_imports_point_one_way(path: Path) -> None:
+    name = module_name(path)
+    assert room(name) in RANK or name == PACKAGE.name, f"give the room of {name} its place in LEVELS"
+    assert upward(path.read_text(encoding="utf-8"), name) == []
+
+
+def test_an_upward_import_is_found() -> None:
+    assert upward("def f():\n    from lyra_petsc.stepping.system import X\n", "lyra_petsc.terms.wind") == [
+        "line 2: lyra_petsc.stepping.system"
+    ]
+    assert upward("import lyra_petsc.cli.app", "lyra_petsc.model") == ["line 1: lyra_petsc.cli.app"]
+    assert upward("from lyra_petsc import model", "lyra_petsc.output.states") == ["line 1: lyra_petsc.model"]
+    assert upward("from lyra_petsc.scene.schema import S", "lyra_petsc.output.states") != []
+    assert upward("from lyra_petsc.errors import E", "lyra_petsc.output.states") == []
+    assert upward("from lyra_petsc.terms.rest import R", "lyra_petsc.assembly.blocks") == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=[module_name(path) for path in MODULES])
+def test_modules_stay_small(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize("path", MODULES, ids=[module_name(path) for path in MODULES])
+def test_only_the_terminals_room_prints(path: Path) -> None:
+    if room(module_name(path)) in ("cli", "__main__"):
+        return
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    lines = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
+    assert lines == []
+
+
+def test_terms_have_never_heard_of_petsc_mpi_or_files() -> None:
+    for path in (PACKAGE / "terms").glob("*.py"):
+        names = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                names.add(node.module.split(".")[0])
+        assert not names & {"petsc4py", "mpi4py", "h5py", "os", "io", "pathlib"}, path.name
