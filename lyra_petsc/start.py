@@ -11,9 +11,7 @@ from lyra_petsc.scene.schema import Initial
 Array = NDArray[np.float64]
 
 
-def start_positions(
-    initial: Initial, mesh: Mesh, held: dict[int, NDArray[np.int64]]
-) -> dict[str, Array]:
+def start_positions(initial: Initial, mesh: Mesh, held: dict[int, NDArray[np.int64]]) -> dict[str, Array]:
     """``start`` (V, 3) [m]: displaced along the vertex normals by normal noise, but for held vertices.
 
     Empty without noise.
@@ -22,7 +20,7 @@ def start_positions(
         return {}
     corners = mesh.positions[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    summed = np.stack(
+    summed: Array = np.stack(
         [np.bincount(mesh.triangles.ravel(), np.repeat(normals[:, i], 3), mesh.n_vertices) for i in range(3)],
         axis=1,
     )

@@ -47,7 +47,9 @@ def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal
     return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": pattern}}
 
 
-def obj_file(path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]) -> dict[str, Any]:
+def obj_file(
+    path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]
+) -> dict[str, Any]:
     """Write an .obj without ``vt`` (rest shape: the surface itself); the mesh block that names it."""
     rows = [f"v {float(x)!r} {float(y)!r} {float(z)!r}" for x, y, z in vertices]
     rows += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles]

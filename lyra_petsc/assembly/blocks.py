@@ -114,7 +114,8 @@ class BlockRows:
         """Rows with a block whose row or column point has a prescribed coordinate; mask (n_local, 3)."""
         held = mask.any(axis=1)
         rows = np.repeat(np.arange(len(self.pattern.indptr) - 1), np.diff(self.pattern.indptr))
-        return np.unique(rows[held[self.pattern.columns] | held[rows]])
+        beside: NDArray[np.int64] = np.unique(rows[held[self.pattern.columns] | held[rows]])
+        return beside
 
     def constrain(self, values: Array, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> None:
         """Decouple prescribed coordinates, with a positive diagonal of the size of their neighbours.

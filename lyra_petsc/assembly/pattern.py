@@ -42,7 +42,9 @@ class BlockPattern:
         own = np.arange(n_owned, dtype=np.int64)
         diagonal_keys = own * n_local + position[own]
         keys = np.unique(
-            np.concatenate([diagonal_keys, *(_keys(s, n_owned, n_local, position) for s in stencils.values())])
+            np.concatenate(
+                [diagonal_keys, *(_keys(s, n_owned, n_local, position) for s in stencils.values())]
+            )
         )
         rows, places = np.divmod(keys, max(n_local, 1))
         self.columns: Ints = order[places]
@@ -73,9 +75,7 @@ def _keys(stencil: NDArray[np.int32], n_owned: int, n_local: int, position: Ints
     return np.unique(np.concatenate(parts))
 
 
-def _offsets(
-    stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int, position: Ints
-) -> Offsets:
+def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int, position: Ints) -> Offsets:
     n = stencil.shape[1]
     out = np.empty((len(stencil), n, n), dtype=np.int32)
     for a in range(n):

@@ -42,7 +42,9 @@ class Held:
 
     def __init__(self, scene: Scene, owned: Selection) -> None:
         self._vertices = owned
-        self._axes = {number: list(scene.handles[number].axis_numbers) for number in owned}
+        self._axes = {
+            number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
+        }
         self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
         self._windows = {number: Window.of(scene.handles[number]) for number in owned}
         self._start: dict[int, Array] = {number: np.zeros((len(v), 3)) for number, v in owned.items()}

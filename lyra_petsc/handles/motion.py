@@ -88,7 +88,10 @@ class Motion:
             return p + s * (q - p), (q - p) / h
         m, n = h * self._tangents[i], h * self._tangents[i + 1]
         value = (
-            (1 + 2 * s) * (1 - s) ** 2 * p + s * (1 - s) ** 2 * m + s * s * (3 - 2 * s) * q - s * s * (1 - s) * n
+            (1 + 2 * s) * (1 - s) ** 2 * p
+            + s * (1 - s) ** 2 * m
+            + s * s * (3 - 2 * s) * q
+            - s * s * (1 - s) * n
         )
         slope = 6 * s * (s - 1) * (p - q) + (1 - s) * (1 - 3 * s) * m + s * (3 * s - 2) * n
         return value, slope / h

@@ -12,9 +12,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.partitioner import locality_order, partition, vertex_graph
 from lyra_petsc.partition.points import Ints, Numbering, Points
-from lyra_petsc.partition.elements import Elements
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,11 @@ def split_elements(owner: NDArray[np.int64], n_ranks: int) -> list[tuple[Ints, i
         by the owner of its first point.
     """
     n_elements = len(owner)
-    pairs = np.unique((owner * n_elements + np.arange(n_elements)[:, None]).ravel()) if n_elements else owner.ravel()
+    pairs = (
+        np.unique((owner * n_elements + np.arange(n_elements)[:, None]).ravel())
+        if n_elements
+        else owner.ravel()
+    )
     ranks, elements = np.divmod(pairs, max(n_elements, 1))
     ends = np.searchsorted(ranks, np.arange(n_ranks + 1))
     pieces = []
@@ -86,7 +90,9 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
     graph = vertex_graph([whole.triangles], n_vertices) if whole else None
     owner, name = partition(comm, graph, n_vertices)
     if comm.rank == 0:
-        assert whole is not None and owner is not None and graph is not None
+        assert whole is not None
+        assert owner is not None
+        assert graph is not None
         numbering = Numbering.build(owner, locality_order(graph), comm.size)
         del graph
         pieces = _pieces(whole, numbering, comm.size)
@@ -110,7 +116,8 @@ def _pieces(whole: Whole, numbering: Numbering, n_ranks: int):  # type: ignore[n
     for rank in range(n_ranks):
         lo, hi = numbering.bounds[rank], numbering.bounds[rank + 1]
         stencils = {
-            name: numbering.number[whole.elements[name].stencil[mine[rank][0]]] for name, mine in split.items()
+            name: numbering.number[whole.elements[name].stencil[mine[rank][0]]]
+            for name, mine in split.items()
         }
         touched = np.unique(np.concatenate([s.ravel() for s in stencils.values()] or [np.empty(0, np.int64)]))
         ghosts = touched[(touched < lo) | (touched >= hi)]
@@ -129,7 +136,8 @@ def _pieces(whole: Whole, numbering: Numbering, n_ranks: int):  # type: ignore[n
 def _local(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
     """Local numbers of global ones: owned from 0, ghosts after them."""
     inside = (numbers >= lo) & (numbers < hi)
-    return np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
+    local: Ints = np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
+    return local
 
 
 def _by_locality(stencil: Ints, n_owned: int) -> Ints:
@@ -137,4 +145,5 @@ def _by_locality(stencil: Ints, n_owned: int) -> Ints:
     if len(stencil) == 0:
         return np.empty(0, dtype=np.int64)
     first = stencil.min(axis=1)
-    return np.lexsort((first, np.arange(len(stencil)) >= n_owned))
+    order: Ints = np.lexsort((first, np.arange(len(stencil)) >= n_owned))
+    return order

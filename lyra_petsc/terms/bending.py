@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
@@ -115,7 +115,8 @@ class Bending(Elastic):
 
 def _corners_of(triangles: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Which corner (0, 1, 2) of each triangle (n, 3) each vertex (n,) is."""
-    return np.argmax(triangles == vertices[:, None], axis=1)
+    corner: NDArray[np.int64] = np.argmax(triangles == vertices[:, None], axis=1)
+    return corner
 
 
 def edge_in_material(
@@ -135,7 +136,9 @@ def edge_in_material(
     edge = uv[row, _corners_of(corners, head)] - uv[row, _corners_of(corners, tail)]
     warp = np.radians(rest.per_triangle("warp_degrees")[triangle])
     cosine, sine = np.cos(warp), np.sin(warp)
-    edge = np.stack([cosine * edge[:, 0] + sine * edge[:, 1], cosine * edge[:, 1] - sine * edge[:, 0]], axis=1)
+    edge = np.stack(
+        [cosine * edge[:, 0] + sine * edge[:, 1], cosine * edge[:, 1] - sine * edge[:, 0]], axis=1
+    )
     direction = np.degrees(np.arctan2(np.abs(edge[:, 1]), np.abs(edge[:, 0])))
     stiffness = np.zeros(len(triangle))
     for number, shell in enumerate(rest.shells):
@@ -144,7 +147,9 @@ def edge_in_material(
     return edge, stiffness
 
 
-def _foot_and_height(rest: RestShape, triangle: NDArray[np.int64], quad: NDArray[np.int64]) -> tuple[Array, Array]:
+def _foot_and_height(
+    rest: RestShape, triangle: NDArray[np.int64], quad: NDArray[np.int64]
+) -> tuple[Array, Array]:
     """Of the opposite vertex over the edge: distance of its foot from the tail and its height [m]."""
     tail, head, opposite = quad.T
     edge, _ = edge_in_material(rest, triangle, tail, head)

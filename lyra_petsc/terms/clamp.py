@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from lyra_petsc.handles.motion import Motion, Window, motion_of
 from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.meshing.topology import boundary_edges
+from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import edge_in_material
-from lyra_petsc.partition.elements import Elements
 from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from lyra_petsc.handles.motion import Window
 from lyra_petsc.meshing.select import find_group, select_triangles, select_vertices
+from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Load as LoadBlock
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.partition.elements import Elements
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
 
@@ -61,7 +61,9 @@ def elements(rest: RestShape) -> Elements:
             chosen, part = _shares(rest, load, f"loads[{number}]")
             force = part[:, None] * np.asarray(load.force)
         elif load.traction is not None:
-            faces = select_triangles(rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source)
+            faces = select_triangles(
+                rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
+            )
             area = np.bincount(
                 rest.mesh.triangles[faces].ravel(), np.repeat(rest.area[faces] / 3.0, 3), rest.mesh.n_vertices
             )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
 

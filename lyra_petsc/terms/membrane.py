@@ -14,8 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
@@ -186,7 +186,8 @@ class Membrane(Elastic):
     def force_scale(self, size: float) -> Array:
         stiffest: Array = np.abs(self._c).max(axis=1)
         steepest = np.abs(self._inverse).max(axis=(1, 2))
-        return stiffest * self._area * steepest**2 * size
+        scale: Array = stiffest * self._area * steepest**2 * size
+        return scale
 
     def strain_and_stress(self, x: Array) -> tuple[Array, Array]:
         """Green strain (E_uu, E_vv, E_uv) and stress (S_uu, S_vv, S_uv) [N/m], each (E, 3)."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.handles.motion import Window
 from lyra_petsc.meshing.select import select_triangles
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
@@ -56,7 +56,9 @@ def elements(rest: RestShape) -> Elements:
     stencils, loads = [], []
     for number, load in enumerate(rest.scene.loads):
         if load.pressure is not None:
-            chosen = select_triangles(rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source)
+            chosen = select_triangles(
+                rest.mesh, load.group, key=f"loads[{number}].group", file=rest.scene.source
+            )
             stencils.append(rest.mesh.triangles[chosen])
             loads.append(np.full(len(chosen), float(number)))
     return Elements(np.concatenate(stencils), {"load": np.concatenate(loads)})

@@ -37,7 +37,9 @@ def _bends(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
 REGISTRY = (
     Registration("membrane", lambda scene, shells: True),
     Registration("bending", _bends),
-    Registration("clamp", lambda scene, shells: _bends(scene, shells) and any(h.clamp for h in scene.handles)),
+    Registration(
+        "clamp", lambda scene, shells: _bends(scene, shells) and any(h.clamp for h in scene.handles)
+    ),
     Registration(
         "spring", lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles)
     ),

@@ -77,8 +77,8 @@ class RestShape:
         """Lumped mass [kg] of each vertex, (V,): a third of each of its triangles."""
         shares = np.repeat(self.area * self.per_triangle("density") / 3.0, 3)
         corners = self.mesh.triangles.ravel()
-        lumped: NDArray[np.float64] = np.bincount(corners, weights=shares, minlength=self.mesh.n_vertices)
-        return lumped
+        lumped = np.bincount(corners, weights=shares, minlength=self.mesh.n_vertices)
+        return np.asarray(lumped, dtype=np.float64)
 
     @cached_property
     def hinges(self) -> Hinges:

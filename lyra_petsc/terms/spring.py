@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.handles.motion import Motion, Window, motion_of
 from lyra_petsc.meshing.select import select_vertices
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 

@@ -53,12 +53,15 @@ class Elastic(Term):
 
     @abstractmethod
     def force_scale(self, size: float) -> Array:
-        """Force [N] whose relative round-off each element's force carries, (E,), at coordinates of ``size`` [m]."""
+        """Force [N] whose relative round-off each element's force carries, (E,).
 
-    def begin(self, time: float, x: Array) -> None:  # noqa: B027
+        ``size`` [m] is the largest coordinate.
+        """
+
+    def begin(self, time: float, x: Array) -> None:
         """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""
 
-    def prepare(self, t0: float, t1: float) -> None:  # noqa: B027
+    def prepare(self, t0: float, t1: float) -> None:
         """Set what depends on time for the step from t0 to t1 [s] (moving targets)."""
 
 

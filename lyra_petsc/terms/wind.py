@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.scene.schema import Scene
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Viscous
@@ -64,7 +64,11 @@ def add_gradient(v, s, area, n, wind, density, drag, out):  # type: ignore[no-un
         rx, ry, rz, vn = _relative(v, s, e, n, wind)
         w = area[e] / 3.0
         along = w * (density * abs(vn) - drag) * vn
-        fx, fy, fz = along * n[e, 0] + w * drag * rx, along * n[e, 1] + w * drag * ry, along * n[e, 2] + w * drag * rz
+        fx, fy, fz = (
+            along * n[e, 0] + w * drag * rx,
+            along * n[e, 1] + w * drag * ry,
+            along * n[e, 2] + w * drag * rz,
+        )
         for k in range(3):
             i = s[e, k]
             out[i, 0] -= fx

@@ -31,7 +31,10 @@ EVERYTHING: dict[str, Any] = {
         {"nodes": [19, 14], "stiffness": 200.0},
     ],
     "motions": {
-        "turn": [{"time": 0}, {"time": 1, "rotate": {"axis": [1, 0, 0], "degrees": 50}, "translate": [0.1, 0, 0]}]
+        "turn": [
+            {"time": 0},
+            {"time": 1, "rotate": {"axis": [1, 0, 0], "degrees": 50}, "translate": [0.1, 0, 0]},
+        ]
     },
     "loads": [{"pressure": 5.0}, {"nodes": [12], "force": [0.0, 1.0, 1.0]}],
 }

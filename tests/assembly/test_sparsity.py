@@ -110,7 +110,11 @@ def imported(**more: Any) -> set[str]:
     } | more
     script = SCRIPT.replace("HEAVY", repr(HEAVY))
     done = subprocess.run(
-        [sys.executable, "-c", script, json.dumps(scene)], capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", script, json.dumps(scene)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     return set(json.loads(done.stdout.splitlines()[-1]))

@@ -22,7 +22,9 @@ def test_free_fall(comm: MPI.Comm, dt: float, steps: int, z: float) -> None:
     with Simulation(content, comm) as simulation:
         before = simulation.x
         after = simulation.run(dt, steps)
-        np.testing.assert_allclose(after - before, np.tile([0.0, 0.0, z], (12, 1)), atol=1e-12 * abs(z) + 1e-14)
+        np.testing.assert_allclose(
+            after - before, np.tile([0.0, 0.0, z], (12, 1)), atol=1e-12 * abs(z) + 1e-14
+        )
 
 
 def eigenvalue(matrix: Array) -> complex:
@@ -37,7 +39,9 @@ DAMPED = [row for row in EXACT["oscillator"]["rows"] if row[0] <= 10.0]
 
 
 @pytest.mark.parametrize(("omega_dt", "zeta", "amplification", "phase"), UNDAMPED)
-def test_spring_and_mass(tmp_path: Path, omega_dt: float, zeta: float, amplification: float, phase: float) -> None:
+def test_spring_and_mass(
+    tmp_path: Path, omega_dt: float, zeta: float, amplification: float, phase: float
+) -> None:
     omega, triangle = 20.0, equilateral(tmp_path / "triangle.obj")
     mass = 0.2 * 3 * np.sqrt(3) / 4 / 3
     handle = {"nodes": [0, 1, 2], "stiffness": mass * omega**2}
@@ -127,7 +131,9 @@ def test_fall_of_a_flat_sheet_through_air(comm: MPI.Comm) -> None:
             if step in rows:
                 v, z = rows[step]
                 np.testing.assert_allclose(simulation.v[:, 2], -v, rtol=1e-11)
-                np.testing.assert_allclose(simulation.x - x, np.tile([0, 0, z], (len(x), 1)), rtol=1e-11, atol=1e-13)
+                np.testing.assert_allclose(
+                    simulation.x - x, np.tile([0, 0, z], (len(x), 1)), rtol=1e-11, atol=1e-13
+                )
 
 
 def test_edge_on_drag_is_linear_in_the_velocity() -> None:
@@ -153,7 +159,12 @@ def test_momentum_of_a_free_sheet_is_kept_and_its_spin_never_grows() -> None:
     content = {
         "mesh": grid(1, 1, 4, 4),
         "material": CLOTH | {"bending": 1e-3, "damping": 0.01},
-        "initial": {"velocity": [0.3, 0.0, 1.0], "angular_velocity": [2.0, 1.0, 3.0], "noise": 0.01, "seed": 4},
+        "initial": {
+            "velocity": [0.3, 0.0, 1.0],
+            "angular_velocity": [2.0, 1.0, 3.0],
+            "noise": 0.01,
+            "seed": 4,
+        },
     }
     with Simulation(content, MPI.COMM_SELF) as simulation:
         mass = simulation.mass[:, None]

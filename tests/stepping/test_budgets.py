@@ -21,9 +21,17 @@ DT = 0.01
 BASE: dict[str, Any] = {
     "mesh": grid(1.0, 0.8, 5, 4, "alternating"),
     "material": CLOTH | {"bending": 2e-3},
-    "initial": {"velocity": [0.2, -0.1, 0.3], "angular_velocity": [1.0, 0.5, -2.0], "noise": 0.005, "seed": 2},
+    "initial": {
+        "velocity": [0.2, -0.1, 0.3],
+        "angular_velocity": [1.0, 0.5, -2.0],
+        "noise": 0.005,
+        "seed": 2,
+    },
 }
-TURN = [{"time": 0}, {"time": 0.3, "rotate": {"axis": [0, 1, 0], "degrees": 40}, "translate": [0.0, 0.1, 0.05]}]
+TURN = [
+    {"time": 0},
+    {"time": 0.3, "rotate": {"axis": [0, 1, 0], "degrees": 40}, "translate": [0.0, 0.1, 0.05]},
+]
 SIDE = {"box": [[-0.01, -0.1, -0.1], [0.01, 1.0, 0.1]]}
 
 SCENES: dict[str, dict[str, Any]] = {
@@ -37,7 +45,10 @@ SCENES: dict[str, dict[str, Any]] = {
     "loads": {"loads": [{"nodes": [3], "force": [0, 1, 2]}, {"pressure": 8.0}, {"traction": [0, 0.5, 0]}]},
     "clamp": {"gravity": [0, 0, -9.81], "handles": [SIDE | {"clamp": True}]},
     "moving clamp": {"handles": [SIDE | {"clamp": True, "motion": "turn"}], "motions": {"turn": TURN}},
-    "released clamp": {"handles": [SIDE | {"clamp": True, "motion": "turn", "until": 0.06}], "motions": {"turn": TURN}},
+    "released clamp": {
+        "handles": [SIDE | {"clamp": True, "motion": "turn", "until": 0.06}],
+        "motions": {"turn": TURN},
+    },
 }
 SCENES["all"] = SCENES["moving"] | SCENES["wind"] | SCENES["loads"] | SCENES["damping"]
 
@@ -117,7 +128,11 @@ def test_forces_and_reactions_are_the_change_of_momentum(comm: MPI.Comm, name: s
 
 
 def test_reactions_of_a_sheet_at_rest_carry_its_weight(comm: MPI.Comm) -> None:
-    content = BASE | {"initial": {}, "gravity": [0, -9.81, 0], "handles": [{"box": [[-1, 0.79, -1], [2, 1, 1]]}]}
+    content = BASE | {
+        "initial": {},
+        "gravity": [0, -9.81, 0],
+        "handles": [{"box": [[-1, 0.79, -1], [2, 1, 1]]}],
+    }
     with Simulation(content, comm) as simulation:
         system = simulation.system
         n = system.points.n_owned

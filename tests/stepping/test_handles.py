@@ -36,14 +36,17 @@ def test_linear_translation_is_a_straight_line() -> None:
     motion = Motion(keyframes({"time": 1}, {"time": 3, "translate": [2, 0, -4]}), "linear")
     points = np.array([[0.1, 0.2, 0.3]])
     for t, share in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.25), (2.5, 0.75), (3.0, 1.0), (9.0, 1.0)):
-        np.testing.assert_allclose(motion.carried(points, 0.0, t) - points, [[2 * share, 0, -4 * share]], atol=1e-15)
+        np.testing.assert_allclose(
+            motion.carried(points, 0.0, t) - points, [[2 * share, 0, -4 * share]], atol=1e-15
+        )
     np.testing.assert_allclose(motion.velocity(points, 0.0, 2.0), [[1, 0, -2]], rtol=1e-8)
     np.testing.assert_allclose(motion.velocity(points, 0.0, 4.0), 0.0)
 
 
 def test_hermite_starts_and_ends_at_rest_and_passes_with_the_central_difference() -> None:
     motion = Motion(
-        keyframes({"time": 0}, {"time": 1, "translate": [1, 0, 0]}, {"time": 3, "translate": [4, 0, 0]}), "hermite"
+        keyframes({"time": 0}, {"time": 1, "translate": [1, 0, 0]}, {"time": 3, "translate": [4, 0, 0]}),
+        "hermite",
     )
     origin = np.zeros((1, 3))
     slope = 4.0 / 3.0
@@ -57,7 +60,9 @@ def test_hermite_starts_and_ends_at_rest_and_passes_with_the_central_difference(
 
 def test_a_keyframe_velocity_replaces_the_tangent() -> None:
     motion = Motion(
-        keyframes({"time": 0, "velocity": [1, 0, 0]}, {"time": 2, "translate": [2, 0, 0], "velocity": [1, 0, 0]}),
+        keyframes(
+            {"time": 0, "velocity": [1, 0, 0]}, {"time": 2, "translate": [2, 0, 0], "velocity": [1, 0, 0]}
+        ),
         "hermite",
     )
     for t in (0.3, 1.0, 1.7):
@@ -83,14 +88,20 @@ def test_transform_scales_then_turns_then_translates() -> None:
 
 
 def test_a_motion_is_relative_to_the_handles_start() -> None:
-    motion = Motion(keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear")
+    motion = Motion(
+        keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear"
+    )
     np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 2.0), [[1, 0, 0]])
     np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
 
 
 def test_keyframes_a_full_turn_apart_are_refused() -> None:
     with pytest.raises(InputError, match="full turn") as refused:
-        Motion(keyframes({"time": 0}, {"time": 1}, {"time": 2, "rotate": turn(360)}), "hermite", key="motions.swing")
+        Motion(
+            keyframes({"time": 0}, {"time": 1}, {"time": 2, "rotate": turn(360)}),
+            "hermite",
+            key="motions.swing",
+        )
     assert refused.value.key == "motions.swing"
     content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "m"}]}
     content["motions"] = {"m": [{"time": 0}, {"time": 1, "rotate": turn(-360)}]}
@@ -286,7 +297,9 @@ def tip_deflection(nx: int, clamp: bool, pattern: str = "criss-cross") -> float:
     return float(tip / (load * length**3 / (3.0 * b * width)))
 
 
-@pytest.mark.parametrize(("pattern", "stiffness"), [("criss-cross", 1.0), ("diagonal", 0.8), ("alternating", 0.8)])
+@pytest.mark.parametrize(
+    ("pattern", "stiffness"), [("criss-cross", 1.0), ("diagonal", 0.8), ("alternating", 0.8)]
+)
 def test_clamped_cantilever_converges_to_the_beam(pattern: str, stiffness: float) -> None:
     """With the stiffness that a strip with free edges has on each family of meshes, in B."""
     errors = [abs(tip_deflection(nx, clamp=True, pattern=pattern) * stiffness - 1.0) for nx in (10, 20, 40)]

@@ -40,7 +40,9 @@ def elongation(nx: int, e: float) -> float:
     return float(tip[0]) - 1.0
 
 
-@pytest.mark.parametrize(("e", "n", "exact"), [row for row in HANGING["chain"]["rows"] if row[1] in (1, 4, 16)])
+@pytest.mark.parametrize(
+    ("e", "n", "exact"), [row for row in HANGING["chain"]["rows"] if row[1] in (1, 4, 16)]
+)
 def test_strip_is_the_discrete_chain(e: float, n: int, exact: float) -> None:
     assert elongation(n, e) == pytest.approx(exact, rel=1e-10, abs=1e-12)
 
@@ -56,7 +58,9 @@ def test_strip_converges_with_the_square_of_the_element_size(e: float, exact: fl
 
 def test_strip_under_gravity_itself() -> None:
     # lumped masses of a diagonal grid differ at the corners: equal to the chain but for that
-    content = strip(16, 0.1, gravity=[9.81, 0, 0], handles=[{"group": "left"}, {"group": "sheet", "axes": ["y", "z"]}])
+    content = strip(
+        16, 0.1, gravity=[9.81, 0, 0], handles=[{"group": "left"}, {"group": "sheet", "axes": ["y", "z"]}]
+    )
     with Simulation(content, MPI.COMM_SELF) as simulation:
         x = simulation.run(100.0, 8)
     exact = next(row[2] for row in HANGING["chain"]["rows"] if row[:2] == [0.1, 16])

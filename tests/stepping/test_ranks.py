@@ -31,7 +31,11 @@ SHEET: dict[str, Any] = {
 TWO_SHEETS = {
     "mesh": [
         {"grid": {"width": 1, "height": 0.3, "nx": 6, "ny": 2, "pattern": "criss-cross"}, "name": "a"},
-        {"grid": {"width": 0.5, "height": 0.5, "nx": 3, "ny": 3}, "name": "b", "transform": {"translate": [0, 2, 0]}},
+        {
+            "grid": {"width": 0.5, "height": 0.5, "nx": 3, "ny": 3},
+            "name": "b",
+            "transform": {"translate": [0, 2, 0]},
+        },
     ],
     "material": [CLOTH | {"group": "a"}, CLOTH | {"density": 0.5, "bending": 1e-3}],
     "gravity": [0, 0, -9.81],
@@ -41,7 +45,9 @@ TWO_SHEETS = {
 TINY = {"mesh": grid(1, 1, 1, 1), "gravity": [0, 0, -9.81], "handles": [{"nodes": [0]}]}
 
 
-def outcome(content: dict[str, Any], comm: MPI.Comm, steps: int) -> tuple[np.ndarray, np.ndarray, list[float]]:
+def outcome(
+    content: dict[str, Any], comm: MPI.Comm, steps: int
+) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Positions, velocities and energies after some steps."""
     with Simulation(content, comm) as simulation:
         ledger = Ledger(simulation.system)

@@ -43,7 +43,7 @@ def dense_stiffness(term: Elastic, x: Array) -> Array:
 
 
 def paper_step(system: ReducedSystem, dt: float) -> Array:
-    """Velocity (V, 3) after a step: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n), held rows out."""
+    """Velocity (V, 3) after a step: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n)."""
     x, v_old = system.x, system.v
     system.begin_step(0.0, dt)
     mass = np.repeat(system.mass, 3)

@@ -7,13 +7,19 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
 
-MESH = {"grid": {"width": 1, "height": 1, "nx": 6, "ny": 6}, "transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
+MESH = {
+    "grid": {"width": 1, "height": 1, "nx": 6, "ny": 6},
+    "transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}},
+}
 
 
 @pytest.mark.parallel
 def test_spin_is_about_the_centre_of_mass(comm: MPI.Comm) -> None:
     content = {
-        "mesh": [grid(1, 1, 2, 2), grid(1, 1, 1, 1) | {"name": "heavy", "transform": {"translate": [3, 0, 0]}}],
+        "mesh": [
+            grid(1, 1, 2, 2),
+            grid(1, 1, 1, 1) | {"name": "heavy", "transform": {"translate": [3, 0, 0]}},
+        ],
         "material": [CLOTH, CLOTH | {"density": 1.0, "group": "heavy"}],
         "initial": {"velocity": [0, 1, 0], "angular_velocity": [0, 0, 2]},
     }
@@ -27,8 +33,14 @@ def test_spin_is_about_the_centre_of_mass(comm: MPI.Comm) -> None:
 
 
 def test_noise_goes_along_the_normal_with_the_given_size() -> None:
-    content = {"mesh": MESH | {"grid": MESH["grid"] | {"nx": 20, "ny": 20}}, "initial": {"noise": 1e-3, "seed": 1}}
-    with Simulation(content, MPI.COMM_SELF) as noisy, Simulation({"mesh": content["mesh"]}, MPI.COMM_SELF) as flat:
+    content = {
+        "mesh": MESH | {"grid": MESH["grid"] | {"nx": 20, "ny": 20}},
+        "initial": {"noise": 1e-3, "seed": 1},
+    }
+    with (
+        Simulation(content, MPI.COMM_SELF) as noisy,
+        Simulation({"mesh": content["mesh"]}, MPI.COMM_SELF) as flat,
+    ):
         shift = noisy.x - flat.x
     np.testing.assert_allclose(shift[:, [0, 2]], 0.0, atol=1e-15)  # the sheet stands in the xz plane
     assert np.std(shift[:, 1]) == pytest.approx(1e-3, rel=0.1)
@@ -37,7 +49,9 @@ def test_noise_goes_along_the_normal_with_the_given_size() -> None:
 
 def test_the_seed_decides() -> None:
     def shape(seed: int) -> np.ndarray:
-        with Simulation({"mesh": MESH, "initial": {"noise": 1e-3, "seed": seed}}, MPI.COMM_SELF) as simulation:
+        with Simulation(
+            {"mesh": MESH, "initial": {"noise": 1e-3, "seed": seed}}, MPI.COMM_SELF
+        ) as simulation:
             return simulation.x
 
     np.testing.assert_array_equal(shape(3), shape(3))

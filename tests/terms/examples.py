@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from physics import CLOTH, Simulation, obj_file
-from mpi4py import MPI
 import numpy as np
+from mpi4py import MPI
+from physics import CLOTH, Simulation, obj_file
 
 BENDING = CLOTH | {"bending": [2.0e-3, 1.0e-3, 3.0e-3], "damping": 0.02, "warp_degrees": 25.0}
 

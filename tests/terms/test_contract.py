@@ -51,7 +51,9 @@ def term(simulation: Simulation, name: str) -> Term:
 def disturbed(x: Array, size: float, seed: int = 3) -> Array:
     """A shape far from rest, turned in space."""
     rng = np.random.default_rng(seed)
-    return np.asarray((x + rng.uniform(-size, size, x.shape)) @ rotation([1.0, 2.0, 0.5], 0.9).T + [0.3, -0.2, 0.1])
+    return np.asarray(
+        (x + rng.uniform(-size, size, x.shape)) @ rotation([1.0, 2.0, 0.5], 0.9).T + [0.3, -0.2, 0.1]
+    )
 
 
 def gradient(add: Callable[[Array, Array], None], y: Array) -> Array:
@@ -119,7 +121,9 @@ def elastic(term: Term) -> Elastic:
 
 @every_elastic
 @pytest.mark.parametrize("size", [0.01, 0.15])
-def test_gradient_is_the_derivative_of_the_energy(elastic: Elastic, simulation: Simulation, size: float) -> None:
+def test_gradient_is_the_derivative_of_the_energy(
+    elastic: Elastic, simulation: Simulation, size: float
+) -> None:
     y = disturbed(simulation.system.x, size)
     analytic = gradient(elastic.add_gradient, y)
     numeric = differences(lambda z: elastic.energies(z).sum(), y, 1e-4)

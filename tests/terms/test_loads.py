@@ -116,7 +116,9 @@ def test_pressure_in_a_closed_surface_has_no_resultant(tmp_path: Path) -> None:
 
 def test_gravity_is_mass_times_acceleration() -> None:
     with Simulation({"mesh": grid(1, 2, 2, 3), "gravity": [0.1, 0.2, -9.81]}, MPI.COMM_SELF) as simulation:
-        np.testing.assert_allclose(force_of(simulation), simulation.mass[:, None] * [0.1, 0.2, -9.81], rtol=1e-14)
+        np.testing.assert_allclose(
+            force_of(simulation), simulation.mass[:, None] * [0.1, 0.2, -9.81], rtol=1e-14
+        )
 
 
 def test_loads_act_within_their_window_only() -> None:

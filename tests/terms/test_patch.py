@@ -43,7 +43,11 @@ def row(request: pytest.FixtureRequest) -> list[object]:
 @pytest.fixture
 def patch(row: list[object], warp: float, tmp_path: Path) -> Iterator[Simulation]:
     c11, c12, c22, c33 = PATCH["materials"][row[0]]
-    material = {"density": 0.1, "membrane": {"c11": c11, "c12": c12, "c22": c22, "c33": c33}, "warp_degrees": warp}
+    material = {
+        "density": 0.1,
+        "membrane": {"c11": c11, "c12": c12, "c22": c22, "c33": c33},
+        "warp_degrees": warp,
+    }
     mesh = obj_file(tmp_path / "patch.obj", np.column_stack([VERTICES, np.zeros(9)]), TRIANGLES)
     with Simulation({"mesh": mesh, "material": material}, MPI.COMM_SELF) as simulation:
         yield simulation
@@ -78,5 +82,8 @@ def test_energy_strain_stress_and_boundary_forces(patch: Simulation, row: list[o
             outward = -outward
         expected[[tail, head]] += 0.5 * stress @ outward
     np.testing.assert_allclose(
-        patch.gather(gradient), np.column_stack([expected, np.zeros(9)]) @ TILT.T, rtol=0.0, atol=1e-12 * scale
+        patch.gather(gradient),
+        np.column_stack([expected, np.zeros(9)]) @ TILT.T,
+        rtol=0.0,
+        atol=1e-12 * scale,
     )

@@ -42,11 +42,16 @@ def test_rest_curvature_is_that_of_the_interpolated_paraboloid(
     curvature: tuple[float, float, float], pattern: str, warp: float
 ) -> None:
     material = CLOTH | {"bending": 1e-3, "rest_curvature": list(curvature), "warp_degrees": warp}
-    with Simulation({"mesh": grid(1.0, 0.8, 4, 3, pattern), "material": material}, MPI.COMM_SELF) as simulation:
+    with Simulation(
+        {"mesh": grid(1.0, 0.8, 4, 3, pattern), "material": material}, MPI.COMM_SELF
+    ) as simulation:
         bending = bending_of(simulation)
         x = simulation.system.x.copy()
         angle = np.radians(warp)
-        u, w = (np.cos(angle) * x[:, 0] + np.sin(angle) * x[:, 1], np.cos(angle) * x[:, 1] - np.sin(angle) * x[:, 0])
+        u, w = (
+            np.cos(angle) * x[:, 0] + np.sin(angle) * x[:, 1],
+            np.cos(angle) * x[:, 1] - np.sin(angle) * x[:, 0],
+        )
         k11, k22, k12 = curvature
         x[:, 2] = 0.5 * k11 * u**2 + 0.5 * k22 * w**2 + k12 * u * w
         rest = bending.elements.data["rest_angle"]
