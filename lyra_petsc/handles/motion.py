@@ -47,7 +47,8 @@ class Motion:
     Raises
     ------
     InputError
-        If two keyframes are a full turn apart (the interpolated quaternion would vanish).
+        If two keyframes are a full turn apart (the interpolated quaternion would vanish), or their
+        scales differ in sign.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str = "motions") -> None:
@@ -62,6 +63,11 @@ class Motion:
             if self._values[i, 6:] @ self._values[i + 1, 6:] < -0.98:
                 raise InputError(
                     f"keyframes {i} and {i + 1} are nearly a full turn apart; put a keyframe between them",
+                    key=key,
+                )
+            if np.any(self._values[i, 3:6] * self._values[i + 1, 3:6] < 0.0):
+                raise InputError(
+                    f"scale changes its sign between keyframes {i} and {i + 1}; it would vanish between them",
                     key=key,
                 )
         self._tangents = np.zeros_like(self._values)

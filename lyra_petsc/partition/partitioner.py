@@ -7,6 +7,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.errors import InputError
+
 Ints = NDArray[np.int64]
 Graph = tuple[Ints, Ints]
 
@@ -68,6 +70,11 @@ def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Int
     owner : (V,) int64 on rank 0, None elsewhere
     name : str
         The partitioner used.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if PETSc has not the partitioner that was asked for.
     """
     if comm.size == 1:
         return np.zeros(n_vertices, dtype=np.int64), "none (one rank)"
@@ -94,6 +101,11 @@ def _choose(partitioning: PETSc.MatPartitioning) -> str:
             continue
         partitioning.setFromOptions()
         return str(partitioning.getType())
+    if asked:
+        raise InputError(
+            f"this PETSc has no partitioner '{asked}'; leave it out or try {', '.join(PREFERRED)}, average",
+            key="-mat_partitioning_type",
+        )
     # "average" cuts the numbering into equal pieces, which the locality order makes compact
     partitioning.setType("average")
     return "average"

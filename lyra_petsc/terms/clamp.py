@@ -116,7 +116,8 @@ class Clamp(Elastic):
         out[self._k[lo:hi] == 0.0] = 0.0
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = self._k * size / self.elements.data["height"] ** 2
+        # of the full stiffness: the scale is asked for before the first step
+        scale: Array = self.elements.data["k"] * size / self.elements.data["height"] ** 2
         return scale
 
 

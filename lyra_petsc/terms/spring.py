@@ -76,7 +76,8 @@ class Spring(Elastic):
             out[:, 0, 0, axis, axis] = self._k[lo:hi, axis]
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = self._k.max(axis=1) * size
+        # of the full stiffness: the scale is asked for before the first step
+        scale: Array = self.elements.data["stiffness"].max(axis=1) * size
         return scale
 
 

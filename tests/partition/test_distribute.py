@@ -8,6 +8,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.grids import grid_sheet
 from lyra_petsc.meshing.topology import hinges
 from lyra_petsc.partition.distribute import Part, Whole, distribute, split_elements
@@ -126,6 +127,18 @@ def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
         assert name == "average"
     if comm.rank == 0:
         np.testing.assert_array_equal(np.sort(np.unique(owner)), np.arange(comm.size))
+
+
+def test_a_partitioner_that_petsc_has_not_is_refused(comm: MPI.Comm) -> None:
+    if comm.size == 1:  # nothing is cut, hence nothing asked for
+        return
+    database = PETSc.Options()
+    database.setValue("mat_partitioning_type", "scissors")
+    try:
+        with pytest.raises(InputError, match="scissors"):
+            partition(comm, vertex_graph([np.array([[0, 1]])], 2) if comm.rank == 0 else None, 2)
+    finally:
+        database.delValue("mat_partitioning_type")
 
 
 def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:

@@ -110,6 +110,11 @@ def test_keyframes_a_full_turn_apart_are_refused() -> None:
     assert refused.value.key == "motions.m"
 
 
+def test_a_scale_through_zero_is_refused() -> None:
+    with pytest.raises(InputError, match="keyframes 1 and 2"):
+        Motion(keyframes({"time": 0}, {"time": 1}, {"time": 2, "scale": [1, -1, 1]}), "linear")
+
+
 def test_two_halves_make_a_full_turn() -> None:
     motion = Motion(
         keyframes({"time": 0}, {"time": 1, "rotate": turn(180)}, {"time": 2, "rotate": turn(360)}), "hermite"

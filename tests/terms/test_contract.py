@@ -116,6 +116,7 @@ def test_is_a_term_of_one_known_kind(term: Term, name: str) -> None:
 @pytest.fixture
 def elastic(term: Term) -> Elastic:
     assert isinstance(term, Elastic)
+    term.prepare(0.0, 0.01)
     return term
 
 
@@ -198,16 +199,20 @@ def test_energy_is_invariant_and_forces_balance(elastic: Elastic, simulation: Si
 
 
 @every_elastic
-def test_force_scale_bounds_the_round_off_of_the_force(elastic: Elastic, simulation: Simulation) -> None:
+def test_force_scale_bounds_the_round_off_of_the_force(term: Term, simulation: Simulation) -> None:
+    assert isinstance(term, Elastic)
     # 10 ε of this scale is where a step may stop: the force at rest must stay below it
     far = 100.0
     x = simulation.system.x + far
-    elastic.begin(0.0, x)  # springs and clamps set out from where they stand
-    elastic.prepare(0.0, 0.01)
-    scale = elastic.force_scale(far + 1.0)
-    assert scale.shape == (elastic.n_elements,)
-    sums = np.bincount(elastic.stencil.ravel(), np.repeat(scale, elastic.stencil.shape[1]), len(x))
-    noise = np.linalg.norm(gradient(elastic.add_gradient, x))
+    term.begin(0.0, x)  # springs and clamps set out from where they stand
+    before = term.force_scale(far + 1.0)
+    term.prepare(0.0, 0.01)
+    np.testing.assert_array_equal(term.force_scale(far + 1.0), before)
+    assert np.all(before > 0.0)
+    scale = term.force_scale(far + 1.0)
+    assert scale.shape == (term.n_elements,)
+    sums = np.bincount(term.stencil.ravel(), np.repeat(scale, term.stencil.shape[1]), len(x))
+    noise = np.linalg.norm(gradient(term.add_gradient, x))
     assert noise <= 10.0 * np.finfo(float).eps * np.linalg.norm(sums)
 
 
