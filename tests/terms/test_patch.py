@@ -53,6 +53,31 @@ def patch(row: list[object], warp: float, tmp_path: Path) -> Iterator[Simulation
         yield simulation
 
 
+@pytest.mark.parametrize("stretches", [(1.2, 1.1), (1.3, 0.6), (0.5, 1.1), (0.7, 0.8)])
+def test_regularisation_drops_the_compressive_principal_stress_only(
+    stretches: tuple[float, float], tmp_path: Path
+) -> None:
+    mesh = obj_file(tmp_path / "one.obj", [(0, 0, 0), (1, 0.1, 0), (0.2, 0.8, 0)], [(0, 1, 2)])
+    f = rotation([0, 0, 1], 0.4)[:2, :2] @ np.diag(stretches) @ rotation([0, 0, 1], 0.7)[:2, :2]
+    with Simulation({"mesh": mesh}, MPI.COMM_SELF) as simulation:
+        membrane = simulation.model.membrane
+        x = simulation.system.x.copy()
+        x[:, :2] = x[:, :2] @ f.T
+        blocks = np.empty((2, 1, 3, 3, 3, 3))
+        for blend, out in enumerate(blocks):
+            membrane.hessians(x, 0, 1, float(blend), out)
+        s11, s22, s12 = membrane.strain_and_stress(x)[1][0]
+        inverse, area = membrane.elements.data["inverse"][0], membrane.elements.data["area"][0]
+    values, vectors = np.linalg.eigh(np.array([[s11, s12], [s12, s22]]))
+    dropped = (vectors * np.minimum(values, 0.0)) @ vectors.T
+    shape = np.vstack([-inverse.sum(axis=0), inverse])  # ∂F/∂x of each corner
+    expected = area * shape @ dropped @ shape.T
+    difference = (blocks[0] - blocks[1])[0]
+    np.testing.assert_allclose(
+        difference, np.einsum("ab,ij->abij", expected, np.eye(3)), atol=1e-11 * np.abs(blocks[0]).max()
+    )
+
+
 def test_energy_strain_stress_and_boundary_forces(patch: Simulation, row: list[object], warp: float) -> None:
     _, _, f, green, second, first, density = row
     q = rotation([0.0, 0.0, 1.0], np.radians(warp))[:2, :2]

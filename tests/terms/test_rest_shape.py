@@ -122,6 +122,42 @@ def test_lumped_mass_is_a_third_of_each_triangle() -> None:
         np.testing.assert_allclose(mass, share * np.array([2, 3, 1, 1, 3, 2]), rtol=1e-13)
 
 
+GEO = """
+Point(1) = {0, 0, 0}; Point(2) = {1, 0, 0}; Point(3) = {1, 1, 0}; Point(4) = {0, 1, 0};
+Point(5) = {2, 0, 0}; Point(6) = {2, 1, 0};
+Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Line(5) = {2, 5}; Line(6) = {5, 6}; Line(7) = {6, 3};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+Curve Loop(2) = {5, 6, 7, -2}; Plane Surface(2) = {2};
+Transfinite Curve {1, 2, 3, 4, 5, 6, 7} = 2;
+Physical Surface("left") = {1}; Physical Surface("right") = {2};
+"""
+
+
+def test_the_softer_material_counts_at_the_hinge_between_two(tmp_path: Path) -> None:
+    path = tmp_path / "two.geo"
+    path.write_text(GEO, encoding="utf-8")
+    soft, hard = 0.25, 4.0
+    material = [
+        CLOTH | {"bending": hard, "damping": 0.2, "group": "left"},
+        CLOTH | {"bending": soft, "damping": 0.4, "group": "right"},
+    ]
+    with Simulation(
+        {"mesh": {"file": str(path), "size": 5.0}, "material": material}, MPI.COMM_SELF
+    ) as simulation:
+        bending = bending_of(simulation)
+        data, x = bending.elements.data, simulation.system.x
+        middle = x[bending.stencil[:, :2], 0].mean(axis=1)
+        areas = 0.5 * data["rest_height"] * data["length"]
+        b = data["k"] * 2.0 * areas / data["length"] ** 2
+        between = np.isclose(middle, 1.0) & np.isclose(np.ptp(x[bending.stencil[:, :2], 0], axis=1), 0.0)
+        assert between.sum() >= 1
+        np.testing.assert_allclose(b, np.where((middle < 1.0) & ~between, hard, soft))
+        np.testing.assert_allclose(
+            data["damping"], np.where(between, 0.3, np.where(middle < 1.0, 0.2, 0.4)), rtol=1e-12
+        )
+
+
 def test_each_sheet_has_its_own_material() -> None:
     mesh = [
         {"grid": {"width": 1, "height": 1, "nx": 1, "ny": 1}, "name": "left"},
