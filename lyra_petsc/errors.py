@@ -48,9 +48,16 @@ def _rebuild_input_error(message: str, file: str | None, key: str | None) -> Inp
 
 
 class SolverError(LyraError):
-    """The solver could not go on; the last good state is on disk (exit 3)."""
+    """The solver could not go on; the last good state is on disk (exit 3).
+
+    ``collective`` is true where all ranks raise it together, so that the state can still be written.
+    """
 
     exit_code = 3
+
+    def __init__(self, message: str, *, collective: bool = False) -> None:
+        super().__init__(message)
+        self.collective = collective
 
 
 class OutputError(LyraError):

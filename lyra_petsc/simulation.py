@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import time as clock
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -146,27 +147,40 @@ class Simulation:
             raise SolverError(
                 f"step {self.step_number + 1} (t = {self.time:g} s) did not converge even with Δt = "
                 f"{end - self.time:.3g} s: {attempt.words}; last residual {attempt.residual:.3g} N; "
-                f"the state at t = {self.time:g} s is kept; {attempt.advice}"
+                f"the state at t = {self.time:g} s is kept; {attempt.advice}",
+                collective=True,
             )
 
-    def resume(self, time: float, step: int, budget: dict[str, float]) -> None:
+    def memory(self) -> dict[str, Any]:
+        """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""
+        return {
+            "time": self.time,
+            "step": self.step_number,
+            "budget": asdict(self.budget),
+            "factor": self.control.factor,
+            "good": self.control.good,
+            "blend": self.stepper.blend,
+            "preset": self.stepper.preset,
+            "late_starts": sorted(self.model.system.late_starts),
+        }
+
+    def resume(self, memory: Mapping[str, Any]) -> None:
         """Go on from a state already put into ``model.system`` (x and v of owned points)."""
         system = self.model.system
         system.points.update_ghosts(system.x)
         system.points.update_ghosts(system.v)
-        self.time, self.step_number = time, step
-        for name, value in budget.items():
-            setattr(self.budget, name, value)
+        self.time, self.step_number = float(memory["time"]), int(memory["step"])
+        for name, value in memory["budget"].items():
+            setattr(self.budget, name, float(value))
         self.ledger.measure()
-        self.stepper.start(time, step)
+        self.control.factor, self.control.good = float(memory["factor"]), int(memory["good"])
+        while memory["preset"] in self.stepper.presets[1:]:
+            self.stepper.next_preset()
+        self.stepper.blend = float(memory["blend"])
+        self.stepper.start(self.time, self.step_number)
 
     def destroy(self) -> None:
         """Free all PETSc and MPI objects; collective."""
         self.stepper.destroy()
         self.model.points.destroy()
 
-
-def steps_left(simulation: Simulation) -> int:
-    """How many nominal steps remain."""
-    control = simulation.control
-    return max(0, math.ceil((control.end - simulation.time) / control.step - 1e-9))

@@ -4,7 +4,7 @@ SetFactory("Built-in");
 
 width = 1.5;   // m, along x
 height = 1.0;  // m, along z
-size = 0.029;  // m, length of an element's edge
+size = 0.04;   // m, length of an element's edge
 
 Point(1) = {0, 0, 0, size};
 Point(2) = {width, 0, 0, size};

@@ -53,3 +53,10 @@ def advice(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
     if ksp.getConvergedReason() < 0:
         return "try -pc_type lu (one rank) or -pc_type lu -pc_factor_mat_solver_type mumps, or -ksp_max_it"
     return "try a smaller time.step, solver.max_iterations above 50, more damping, or a finer mesh"
+
+
+def last_words(error: PETSc.Error) -> str:
+    """The innermost message of a PETSc error, in one line."""
+    lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]
+    told = [line for line in lines if line and "() at " not in line and not line.startswith("error code")]
+    return "; ".join(told[-2:]) if told else " ".join(str(error).split())

@@ -2,7 +2,8 @@
 
 The exact Hessian converges in few iterations but may be indefinite (compression, folds); the
 regularised one never is, but converges slowly. Conjugate gradients tell: when they meet negative
-curvature, the iteration is repeated with more regularisation; the next one tries less.
+curvature, the iteration is repeated with more regularisation; the next one tries less. A nearly
+singular Hessian shows in the line search: a step that had to be cut asks for more as well.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ FIRST = 0.05
 RAISE = 4.0
 LOWER = 0.25
 SMALLEST = 1e-3
+CUT = 0.5
+"""Fraction of a step taken by the line search below which the Hessian was too soft."""
 
 INDEFINITE = (
     PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
@@ -37,9 +40,11 @@ class Blend:
         self._adaptive = mode == "adaptive"
         self.value = 1.0 if mode == "regularised" else 0.0
 
-    def lower(self) -> float:
-        """The fraction for the next iteration: less than what the one before needed."""
-        if self._adaptive:
+    def after(self, taken: float) -> float:
+        """The fraction for the next iteration, when the line search took ``taken`` of the last step."""
+        if taken < CUT:
+            self.raise_()
+        elif self._adaptive:
             lowered = LOWER * self.value
             self.value = lowered if lowered > SMALLEST else 0.0
         return self.value

@@ -28,6 +28,13 @@ class StepControl:
         Further times [s] on which a step must end.
     smallest : float
         Δt [s] below which no retry is made.
+
+    Attributes
+    ----------
+    factor : float
+        Present Δt over the nominal one.
+    good : int
+        Successful steps since it last changed.
     """
 
     def __init__(
@@ -35,12 +42,12 @@ class StepControl:
     ) -> None:
         self.step, self.end, self._every, self.smallest = step, end, every, smallest
         self._events = sorted({t for t in events if 0.0 < t < end} | {end})
-        self._factor = 1.0
-        self._good = 0
+        self.factor = 1.0
+        self.good = 0
 
     def next_end(self, time: float) -> float:
         """End of the step that starts at ``time`` [s]."""
-        dt = self.step * self._factor
+        dt = self.step * self.factor
         target = min(self._next_event(time), self._next_state(time))
         # landing exactly on the event also when it lies a rounding beyond the step
         return target if target - time <= dt * (1.0 + SLACK) else time + dt
@@ -67,15 +74,15 @@ class StepControl:
 
     def failed(self) -> bool:
         """Halve Δt after a failed attempt; False if it is as small as it may be."""
-        self._good = 0
-        if 0.5 * self._factor * self.step < self.smallest:
+        self.good = 0
+        if 0.5 * self.factor * self.step < self.smallest:
             return False
-        self._factor *= 0.5
+        self.factor *= 0.5
         return True
 
     def succeeded(self) -> None:
         """Let a shortened Δt recover."""
-        self._good += 1
-        if self._factor < 1.0 and self._good >= GROW_AFTER:
-            self._factor = min(1.0, 2.0 * self._factor)
-            self._good = 0
+        self.good += 1
+        if self.factor < 1.0 and self.good >= GROW_AFTER:
+            self.factor = min(1.0, 2.0 * self.factor)
+            self.good = 0

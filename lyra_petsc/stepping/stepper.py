@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.errors import InputError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import fill_gaps, is_set
@@ -24,8 +24,6 @@ Reason = PETSc.SNES.ConvergedReason
 ENERGY_ROUNDOFF = 1e-14
 """Differences of the objective below this fraction of its summands are noise."""
 
-WITH_RIGID_MODES = ("gamg", "ml", "hypre")
-
 
 @dataclass(frozen=True)
 class Attempt:
@@ -38,6 +36,9 @@ class Attempt:
     words: str = ""
     advice: str = ""
     at_roundoff: bool = False
+
+TRUE_NORM = ("cg", "fcg", "pipecg", "groppcg")
+"""Krylov methods that can watch the true residual with left preconditioning."""
 
 
 class Stepper:
@@ -59,6 +60,8 @@ class Stepper:
         Without options prefix.
     preset : str
         Name of the linear solver in use.
+    presets : list of str
+        It and those still to try when it breaks down.
     our_options : list of str
         Options this class filled in.
 
@@ -74,11 +77,13 @@ class Stepper:
         self._scene, self._system, self._pattern = scene, system, pattern
         self._spacing, self._floor = spacing, floor
         self._newton = scene.time.integrator != "semi-implicit"
-        self._presets = candidates()
+        self.presets = candidates(system.points.n_global)
         self._blend = Blend("regularised" if not self._newton else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
+        self._from: PETSc.Vec | None = None
+        self._length = 0.0
         self._shape = (system.points.n_owned, 3)
         self._create()
 
@@ -86,16 +91,19 @@ class Stepper:
 
     def _create(self) -> None:
         points, scene = self._system.points, self._scene
-        self.preset = self._presets[0]
+        self.preset = self.presets[0]
         self._fill(options_of(self.preset, PETSc.Options().getString("pc_type", "")))
         self.matrix = SystemMatrix(points, self._pattern, "baij")
+        self.preconditioner = self.matrix
+        if self._separate():
+            self.preconditioner = SystemMatrix(points, self._pattern, "baij")
         self.velocity = PETSc.Vec().createMPI((3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm)
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
         ts.setType(PETSc.TS.Type.BEULER)
         ts.setIFunction(self._ifunction, self.residual)
-        ts.setIJacobian(self._ijacobian, self.matrix.mat)
+        ts.setIJacobian(self._ijacobian, self.matrix.mat, self.preconditioner.mat)
         ts.setMaxTime(scene.time.end)
         ts.setTimeStep(scene.time.step)
         ts.setMaxSteps(np.iinfo(PETSc.IntType).max - 1)
@@ -106,8 +114,6 @@ class Stepper:
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
         ksp.setType(PETSc.KSP.Type.CG)
-        # an incomplete factor near breakdown makes the preconditioned norm meaningless
-        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         if self._newton:
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(self._objective)
@@ -116,13 +122,28 @@ class Stepper:
             snes.setLineSearchPreCheck(self._direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxLinearSolveFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=1e-4, max_it=5000)
+            ksp.setTolerances(rtol=1e-2, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=1e-6, max_it=5000)
-        ts.setFromOptions()
+        try:
+            ts.setFromOptions()
+        except PETSc.Error as error:
+            raise InputError(f"PETSc refuses the options: {reasons.last_words(error)}", key="PETSc options") from None
+        if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
+            # a preconditioner near breakdown makes the preconditioned norm meaningless
+            ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         self._refuse_contradictions()
         ts.setSolution(self.velocity)
+
+    def _separate(self) -> bool:
+        """Whether the preconditioner is built from a matrix of its own, the regularised one.
+
+        So it stays positive definite, and conjugate gradients see negative curvature of the exact
+        Hessian only where there is some.
+        """
+        kind = PETSc.Options().getString("ksp_type", "cg")
+        return self._newton and self._scene.solver.hessian != "regularised" and kind != "preonly"
 
     def _fill(self, options: dict[str, object]) -> None:
         self._filled = fill_gaps(options)  # type: ignore[arg-type]
@@ -143,14 +164,14 @@ class Stepper:
 
     def next_preset(self) -> str | None:
         """Change to the next linear solver; its name, or None if there is none left; collective."""
-        if len(self._presets) < 2:
+        if len(self.presets) < 2:
             return None
         time, step = self.ts.getTime(), self.ts.getStepNumber()
         self.destroy()
         database = PETSc.Options()
         for name in self._filled:
             database.delValue(name)
-        self._presets.pop(0)
+        self.presets.pop(0)
         self._create()
         self.start(time, step)
         return self.preset
@@ -159,6 +180,8 @@ class Stepper:
         """Free all PETSc objects; collective."""
         self.ts.destroy()
         self.matrix.destroy()
+        if self.preconditioner is not self.matrix:
+            self.preconditioner.destroy()
         self.velocity.destroy()
         self.residual.destroy()
 
@@ -180,7 +203,14 @@ class Stepper:
         self.ts.setTimeStep(t1 - t0)
         self._at_roundoff = False
         self._norm, self._more_linear = 0.0, 0
-        self.ts.step()
+        self._length = 0.0
+        try:
+            self.ts.step()
+        except PETSc.Error as error:
+            raise SolverError(
+                f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
+                "the state before it is kept; check the PETSc options"
+            ) from None
         newton, linear = self.snes.getIterationNumber(), self.snes.getLinearSolveIterations() + self._more_linear
         converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
         if converged:
@@ -196,6 +226,15 @@ class Stepper:
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         return Attempt(False, newton, linear, self._norm, words, advice)
+
+    @property
+    def blend(self) -> float:
+        """Fraction of regularisation in the last Newton iteration."""
+        return self._blend.value
+
+    @blend.setter
+    def blend(self, value: float) -> None:
+        self._blend.value = value
 
     @property
     def linear_solver_failed(self) -> bool:
@@ -217,25 +256,23 @@ class Stepper:
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
     ) -> bool:
         v = u.getArray(readonly=True).reshape(self._shape)
-        self.matrix.set(self._system.jacobian(v, shift, self._blend.lower()))
-        if a != p:
-            a.assemble()
-        if self.ksp.getPC().getType() in WITH_RIGID_MODES:
-            self._set_rigid_modes()
+        self.matrix.set(self._system.jacobian(v, shift, self._blend.after(self._taken(u))))
+        if self.preconditioner is not self.matrix:
+            self.preconditioner.set(self._system.jacobian(v, shift, 1.0))
         if self._newton:
             self._at = self._system.objective(v, shift)
             self._at_norm = self.snes.getFunctionNorm()
         return True
 
-    def _set_rigid_modes(self) -> None:
-        """Near-null space: the six rigid-body modes of the shape at the start of the step."""
-        coordinates = self.velocity.duplicate()
-        coordinates.setArray(self._system.x[: self._shape[0]].ravel())
-        coordinates.setBlockSize(3)
-        modes = PETSc.NullSpace().createRigidBody(coordinates)
-        self.matrix.mat.setNearNullSpace(modes)
-        modes.destroy()
-        coordinates.destroy()
+    def _taken(self, u: PETSc.Vec) -> float:
+        """Fraction of the last Newton step that the line search took; 1 before the first."""
+        if self._from is None or self._length == 0.0:
+            return 1.0
+        self._from.axpy(-1.0, u)
+        taken = self._from.norm() / self._length
+        self._from.destroy()
+        self._from = None
+        return float(taken)
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         self._system.first_guess(u.getArray().reshape(self._shape))
@@ -243,16 +280,25 @@ class Stepper:
     def _direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Solve again with more regularisation while the linear solve meets negative curvature."""
         changed = False
-        while self.ksp.getConvergedReason() in INDEFINITE and self._blend.raise_():
+        residual = self.snes.getFunction()[0]
+        while self._useless(residual, y) and self._blend.raise_():
             v = x.getArray(readonly=True).reshape(self._shape)
             self.matrix.set(self._system.jacobian(v, 1.0 / self._system.dt, self._blend.value))
-            self.ksp.solve(self.snes.getFunction()[0], y)
+            self.ksp.setOperators(self.matrix.mat, self.preconditioner.mat)
+            self.ksp.solve(residual, y)
             self._more_linear += self.ksp.getIterationNumber()
             changed = True
-        if self.ksp.getConvergedReason() < 0:
+        if self._useless(residual, y):
             y.zeroEntries()
             return True
+        if self._from is not None:
+            self._from.destroy()
+        self._from, self._length = x.copy(), y.norm()
         return changed
+
+    def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Whether the linear solve failed in a way that leaves no direction of descent."""
+        return self.ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0
 
     def _objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
         """Energy of a trial point; where differences drown in round-off, judged by its residual."""

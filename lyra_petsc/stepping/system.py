@@ -68,6 +68,7 @@ class ReducedSystem:
         self._blocks = blocks
         self._starts = sorted(set(starts))
         self._begun: set[float] = set()
+        self.late_starts: dict[float, Array] = {}
         self._explicit = explicit_wind
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
@@ -95,6 +96,8 @@ class ReducedSystem:
         for start in self.starts():
             if start <= time and start not in self._begun:
                 self._begun.add(start)
+                if start > 0.0:
+                    self.late_starts[start] = self.x[: self.points.n_owned].copy()
                 self._set_out(start, self.x)
 
     def resume(self, start: float, x: Array) -> None:
@@ -103,6 +106,7 @@ class ReducedSystem:
         shape[: self.points.n_owned] = x
         self.points.update_ghosts(shape)
         self._begun.add(start)
+        self.late_starts[start] = shape[: self.points.n_owned].copy()
         self._set_out(start, shape)
 
     def _set_out(self, start: float, x: Array) -> None:

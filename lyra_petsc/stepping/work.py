@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.stepping.system import ReducedSystem
-from lyra_petsc.terms.gravity import Gravity
+from lyra_petsc.terms.term import Pulling
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class Ledger:
         self.reaction: Array = np.zeros((system.points.n_owned, 3))
         self._weight = np.zeros((system.points.n_local, 3))
         for load in system.loads:
-            if isinstance(load, Gravity):
+            if load.name == "gravity":
                 load.add_force(system.x, 0.0, 0.0, self._weight)
         self._anchored = 0.0
         self.measure()
@@ -102,3 +102,16 @@ class Ledger:
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
         return self.measure()
+
+    def handle_forces(self, count: int) -> list[Array]:
+        """Total force [N] of each of the scene's ``count`` handles on the sheet in the last step; collective."""
+        system = self._system
+        local = np.zeros((count, 3))
+        for number in system.held.active(system.t0, system.t1):
+            local[number] = self.reaction[system.held.vertices(number)].sum(axis=0)
+        for term in system.elastic:
+            if isinstance(term, Pulling):
+                local += term.handle_forces(system.x, count)
+        total = np.empty_like(local)
+        system.points.comm.Allreduce(local, total)
+        return list(total)

@@ -16,7 +16,7 @@ from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.terms.term import Pulling
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ ORIGINAL_STIFFNESS = 1000.0
 """[N/m], of the original program; what a fading exact handle takes."""
 
 
-class Spring(Elastic):
+class Spring(Pulling):
     """Springs of all soft or fading handles.
 
     Parameters
@@ -66,6 +66,12 @@ class Spring(Elastic):
     def energies(self, x: Array) -> Array:
         energy: Array = 0.5 * (self._k * self._pull(x) ** 2).sum(axis=1)[: self.n_owned]
         return energy
+
+    def handle_forces(self, x: Array, count: int) -> Array:
+        forces = np.zeros((count, 3))
+        n = self.n_owned
+        np.add.at(forces, self._handle[:n], -(self._k * self._pull(x))[:n])
+        return forces
 
     def add_gradient(self, x: Array, out: Array) -> None:
         np.add.at(out, self.stencil[:, 0], self._k * self._pull(x))

@@ -65,6 +65,14 @@ class Elastic(Term):
         """Set what depends on time for the step from t0 to t1 [s] (moving targets)."""
 
 
+class Pulling(Elastic):
+    """An elastic term by which handles pull."""
+
+    @abstractmethod
+    def handle_forces(self, x: Array, count: int) -> Array:
+        """Force [N] of each of a scene's handles on this rank's elements, (count, 3)."""
+
+
 class Viscous(Term):
     """A potential of the velocities, with the geometry frozen at the start of the step."""
 

@@ -1,0 +1,101 @@
+"""``check``: what a run of a scene would do; runs nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from rich.console import Console
+from rich.table import Table
+
+from lyra_petsc.cli.run import read_scene
+from lyra_petsc.output.phases import Phases
+from lyra_petsc.recorder import Recorder
+from lyra_petsc.scene.default import default_scene
+from lyra_petsc.simulation import Simulation
+
+LISTED_RANKS = 16
+"""Ranks shown one by one; of more, only the extremes."""
+
+
+def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
+    """Validate a scene, set it up as a run would, and print the plan on rank 0; collective.
+
+    Raises
+    ------
+    InputError
+        As ``run`` would.
+    """
+    path = path or default_scene()
+    scene = read_scene(comm, path, settings)
+    simulation = Simulation(comm, scene, Phases())
+    Recorder(simulation)
+    model = simulation.model
+    points, pattern = model.points, model.pattern
+    mine = np.array([points.n_owned, points.n_local - points.n_owned, pattern.n_blocks, _elements(simulation)])
+    every = comm.gather(mine, root=0)
+    if every is not None:
+        _print(simulation, path, np.array(every))
+    simulation.destroy()
+
+
+def _elements(simulation: Simulation) -> int:
+    return sum(term.n_elements for term in simulation.model.terms.values())
+
+
+def _print(simulation: Simulation, path: Path, ranks: np.ndarray) -> None:
+    model, scene, control = simulation.model, simulation.scene, simulation.control
+    outline = model.outline
+    blocks = int(ranks[:, 2].sum())
+    steps = math.ceil(control.end / control.step - 1e-9)
+    states = 1 + (steps if scene.output.every is None else math.ceil(control.end / scene.output.every - 1e-9))
+    console = Console(width=None if Console().is_terminal else 100, highlight=False, soft_wrap=True)
+    plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, value in (
+        ("scene", f"{path}" + (f" ({scene.title})" if scene.title else "")),
+        ("mesh", f"{outline.n_vertices} vertices, {outline.n_triangles} triangles, mean edge {outline.spacing:.4g} m"),
+        ("active terms", ", ".join(outline.terms)),
+        ("handles", str(len(scene.handles))),
+        ("unknowns", f"{3 * outline.n_vertices} (velocities)"),
+        ("nonzeros", f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row"),
+        ("memory", f"about {_megabytes(ranks):.0f} MB on the fullest rank, beside Python and PETSc"),
+        ("integrator", scene.time.integrator),
+        ("steps", f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"),
+        ("linear solver", f"{simulation.stepper.preset}: {_solver_options(simulation)}"),
+        ("partitioner", model.partitioner),
+    ):
+        plan.add_row(name, value)
+    console.print(plan)
+    console.print(_rank_table(ranks))
+    owned = ranks[:, 0]
+    console.print(f"load imbalance {owned.max() / owned.mean():.3f} (most owned vertices over mean)")
+    for note in simulation.notes:
+        console.print(f"note: {note}")
+
+
+def _rank_table(ranks: np.ndarray) -> Table:
+    table = Table("rank", header_style="", "owned vertices", "ghosts", "ghost share", "blocks", "elements", box=None)
+    shown = list(enumerate(ranks))
+    if len(shown) > LISTED_RANKS:
+        order = np.argsort(ranks[:, 0])
+        shown = [(int(rank), ranks[rank]) for rank in (*order[:2], *order[-2:])]
+    for rank, (owned, ghosts, blocks, elements) in shown:
+        share = ghosts / max(owned + ghosts, 1)
+        table.add_row(str(rank), str(owned), str(ghosts), f"{share:.1%}", str(blocks), str(elements))
+    return table
+
+
+def _megabytes(ranks: np.ndarray) -> float:
+    """Matrix and preconditioner, their assembly buffers, and element constants, roughly."""
+    return float((ranks[:, 2] * 9 * 8 * 5 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
+
+
+def _solver_options(simulation: Simulation) -> str:
+    stepper = simulation.stepper
+    options = PETSc.Options()
+    named = [f"-{name} {options.getString(name, '')}" for name in stepper.our_options]
+    return " ".join(named) or f"-ksp_type {stepper.ksp.getType()} -pc_type {stepper.ksp.getPC().getType()}"

@@ -1,0 +1,181 @@
+"""``run``: simulate a scene and leave its results in a folder."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from lyra_petsc.cli.progress import Progress, closing_table
+from lyra_petsc.cli.signals import StopRequest
+from lyra_petsc.errors import Interrupted, LyraError, SolverError
+from lyra_petsc.output.folder import choose, create
+from lyra_petsc.output.phases import Phases
+from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.parallel import on_root
+from lyra_petsc.recorder import Recorder
+from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.simulation import Simulation
+from lyra_petsc.solvers.options import unused
+
+
+def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str]) -> Scene:
+    """The checked scene on all ranks; read on rank 0."""
+    scene = on_root(comm, lambda: load_scene(path, settings))
+    assert scene is not None
+    return scene
+
+
+def run(
+    comm: MPI.Comm,
+    path: Path | None,
+    settings: Sequence[str],
+    *,
+    out: Path | None,
+    force: bool,
+    resume: bool,
+) -> None:
+    """Simulate a scene; collective.
+
+    Raises
+    ------
+    InputError
+        Bad input; nothing is written.
+    SolverError, OutputError
+        The run could not go on; what was announced stands.
+    Interrupted
+        A signal; the last step is in the checkpoint.
+    """
+    phases = Phases()
+    stop = StopRequest(comm)
+    if path is None and resume and out is not None:
+        path = out / "scene.yaml"
+    path = path or default_scene()
+    stem = path.stem
+    choice = choose(comm, stem, out, force=force, resume=resume)
+    scene = read_scene(comm, path, settings)
+    simulation = Simulation(comm, scene, phases)
+    recorder = Recorder(simulation)
+    folder = create(comm, choice)
+    with phases("output"):
+        if choice.resume:
+            recorder.resume(folder)
+        else:
+            recorder.begin(folder)
+    simulation.model.release()
+    journey = _Journey(comm, simulation, recorder, folder)
+    journey.go(stop)
+    simulation.destroy()
+
+
+class _Journey:
+    """The loop over the steps with its progress, summary and ways of ending."""
+
+    def __init__(self, comm: MPI.Comm, simulation: Simulation, recorder: Recorder, folder: Path) -> None:
+        self._comm, self._simulation, self._recorder, self._folder = comm, simulation, recorder, folder
+        self._totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
+        self._versions = versions()
+        self._told = 0
+        self._first_step = simulation.step_number
+
+    def go(self, stop: StopRequest) -> None:
+        simulation, recorder = self._simulation, self._recorder
+        outcome = "done"
+        self._summarise("running")
+        progress = Progress(
+            self._comm, simulation.control.end, start=simulation.time, plain=_petsc_speaks()
+        )
+        try:
+            with progress:
+                self._tell(progress)
+                while not simulation.finished:
+                    report = simulation.step()
+                    for name in self._totals:
+                        self._totals[name] += getattr(report, name)
+                    with simulation.phases("output"):
+                        recorder.record(report)
+                    self._tell(progress)
+                    budget = simulation.budget
+                    energy = budget.kinetic + budget.membrane + budget.bending + budget.potential
+                    progress.update(
+                        report.step, report.time, report.newton_iterations, report.linear_iterations, energy
+                    )
+                    self._obey(stop)
+        except SolverError as error:
+            outcome = str(error)
+            if error.collective:
+                recorder.write_state()
+                recorder.write_checkpoint()
+                self._summarise(outcome)
+            raise
+        except LyraError as error:
+            outcome = str(error)
+            self._summarise(outcome)
+            raise
+        finally:
+            recorder.close()
+        self._summarise(outcome)
+        simulation.stepper.ts.viewFromOptions("-ts_view")
+        closing_table(self._comm, simulation.phases.seconds(), self._folder, outcome)
+        self._warn_of_unused()
+
+    def _obey(self, stop: StopRequest) -> None:
+        number = stop.signal_number()
+        if number:
+            self._recorder.write_checkpoint()
+            raise Interrupted(
+                f"stopped by {signal.Signals(number).name} after step {self._simulation.step_number} "
+                f"(t = {self._simulation.time:g} s); the checkpoint is written, --resume goes on",
+                number,
+            )
+
+    def _tell(self, progress: Progress) -> None:
+        for note in self._simulation.notes[self._told :]:
+            progress.say(f"note: {note}")
+        self._told = len(self._simulation.notes)
+
+    def _summarise(self, outcome: str) -> None:
+        simulation = self._simulation
+        model = simulation.model
+        content: dict[str, Any] = {
+            "title": simulation.scene.title,
+            "outcome": outcome,
+            "versions": self._versions,
+            "ranks": self._comm.size,
+            "sizes": {
+                "vertices": model.outline.n_vertices,
+                "triangles": model.outline.n_triangles,
+                "unknowns": 3 * model.outline.n_vertices,
+            },
+            "terms": model.outline.terms,
+            "partitioner": model.partitioner,
+            "linear_solver": simulation.stepper.preset,
+            "integrator": simulation.scene.time.integrator,
+            "time": simulation.time,
+            "steps": simulation.step_number,
+            "steps_of_this_run": simulation.step_number - self._first_step,
+            **self._totals,
+            "wall_seconds": simulation.phases.seconds(),
+            "notes": simulation.notes,
+        }
+        write_summary(self._folder / "summary.json", content, self._comm)
+
+    def _warn_of_unused(self) -> None:
+        simulation = self._simulation
+        left = unused(simulation.stepper.our_options)
+        if left and self._comm.rank == 0:
+            listed = ", ".join(f"-{name}" for name in left)
+            print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
+
+
+def _petsc_speaks() -> bool:
+    """Whether PETSc prints while the run goes on, which would tear a progress bar apart."""
+    names = PETSc.Options().getAll()
+    return any(word in name for name in names for word in ("monitor", "converged_reason", "_view", "info"))

@@ -1,0 +1,203 @@
+"""The files of a run: states, checkpoints, history, probes, reactions; every method is collective."""
+
+from __future__ import annotations
+
+import time as clock
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.fields import Field, chosen
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
+from lyra_petsc.output.history import HISTORY_COLUMNS, History, vector_columns
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.states import StateWriter
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.simulation import Simulation, StepReport
+
+Array = NDArray[np.float64]
+
+
+class Recorder:
+    """Writes what a scene asks for.
+
+    Construction checks and plans, and touches no file; ``begin`` or ``resume`` opens them.
+
+    Parameters
+    ----------
+    simulation : Simulation
+
+    Raises
+    ------
+    InputError
+        For a field that the scene cannot have.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        model = simulation.model
+        self._fields: list[Field] = chosen(model)
+        points = model.points
+        self._vertices = FileOrder(points.comm, points.original, points.n_global)
+        self._triangles: FileOrder | None = None
+        if any(field.on == "triangle" for field in self._fields):
+            elements = model.membrane.elements
+            own = elements.index[: elements.n_owned]
+            self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
+        self._last_checkpoint = clock.monotonic()
+        self._last_state = -1
+
+    # -- opening -------------------------------------------------------------------------------------
+
+    def begin(self, folder: Path) -> None:
+        """Write the mesh, the scene as understood, the initial state, row and checkpoint."""
+        simulation = self._simulation
+        model = simulation.model
+        scene = model.scene
+        write_mesh(folder, model.mesh, model.points.comm)
+        on_root(model.points.comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        self._open(folder, None)
+        self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
+        self.write_state()
+        self.write_checkpoint()
+
+    def resume(self, folder: Path) -> None:
+        """Put the newest checkpoint into the simulation and cut the files behind it."""
+        simulation = self._simulation
+        system, n = simulation.model.system, simulation.model.points.n_owned
+        checkpoint = read_checkpoint(folder, self._vertices)
+        memory = checkpoint.scalars
+        for number, start in enumerate(memory["late_starts"]):
+            system.resume(float(start), checkpoint.arrays[f"start_{number}"])
+        system.x[:n] = checkpoint.arrays["position"]
+        system.v[:n] = checkpoint.arrays["velocity"]
+        simulation.resume(memory)
+        if checkpoint.note:
+            simulation.notes.append(checkpoint.note)
+        self._open(folder, simulation.step_number)
+        self._last_state = int(memory["last_state"])
+
+    def _open(self, folder: Path, resume_after: int | None) -> None:
+        simulation = self._simulation
+        model, scene = simulation.model, simulation.scene
+        comm = model.points.comm
+        self._folder = folder
+        self._states = StateWriter(
+            folder,
+            self._vertices,
+            self._triangles,
+            n_triangles=model.outline.n_triangles,
+            resume_after=resume_after,
+        )
+        self._history = History(folder / "history.csv", HISTORY_COLUMNS, comm, resume_after=resume_after)
+        self._probes = self._reactions = None
+        if scene.probes:
+            columns = vector_columns(list(scene.probes))
+            self._probes = History(folder / "probes.csv", columns, comm, resume_after=resume_after)
+        if scene.output.reactions and scene.handles:
+            columns = vector_columns([f"handle{number}" for number in range(len(scene.handles))])
+            self._reactions = History(folder / "reactions.csv", columns, comm, resume_after=resume_after)
+
+    # -- a step --------------------------------------------------------------------------------------
+
+    def record(self, report: StepReport) -> None:
+        """Everything that the step just accepted has to leave on disk."""
+        self._write_row(report)
+        control = self._simulation.control
+        if control.writes_at(report.time) or self._simulation.finished:
+            self.write_state()
+            self.write_checkpoint()
+        elif self._due():
+            self.write_checkpoint()
+
+    def _due(self) -> bool:
+        """Whether a checkpoint is due by wall time: rank 0's clock decides."""
+        seconds = self._simulation.scene.output.checkpoint.seconds
+        due = clock.monotonic() - self._last_checkpoint >= seconds
+        return bool(self._simulation.comm.bcast(due, root=0))
+
+    def _write_row(self, report: StepReport) -> None:
+        budget = self._simulation.budget
+        self._history.append(
+            {
+                "step": report.step,
+                "time": report.time,
+                "dt": report.dt,
+                "newton_iterations": report.newton_iterations,
+                "linear_iterations": report.linear_iterations,
+                "rejected": report.rejected,
+                "kinetic_energy": budget.kinetic,
+                "membrane_energy": budget.membrane,
+                "bending_energy": budget.bending,
+                "potential_energy": budget.potential,
+                "external_work": budget.external_work,
+                "dissipation": budget.dissipation,
+                "residual": report.residual,
+                "wall_seconds": report.wall_seconds,
+            }
+        )
+        if self._probes is not None:
+            self._probes.append(self._vectors(report, self._probe_means()))
+        if self._reactions is not None:
+            pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
+            forces = {f"handle{n}": force for n, force in enumerate(pulls)}
+            self._reactions.append(self._vectors(report, forces))
+
+    @staticmethod
+    def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float]:
+        row: dict[str, float] = {"step": report.step, "time": report.time}
+        for name, vector in vectors.items():
+            row |= {f"{name}_{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
+        return row
+
+    def _probe_means(self) -> dict[str, Array]:
+        """Mean position [m] of each probe's vertices."""
+        model = self._simulation.model
+        local = np.zeros((len(model.probes), 4))
+        for row, vertices in enumerate(model.probes.values()):
+            local[row, :3] = model.system.x[vertices].sum(axis=0)
+            local[row, 3] = len(vertices)
+        total = np.empty_like(local)
+        model.points.comm.Allreduce(local, total, MPI.SUM)
+        return {name: total[row, :3] / total[row, 3] for row, name in enumerate(model.probes)}
+
+    # -- states --------------------------------------------------------------------------------------
+
+    def write_state(self) -> None:
+        """Write and announce the present state, unless it is written already."""
+        simulation = self._simulation
+        if simulation.step_number == self._last_state:
+            return
+        model = simulation.model
+        values = {field: field.compute(model) for field in self._fields}
+        self._states.write(
+            simulation.step_number,
+            simulation.time,
+            model.system.x[: model.points.n_owned],
+            {field.name: value for field, value in values.items() if field.on == "vertex"},
+            {field.name: value for field, value in values.items() if field.on == "triangle"},
+        )
+        self._last_state = simulation.step_number
+
+    def write_checkpoint(self) -> None:
+        """Replace the checkpoint by the present state."""
+        simulation = self._simulation
+        system, n = simulation.model.system, simulation.model.points.n_owned
+        arrays = {"position": system.x[:n], "velocity": system.v[:n]}
+        for number, start in enumerate(sorted(system.late_starts)):
+            arrays[f"start_{number}"] = system.late_starts[start]
+        write_checkpoint(
+            self._folder, self._vertices, arrays, {**simulation.memory(), "last_state": self._last_state}
+        )
+        self._last_checkpoint = clock.monotonic()
+
+    def close(self) -> None:
+        """Close the tables."""
+        for table in (self._history, self._probes, self._reactions):
+            if table is not None:
+                table.close()
