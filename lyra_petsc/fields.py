@@ -77,7 +77,13 @@ FIELDS = {
         Field("green_strain", "triangle", "E_uu, E_vv, E_uv in material axes, (F, 3)", _green_strain),
         Field("stress", "triangle", "second Piola-Kirchhoff S_uu, S_vv, S_uv, N/m, (F, 3)", _stress),
         Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
-        Field("bending_energy", "vertex", "J per m² of rest area, hinges averaged, (V,)", _bending_energy, "bending"),
+        Field(
+            "bending_energy",
+            "vertex",
+            "J per m² of rest area, hinges averaged, (V,)",
+            _bending_energy,
+            "bending",
+        ),
         Field("curvature", "vertex", "κ1 + κ2, 1/m, hinge angles averaged, (V,)", _curvature, "bending"),
         Field("rank", "vertex", "owning rank, (V,)", _rank),
     )

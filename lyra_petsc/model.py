@@ -136,7 +136,8 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     light = np.flatnonzero(~(rest.mass > 0.0))
     if len(light):
         raise InputError(
-            f"{len(light)} vertices without mass (first: {light[:5].tolist()}); give their material a density > 0",
+            f"{len(light)} vertices without mass (first: {light[:5].tolist()}); "
+            "give their material a density > 0",
             file=scene.source,
             key="material",
         )

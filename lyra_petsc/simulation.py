@@ -132,7 +132,9 @@ class Simulation:
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
-        return StepReport(self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds)
+        return StepReport(
+            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds
+        )
 
     def _recover(self, attempt: Attempt, end: float) -> None:
         if self.stepper.linear_solver_failed:
@@ -140,7 +142,8 @@ class Simulation:
             following = self.stepper.next_preset()
             if following is not None:
                 self.notes.append(
-                    f"step {self.step_number + 1}: linear solver '{previous}' broke down, going on with '{following}'"
+                    f"step {self.step_number + 1}: linear solver '{previous}' broke down, "
+                    f"going on with '{following}'"
                 )
                 return
         if not self.control.failed():
@@ -183,4 +186,3 @@ class Simulation:
         """Free all PETSc and MPI objects; collective."""
         self.stepper.destroy()
         self.model.points.destroy()
-

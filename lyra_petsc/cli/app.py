@@ -108,9 +108,15 @@ class _Verbs(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0]
         if name in LATER:
-            raise InputError(f"'{name}' ({LATER[name]}) is not there yet; there are: {_listing(self)}", key=name)
+            raise InputError(
+                f"'{name}' ({LATER[name]}) is not there yet; there are: {_listing(self)}", key=name
+            )
         if self.get_command(ctx, name) is None:
-            hint = "give a verb first, as in: run " + name if Path(name).suffix else nearest(name, list(self.commands))
+            hint = (
+                "give a verb first, as in: run " + name
+                if Path(name).suffix
+                else nearest(name, list(self.commands))
+            )
             raise InputError(f"unknown verb, {hint}", key=name)
         return super().resolve_command(ctx, args)
 
@@ -136,13 +142,18 @@ def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
 _helped = click.option(
     "--help", is_flag=True, is_eager=True, expose_value=False, callback=_help, help="Show this and exit."
 )
-_SETTINGS = {"help_option_names": [], "token_normalize_func": None}
+_SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
 
 
 @click.group(cls=_Verbs, context_settings=_SETTINGS, invoke_without_command=True)
 @_helped
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Show the version and exit."
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_version,
+    help="Show the version and exit.",
 )
 @click.pass_context
 def _verbs(ctx: click.Context) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 from rich.console import Console
 from rich.table import Table
@@ -17,6 +18,8 @@ from lyra_petsc.output.phases import Phases
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.simulation import Simulation
+
+Counts = NDArray[np.int64]
 
 LISTED_RANKS = 16
 """Ranks shown one by one; of more, only the extremes."""
@@ -36,7 +39,9 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
     Recorder(simulation)
     model = simulation.model
     points, pattern = model.points, model.pattern
-    mine = np.array([points.n_owned, points.n_local - points.n_owned, pattern.n_blocks, _elements(simulation)])
+    mine = np.array(
+        [points.n_owned, points.n_local - points.n_owned, pattern.n_blocks, _elements(simulation)]
+    )
     every = comm.gather(mine, root=0)
     if every is not None:
         _print(simulation, path, np.array(every))
@@ -47,7 +52,7 @@ def _elements(simulation: Simulation) -> int:
     return sum(term.n_elements for term in simulation.model.terms.values())
 
 
-def _print(simulation: Simulation, path: Path, ranks: np.ndarray) -> None:
+def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     model, scene, control = simulation.model, simulation.scene, simulation.control
     outline = model.outline
     blocks = int(ranks[:, 2].sum())
@@ -57,11 +62,17 @@ def _print(simulation: Simulation, path: Path, ranks: np.ndarray) -> None:
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
         ("scene", f"{path}" + (f" ({scene.title})" if scene.title else "")),
-        ("mesh", f"{outline.n_vertices} vertices, {outline.n_triangles} triangles, mean edge {outline.spacing:.4g} m"),
+        (
+            "mesh",
+            f"{outline.n_vertices} vertices, {outline.n_triangles} triangles, mean edge {outline.spacing:.4g} m",
+        ),
         ("active terms", ", ".join(outline.terms)),
         ("handles", str(len(scene.handles))),
         ("unknowns", f"{3 * outline.n_vertices} (velocities)"),
-        ("nonzeros", f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row"),
+        (
+            "nonzeros",
+            f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row",
+        ),
         ("memory", f"about {_megabytes(ranks):.0f} MB on the fullest rank, beside Python and PETSc"),
         ("integrator", scene.time.integrator),
         ("steps", f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"),
@@ -77,8 +88,10 @@ def _print(simulation: Simulation, path: Path, ranks: np.ndarray) -> None:
         console.print(f"note: {note}")
 
 
-def _rank_table(ranks: np.ndarray) -> Table:
-    table = Table("rank", header_style="", "owned vertices", "ghosts", "ghost share", "blocks", "elements", box=None)
+def _rank_table(ranks: Counts) -> Table:
+    table = Table(
+        "rank", "owned vertices", "ghosts", "ghost share", "blocks", "elements", box=None, header_style=""
+    )
     shown = list(enumerate(ranks))
     if len(shown) > LISTED_RANKS:
         order = np.argsort(ranks[:, 0])
@@ -89,7 +102,7 @@ def _rank_table(ranks: np.ndarray) -> Table:
     return table
 
 
-def _megabytes(ranks: np.ndarray) -> float:
+def _megabytes(ranks: Counts) -> float:
     """Matrix and preconditioner, their assembly buffers, and element constants, roughly."""
     return float((ranks[:, 2] * 9 * 8 * 5 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 

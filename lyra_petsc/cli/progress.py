@@ -187,15 +187,15 @@ def _print_table(rows: list[tuple[str, str, str]], facts: list[tuple[str, str]],
     from rich.table import Table
     from rich.text import Text
 
-    table = Table("phase", box=None, pad_edge=False)
+    table = Table("phase", box=None, pad_edge=False, header_style="")
     table.add_column("wall time", justify="right")
     table.add_column("share", justify="right")
     for row in rows:
-        table.add_row(*row, style="bold" if row[0] == "total" else None)
+        table.add_row(*row)
     console = Console(file=stream)
     console.print(table)
     for name, text in facts:  # unwrapped: a path is there to be copied
-        console.print(Text.assemble((f"{name:<8} ", "bold"), text), soft_wrap=True)
+        console.print(Text(f"{name:<8} {text}"), soft_wrap=True)
 
 
 def duration(seconds: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,9 @@ from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
-from lyra_petsc.solvers.options import fill_gaps, is_set
+from lyra_petsc.solvers.options import Value, fill_gaps, is_set
 from lyra_petsc.solvers.presets import candidates, options_of
-from lyra_petsc.stepping.blend import INDEFINITE, Blend
+from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.system import ReducedSystem
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class Attempt:
     words: str = ""
     advice: str = ""
     at_roundoff: bool = False
+
 
 TRUE_NORM = ("cg", "fcg", "pipecg", "groppcg")
 """Krylov methods that can watch the true residual with left preconditioning."""
@@ -97,7 +99,9 @@ class Stepper:
         self.preconditioner = self.matrix
         if self._separate():
             self.preconditioner = SystemMatrix(points, self._pattern, "baij")
-        self.velocity = PETSc.Vec().createMPI((3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm)
+        self.velocity = PETSc.Vec().createMPI(
+            (3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm
+        )
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
@@ -129,7 +133,9 @@ class Stepper:
         try:
             ts.setFromOptions()
         except PETSc.Error as error:
-            raise InputError(f"PETSc refuses the options: {reasons.last_words(error)}", key="PETSc options") from None
+            raise InputError(
+                f"PETSc refuses the options: {reasons.last_words(error)}", key="PETSc options"
+            ) from None
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
@@ -145,8 +151,8 @@ class Stepper:
         kind = PETSc.Options().getString("ksp_type", "cg")
         return self._newton and self._scene.solver.hessian != "regularised" and kind != "preonly"
 
-    def _fill(self, options: dict[str, object]) -> None:
-        self._filled = fill_gaps(options)  # type: ignore[arg-type]
+    def _fill(self, options: Mapping[str, Value]) -> None:
+        self._filled = fill_gaps(options)
         self.our_options += [name for name in self._filled if name not in self.our_options]
 
     def _refuse_contradictions(self) -> None:
@@ -158,7 +164,9 @@ class Stepper:
                 key="-ts_type",
             )
         if is_set("ts_theta_endpoint"):
-            raise InputError("has no meaning for the reduced velocity form; leave it out", key="-ts_theta_endpoint")
+            raise InputError(
+                "has no meaning for the reduced velocity form; leave it out", key="-ts_theta_endpoint"
+            )
         if PETSc.Options().getString("ts_adapt_type", "none") != "none":
             raise InputError("TS cannot judge steps of the reduced form; leave it out", key="-ts_adapt_type")
 
@@ -211,7 +219,10 @@ class Stepper:
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
                 "the state before it is kept; check the PETSc options"
             ) from None
-        newton, linear = self.snes.getIterationNumber(), self.snes.getLinearSolveIterations() + self._more_linear
+        newton, linear = (
+            self.snes.getIterationNumber(),
+            self.snes.getLinearSolveIterations() + self._more_linear,
+        )
         converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
         if converged:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
@@ -220,7 +231,9 @@ class Stepper:
                 system.accept(velocity)
                 self.ts.setTime(t1)
                 return Attempt(True, newton, linear, self._norm, at_roundoff=self._at_roundoff)
-            return Attempt(False, newton, linear, self._norm, "the velocities are not finite", "try a smaller time.step")
+            return Attempt(
+                False, newton, linear, self._norm, "the velocities are not finite", "try a smaller time.step"
+            )
         words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
         self._linear_failed = reasons.preconditioner_failed(self.ksp)
         self.ts.setStepNumber(number)
@@ -248,7 +261,10 @@ class Stepper:
     # -- callbacks ---------------------------------------------------------------------------------------
 
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
-        v, rate = u.getArray(readonly=True).reshape(self._shape), udot.getArray(readonly=True).reshape(self._shape)
+        v, rate = (
+            u.getArray(readonly=True).reshape(self._shape),
+            udot.getArray(readonly=True).reshape(self._shape),
+        )
         out = f.getArray().reshape(self._shape)
         self._system.residual(v, rate, 1.0 / self._system.dt, out)
 
@@ -340,4 +356,3 @@ class Stepper:
         if 0.0 < increment <= stol * self._spacing:
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
-

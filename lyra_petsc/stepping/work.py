@@ -1,7 +1,7 @@
 """Energies of the state and the work done in a step, as in the energy identity of backward Euler::
 
-    Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
-    bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
+Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
+bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Ledger:
         return self.measure()
 
     def handle_forces(self, count: int) -> list[Array]:
-        """Total force [N] of each of the scene's ``count`` handles on the sheet in the last step; collective."""
+        """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""
         system = self._system
         local = np.zeros((count, 3))
         for number in system.held.active(system.t0, system.t1):
