@@ -27,6 +27,7 @@ LEVELS = [
     {"model"},
     {"fields"},
     {"simulation"},
+    {"recorder"},
     {"cli"},
     {"__main__"},
 ]

@@ -62,10 +62,8 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
         ("scene", f"{path}" + (f" ({scene.title})" if scene.title else "")),
-        (
-            "mesh",
-            f"{outline.n_vertices} vertices, {outline.n_triangles} triangles, mean edge {outline.spacing:.4g} m",
-        ),
+        ("mesh", f"{outline.n_vertices} vertices, {outline.n_triangles} triangles"),
+        ("mean edge", f"{outline.spacing:.4g} m"),
         ("active terms", ", ".join(outline.terms)),
         ("handles", str(len(scene.handles))),
         ("unknowns", f"{3 * outline.n_vertices} (velocities)"),

@@ -8,19 +8,12 @@ singular Hessian shows in the line search: a step that had to be cut asks for mo
 
 from __future__ import annotations
 
-from petsc4py import PETSc
-
 FIRST = 0.05
 RAISE = 4.0
 LOWER = 0.25
 SMALLEST = 1e-3
 CUT = 0.5
 """Fraction of a step taken by the line search below which the Hessian was too soft."""
-
-INDEFINITE = (
-    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT,
-    PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC,
-)
 
 
 class Blend:

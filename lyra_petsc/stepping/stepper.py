@@ -17,13 +17,10 @@ from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import Value, fill_gaps, is_set
 from lyra_petsc.solvers.presets import candidates, options_of
 from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
 
 Array = NDArray[np.float64]
-Reason = PETSc.SNES.ConvergedReason
-
-ENERGY_ROUNDOFF = 1e-14
-"""Differences of the objective below this fraction of its summands are noise."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +75,12 @@ class Stepper:
     ) -> None:
         self._scene, self._system, self._pattern = scene, system, pattern
         self._spacing, self._floor = spacing, floor
-        self._newton = scene.time.integrator != "semi-implicit"
+        self._iterates = scene.time.integrator != "semi-implicit"
         self.presets = candidates(system.points.n_global)
-        self._blend = Blend("regularised" if not self._newton else scene.solver.hessian)
+        self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
-        self._from: PETSc.Vec | None = None
-        self._length = 0.0
         self._shape = (system.points.n_owned, 3)
         self._create()
 
@@ -117,13 +112,23 @@ class Stepper:
         self.snes = snes = ts.getSNES()
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
+        self._newton = newton = Newton(
+            snes,
+            self._system,
+            self.matrix,
+            self.preconditioner,
+            self._blend,
+            scene.solver,
+            self._spacing,
+            self._floor,
+        )
         ksp.setType(PETSc.KSP.Type.CG)
-        if self._newton:
+        if self._iterates:
             snes.setType(PETSc.SNES.Type.NEWTONLS)
-            snes.setObjective(self._objective)
+            snes.setObjective(newton.objective)
             snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
-            snes.setConvergenceTest(self._converged)
-            snes.setLineSearchPreCheck(self._direction)
+            snes.setConvergenceTest(newton.converged)
+            snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxLinearSolveFailures(scene.solver.max_iterations)
             ksp.setTolerances(rtol=1e-2, max_it=5000)
@@ -149,7 +154,7 @@ class Stepper:
         Hessian only where there is some.
         """
         kind = PETSc.Options().getString("ksp_type", "cg")
-        return self._newton and self._scene.solver.hessian != "regularised" and kind != "preonly"
+        return self._iterates and self._scene.solver.hessian != "regularised" and kind != "preonly"
 
     def _fill(self, options: Mapping[str, Value]) -> None:
         self._filled = fill_gaps(options)
@@ -209,9 +214,7 @@ class Stepper:
         number = self.ts.getStepNumber()
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
-        self._at_roundoff = False
-        self._norm, self._more_linear = 0.0, 0
-        self._length = 0.0
+        self._newton.begin_step()
         try:
             self.ts.step()
         except PETSc.Error as error:
@@ -221,7 +224,7 @@ class Stepper:
             ) from None
         newton, linear = (
             self.snes.getIterationNumber(),
-            self.snes.getLinearSolveIterations() + self._more_linear,
+            self.snes.getLinearSolveIterations() + self._newton.more_linear,
         )
         converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
         if converged:
@@ -230,15 +233,20 @@ class Stepper:
             if finite:
                 system.accept(velocity)
                 self.ts.setTime(t1)
-                return Attempt(True, newton, linear, self._norm, at_roundoff=self._at_roundoff)
+                return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
             return Attempt(
-                False, newton, linear, self._norm, "the velocities are not finite", "try a smaller time.step"
+                False,
+                newton,
+                linear,
+                self._newton.norm,
+                "the velocities are not finite",
+                "try a smaller time.step",
             )
         words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
         self._linear_failed = reasons.preconditioner_failed(self.ksp)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        return Attempt(False, newton, linear, self._norm, words, advice)
+        return Attempt(False, newton, linear, self._newton.norm, words, advice)
 
     @property
     def blend(self) -> float:
@@ -268,91 +276,13 @@ class Stepper:
         out = f.getArray().reshape(self._shape)
         self._system.residual(v, rate, 1.0 / self._system.dt, out)
 
-    def _ijacobian(
-        self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
-    ) -> bool:
-        v = u.getArray(readonly=True).reshape(self._shape)
-        self.matrix.set(self._system.jacobian(v, shift, self._blend.after(self._taken(u))))
-        if self.preconditioner is not self.matrix:
-            self.preconditioner.set(self._system.jacobian(v, shift, 1.0))
-        if self._newton:
-            self._at = self._system.objective(v, shift)
-            self._at_norm = self.snes.getFunctionNorm()
-        return True
-
-    def _taken(self, u: PETSc.Vec) -> float:
-        """Fraction of the last Newton step that the line search took; 1 before the first."""
-        if self._from is None or self._length == 0.0:
-            return 1.0
-        self._from.axpy(-1.0, u)
-        taken = self._from.norm() / self._length
-        self._from.destroy()
-        self._from = None
-        return float(taken)
-
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         self._system.first_guess(u.getArray().reshape(self._shape))
 
-    def _direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Solve again with more regularisation while the linear solve meets negative curvature."""
-        changed = False
-        residual = self.snes.getFunction()[0]
-        while self._useless(residual, y) and self._blend.raise_():
-            v = x.getArray(readonly=True).reshape(self._shape)
-            self.matrix.set(self._system.jacobian(v, 1.0 / self._system.dt, self._blend.value))
-            self.ksp.setOperators(self.matrix.mat, self.preconditioner.mat)
-            self.ksp.solve(residual, y)
-            self._more_linear += self.ksp.getIterationNumber()
-            changed = True
-        if self._useless(residual, y):
-            y.zeroEntries()
-            return True
-        if self._from is not None:
-            self._from.destroy()
-        self._from, self._length = x.copy(), y.norm()
-        return changed
-
-    def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
-        """Whether the linear solve failed in a way that leaves no direction of descent."""
-        return self.ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0
-
-    def _objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
-        """Energy of a trial point; where differences drown in round-off, judged by its residual."""
-        v = u.getArray(readonly=True).reshape(self._shape)
-        sigma = 1.0 / self._system.dt
-        value, size = self._system.objective(v, sigma)
-        here, here_size = self._at
-        noise = ENERGY_ROUNDOFF * max(size, here_size)
-        if value == here or not abs(value - here) < noise:
-            return value
-        trial = np.empty(self._shape)
-        self._system.residual(v, sigma * (v - self._system.v[: self._shape[0]]), sigma, trial)
-        square = self._system.points.comm.allreduce(float(np.vdot(trial, trial)))
-        smaller = bool(np.sqrt(square) < self._at_norm)
-        return here - noise if smaller else here + noise
-
-    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
-        _, _, residual = norms
-        self._norm = residual
-        if not np.isfinite(residual):
-            return int(Reason.DIVERGED_FNORM_NAN)
-        if residual <= self._floor:
-            self._at_roundoff = True
-            return int(Reason.CONVERGED_FNORM_ABS)
-        rtol, atol, stol, _ = snes.getTolerances()
-        if residual <= atol:
-            return int(Reason.CONVERGED_FNORM_ABS)
-        if iteration == 0:
-            self._first_norm = residual
-            return None
-        if residual <= rtol * self._first_norm:
-            return int(Reason.CONVERGED_FNORM_RELATIVE)
-        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.dt
-        forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
-        scale = float(np.sqrt(forces.max()))
-        solver = self._scene.solver
-        if residual <= solver.force_tolerance * scale and increment <= solver.step_tolerance * self._spacing:
-            return int(Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < increment <= stol * self._spacing:
-            return int(Reason.CONVERGED_SNORM_RELATIVE)
-        return None
+    def _ijacobian(
+        self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
+    ) -> bool:
+        self._newton.assemble(u, shift)
+        if self._iterates:
+            self._newton.remember(u, shift)
+        return True

@@ -1,0 +1,159 @@
+"""What SNES asks while it iterates: Jacobians, directions, energies, and whether to stop."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.system import ReducedSystem
+
+Array = NDArray[np.float64]
+Reason = PETSc.SNES.ConvergedReason
+
+ENERGY_ROUNDOFF = 1e-14
+"""Differences of the objective below this fraction of its summands are noise."""
+
+
+class Newton:
+    """Callbacks of one SNES and the memory between them.
+
+    Parameters
+    ----------
+    snes : PETSc.SNES
+    system : ReducedSystem
+    matrix, preconditioner : SystemMatrix
+        The Jacobian and what the preconditioner is built from; may be the same.
+    blend : Blend
+    tolerances : Solver
+        The scene's block.
+    spacing : float
+        Mean edge length [m], for the step tolerance.
+    floor : float
+        Norm [N] of the residual's round-off.
+
+    Attributes
+    ----------
+    norm : float
+        Last residual norm [N].
+    at_roundoff : bool
+        Whether the solve ended because only round-off was left.
+    more_linear : int
+        Linear iterations of directions that were solved for again.
+    """
+
+    def __init__(
+        self,
+        snes: PETSc.SNES,
+        system: ReducedSystem,
+        matrix: SystemMatrix,
+        preconditioner: SystemMatrix,
+        blend: Blend,
+        tolerances: Solver,
+        spacing: float,
+        floor: float,
+    ) -> None:
+        self._snes, self._ksp, self._system = snes, snes.getKSP(), system
+        self._matrix, self._preconditioner, self._blend = matrix, preconditioner, blend
+        self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
+        self._shape = (system.points.n_owned, 3)
+        self._from: PETSc.Vec | None = None
+        self.begin_step()
+
+    def begin_step(self) -> None:
+        """Forget the step before."""
+        self.norm, self.at_roundoff, self.more_linear = 0.0, False, 0
+        self._length = self._first_norm = self._at_norm = 0.0
+        self._at = (0.0, 0.0)
+
+    def assemble(self, u: PETSc.Vec, shift: float) -> None:
+        """Jacobian, and preconditioning matrix, at velocities u."""
+        v = u.getArray(readonly=True).reshape(self._shape)
+        self._matrix.set(self._system.jacobian(v, shift, self._blend.after(self._taken(u))))
+        if self._preconditioner is not self._matrix:
+            self._preconditioner.set(self._system.jacobian(v, shift, 1.0))
+
+    def remember(self, u: PETSc.Vec, shift: float) -> None:
+        """Note energy and residual of the present iterate, against which trial points are judged."""
+        self._at = self._system.objective(u.getArray(readonly=True).reshape(self._shape), shift)
+        self._at_norm = self._snes.getFunctionNorm()
+
+    def _taken(self, u: PETSc.Vec) -> float:
+        """Fraction of the last Newton step that the line search took; 1 before the first."""
+        if self._from is None or self._length == 0.0:
+            return 1.0
+        self._from.axpy(-1.0, u)
+        taken = self._from.norm() / self._length
+        self._from.destroy()
+        self._from = None
+        return float(taken)
+
+    def direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Solve again with more regularisation while the linear solve meets negative curvature."""
+        changed = False
+        residual = self._snes.getFunction()[0]
+        while self._useless(residual, y) and self._blend.raise_():
+            v = x.getArray(readonly=True).reshape(self._shape)
+            self._matrix.set(self._system.jacobian(v, 1.0 / self._system.dt, self._blend.value))
+            self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
+            self._ksp.solve(residual, y)
+            self.more_linear += self._ksp.getIterationNumber()
+            changed = True
+        if self._useless(residual, y):
+            y.zeroEntries()
+            return True
+        if self._from is not None:
+            self._from.destroy()
+        self._from, self._length = x.copy(), y.norm()
+        return changed
+
+    def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Whether the linear solve failed in a way that leaves no direction of descent."""
+        return self._ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0
+
+    def objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
+        """Energy of a trial point; where differences drown in round-off, judged by its residual."""
+        v = u.getArray(readonly=True).reshape(self._shape)
+        sigma = 1.0 / self._system.dt
+        value, size = self._system.objective(v, sigma)
+        here, here_size = self._at
+        noise = ENERGY_ROUNDOFF * max(size, here_size)
+        if value == here or not abs(value - here) < noise:
+            return value
+        trial = np.empty(self._shape)
+        self._system.residual(v, sigma * (v - self._system.v[: self._shape[0]]), sigma, trial)
+        square = self._system.points.comm.allreduce(float(np.vdot(trial, trial)))
+        smaller = bool(np.sqrt(square) < self._at_norm)
+        return here - noise if smaller else here + noise
+
+    def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
+        """SNES's reason to stop, in terms of the scene's tolerances and of the user's ``-snes_*tol``."""
+        _, _, residual = norms
+        self.norm = residual
+        if not np.isfinite(residual):
+            return int(Reason.DIVERGED_FNORM_NAN)
+        if residual <= self._floor:
+            self.at_roundoff = True
+            return int(Reason.CONVERGED_FNORM_ABS)
+        rtol, atol, stol, _ = snes.getTolerances()
+        if residual <= atol:
+            return int(Reason.CONVERGED_FNORM_ABS)
+        if iteration == 0:
+            self._first_norm = residual
+            return None
+        if residual <= rtol * self._first_norm:
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.dt
+        forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
+        scale = float(np.sqrt(forces.max()))
+        if (
+            residual <= self._tolerances.force_tolerance * scale
+            and increment <= self._tolerances.step_tolerance * self._spacing
+        ):
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        if 0.0 < increment <= stol * self._spacing:
+            return int(Reason.CONVERGED_SNORM_RELATIVE)
+        return None
