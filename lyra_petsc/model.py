@@ -13,6 +13,7 @@ from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError
 from lyra_petsc.handles.held import Held, is_exact, select_held
+from lyra_petsc.handles.motion import Window
 from lyra_petsc.meshing.build import build_mesh
 from lyra_petsc.meshing.measure import bounding_diagonal, mean_edge_length
 from lyra_petsc.meshing.mesh import Mesh
@@ -197,7 +198,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         [t for t in terms.values() if isinstance(t, Load)],
         held,
         BlockRows(pattern),
-        starts=[handle.start for handle in scene.handles],
+        starts=[Window.of(handle).start for handle in scene.handles],
         explicit_wind=explicit,
     )
     data = part.vertex_data

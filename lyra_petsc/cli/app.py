@@ -39,10 +39,18 @@ GRACE_SECONDS = 5.0
 def run_command_line(argv: Sequence[str]) -> int:
     """Parse and run; the exit code. Starts PETSc with its part of the arguments."""
     ours, petsc = split(argv[1:])
-    import petsc4py
+    try:
+        import petsc4py
 
-    petsc4py.init([argv[0], *petsc])
-    from mpi4py import MPI
+        petsc4py.init([argv[0], *petsc])
+        from mpi4py import MPI
+    except ImportError as error:
+        print(
+            f"lyra-petsc: {error}: this Python ({sys.executable}) has no working petsc4py and mpi4py; "
+            "use 'bash scripts/run.sh', or see the README for conda, clusters and PyPI",
+            file=sys.stderr,
+        )
+        return InputError.exit_code
 
     comm = MPI.COMM_WORLD
     try:

@@ -134,8 +134,8 @@ class Window:
 
     @classmethod
     def of(cls, handle: Handle) -> Window:
-        """The window of a scene's handle."""
-        return cls(handle.start, handle.until, handle.fade)
+        """The window of a scene's handle; one that starts before t = 0 sets out at 0."""
+        return cls(max(handle.start, 0.0), handle.until, handle.fade)
 
     def holds(self, t0: float, t1: float) -> bool:
         """Whether the step from t0 to t1 lies within the window (steps land on its ends)."""
