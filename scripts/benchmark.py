@@ -62,7 +62,8 @@ def benchmark(vertices: tuple[int, ...], steps: int) -> None:
         iterations = statistics.median(report.linear_iterations for report in reports)
         if comm.rank == 0:
             print(
-                f"| {count} | {comm.size} | {statistics.median(times):.1f} ({min(times):.1f}-{max(times):.1f})"
+                f"| {count} | {comm.size}"
+                f" | {statistics.median(times):.1f} ({min(times):.1f}-{max(times):.1f})"
                 f" | {iterations:.0f} ({simulation.stepper.preset}) | {ORIGINAL_MS.get(count, '')} |",
                 flush=True,
             )
