@@ -52,9 +52,8 @@ def scene(vertices: int, steps: int) -> Scene:
 def benchmark(vertices: tuple[int, ...], steps: int) -> None:
     comm = MPI.COMM_WORLD
     if comm.rank == 0:
-        print(
-            f"| vertices | ranks | ms a step, median (fastest-slowest) | CG iterations | original, ms |\n{'| --- ' * 5}|"
-        )
+        print("| vertices | ranks | ms a step, median (fastest-slowest) | CG iterations | original, ms |")
+        print("| --- | --- | --- | --- | --- |")
     for count in vertices:
         simulation = Simulation(comm, scene(count, steps))
         reports = [simulation.step() for _ in range(steps + WARM_UP)][WARM_UP:]
