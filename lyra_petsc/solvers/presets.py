@@ -39,7 +39,10 @@ def candidates(n_vertices: int) -> list[str]:
 
 
 def options_of(name: str, chosen_pc: str) -> dict[str, Value]:
-    """The options of a preset; ``user`` adds only a matrix type that suits ``-pc_type``."""
+    """The options of a preset; ``user`` adds what goes with the ``-pc_type`` that was chosen."""
     if name != "user":
         return PRESETS[name]
+    for preset in PRESETS.values():
+        if preset["pc_type"] == chosen_pc:
+            return preset
     return {"mat_type": "baij" if chosen_pc in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}
