@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+NOT_A_NUMBER = -4
+"""SNES reason of a residual that is not a number; its name changed in PETSc 3.25."""
+
 _NOT_A_NUMBER = "the residual is not a number (a triangle collapsed?)"
 _SNES = {
     PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "Newton did not converge within its iterations",
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "the line search found no smaller energy",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the linear solve failed",
-    PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN: _NOT_A_NUMBER,
+    NOT_A_NUMBER: _NOT_A_NUMBER,
     PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_DOMAIN: _NOT_A_NUMBER,
     PETSc.SNES.ConvergedReason.DIVERGED_FUNCTION_COUNT: "the limit of residual evaluations was reached",
     PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN: "the line search is stuck in a point that is no solution",

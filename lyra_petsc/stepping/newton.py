@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.solvers.reasons import NOT_A_NUMBER
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.system import ReducedSystem
 
@@ -134,7 +135,7 @@ class Newton:
         _, _, residual = norms
         self.norm = residual
         if not np.isfinite(residual):
-            return int(Reason.DIVERGED_FNORM_NAN)
+            return NOT_A_NUMBER
         if residual <= self._floor:
             self.at_roundoff = True
             return int(Reason.CONVERGED_FNORM_ABS)
