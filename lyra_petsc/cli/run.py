@@ -93,6 +93,7 @@ class _Journey:
         try:
             with progress:
                 self._tell(progress)
+                simulation.stepper.monitor()
                 while not simulation.finished:
                     report = simulation.step()
                     for name in self._totals:
