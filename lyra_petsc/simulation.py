@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import SolverError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.handles.motion import Window
 from lyra_petsc.model import Model, build_model
 from lyra_petsc.output.phases import Phases
@@ -39,6 +40,13 @@ class StepReport:
     rejected: int
     residual: float
     wall_seconds: float
+
+
+def _positive(name: str, seconds: float) -> float:
+    """A time [s] from PETSc's options, or from the scene and then positive anyway."""
+    if not 0.0 < seconds < math.inf:
+        raise InputError(f"must be a finite number of seconds > 0, not {seconds:g}", key=name)
+    return seconds
 
 
 class Simulation:
@@ -78,9 +86,10 @@ class Simulation:
                 scene, system, self.model.pattern, outline.spacing, system.roundoff(outline.reach)
             )
         ts = self.stepper.ts
-        step = ts.getTimeStep()
-        step = min(step, petsc_number("ts_adapt_dt_max", step))
-        smallest = petsc_number("ts_adapt_dt_min", SMALLEST_FRACTION * step)
+        step = _positive("-ts_dt", ts.getTimeStep())
+        step = _positive("-ts_adapt_dt_max", min(step, petsc_number("ts_adapt_dt_max", step)))
+        smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", SMALLEST_FRACTION * step))
+        _positive("-ts_max_time", ts.getMaxTime())
         self.max_steps = ts.getMaxSteps()
         self.control = StepControl(step, ts.getMaxTime(), scene.output.every, self._events(), smallest)
         self.time, self.step_number = 0.0, 0

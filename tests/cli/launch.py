@@ -1,0 +1,138 @@
+"""Starts the program as a user does: another process, or several under mpirun."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 60.0
+"""Seconds after which a program counts as hanging."""
+
+LAUNCHER = {
+    "OMPI_ALLOW_RUN_AS_ROOT": "1",
+    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+    "OMPI_MCA_rmaps_base_oversubscribe": "1",
+}
+
+SCENE = """\
+mesh: {grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}
+material: {density: 0.15, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}, bending: 2.0e-5, damping: 0.005}
+gravity: [0, 0, -9.81]
+handles: [{nodes: [0, 4]}]
+time: {end: 0.05, step: 0.01}
+output: {every: 0.02}
+"""
+"""A hanging square of 25 vertices and five steps; states at 0, 0.02, 0.04 and 0.05 s."""
+
+DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
+
+
+@dataclass
+class Left:
+    """What a process left behind."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def ours(self) -> list[str]:
+        """Lines on stderr that begin with our name; a launcher's banner does not."""
+        return [line for line in self.err.splitlines() if line.startswith("lyra-petsc: ")]
+
+
+def write_scene(folder: Path, text: str = SCENE, name: str = "scene.yaml") -> Path:
+    """Write a scene file."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def command(
+    arguments: Sequence[object], ranks: int = 1, program: Sequence[str] = ("-m", "lyra_petsc")
+) -> list[str]:
+    """The words of a command line; skips the test where mpirun is needed and missing."""
+    words = [sys.executable, *program, *map(str, arguments)]
+    if ranks == 1:
+        return words
+    mpirun = shutil.which("mpirun")
+    if mpirun is None:
+        pytest.skip("needs mpirun")
+    return [mpirun, "-n", str(ranks), *words]
+
+
+def environment(extra: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment without what tells a process that it is one of a parallel job already."""
+    ours = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("OMPI_", "PMIX_", "PMI_", "HYDRA_", "PETSC_OPTIONS"))
+    }
+    path = str(ROOT) + os.pathsep + ours.get("PYTHONPATH", "")
+    return {**ours, **LAUNCHER, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", **(extra or {})}
+
+
+def start(
+    arguments: Sequence[object],
+    folder: Path,
+    ranks: int = 1,
+    extra: Mapping[str, str] | None = None,
+    **keywords: Any,
+) -> subprocess.Popen[str]:
+    """Start the program in ``folder`` without waiting for it."""
+    return subprocess.Popen(
+        command(arguments, ranks, **keywords),
+        cwd=folder,
+        env=environment(extra),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
+    """Wait for a process; one that hangs is killed with all its ranks and fails the test."""
+    try:
+        out, err = process.communicate(timeout=patience)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        out, err = process.communicate()
+        pytest.fail(f"hangs: {process.args}\n{out}\n{err}")
+    return Left(process.returncode, out, err)
+
+
+def lyra(
+    arguments: Sequence[object],
+    folder: Path,
+    ranks: int = 1,
+    extra: Mapping[str, str] | None = None,
+    patience: float = PATIENCE,
+    **keywords: Any,
+) -> Left:
+    """Run the program in ``folder`` to its end."""
+    return finish(start(arguments, folder, ranks, extra, **keywords), patience)
+
+
+def done(
+    arguments: Sequence[object],
+    folder: Path,
+    ranks: int = 1,
+    extra: Mapping[str, str] | None = None,
+    **keywords: Any,
+) -> Left:
+    """Run the program and expect success."""
+    left = lyra(arguments, folder, ranks, extra, **keywords)
+    assert left.code == 0, left.err + left.out
+    return left
