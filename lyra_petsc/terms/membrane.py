@@ -9,8 +9,6 @@ Source: the Lyra paper, eq. 2-3; Bonet and Wood, Nonlinear Continuum Mechanics f
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,18 +81,13 @@ def add_gradient(x, s, inverse, area, c, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _tensile(s0, s1, s2):  # type: ignore[no-untyped-def]
-    """The positive-semidefinite part of the 2×2 stress: compressive principal stress dropped."""
-    mean = 0.5 * (s0 + s1)
-    half = 0.5 * (s0 - s1)
-    radius = math.sqrt(half * half + s2 * s2)
-    if mean - radius >= 0.0:
-        return s0, s1, s2
-    if mean + radius <= 0.0:
-        return 0.0, 0.0, 0.0
-    # one tensile direction: σ n nᵀ with n nᵀ = (1 + (S − mean)/radius) / 2
-    scale = (mean + radius) / (2.0 * radius)
-    return scale * (radius + half), scale * (radius - half), scale * s2
+def _tensile(e0, e1, c11, c12, c22):  # type: ignore[no-untyped-def]
+    """Stress (S_uu, S_vv) that extension along the material axes alone makes, none of it compressive.
+
+    The original Lyra's choice: its geometric stiffness has these two and leaves shear out.
+    """
+    t0, t1 = max(e0, 0.0), max(e1, 0.0)
+    return max(c11 * t0 + c12 * t1, 0.0), max(c12 * t0 + c22 * t1, 0.0)
 
 
 @kernel()
@@ -104,10 +97,10 @@ def hessians(x, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-unt
     for e in range(lo, hi):
         f = _deformation(x, s, e, inverse)
         ux, uy, uz, vx, vy, vz = f
-        _, _, _, s0, s1, s2 = _green_and_stress(f, c, e)
+        e0, e1, _, s0, s1, s2 = _green_and_stress(f, c, e)
         if blend > 0.0:
-            p0, p1, p2 = _tensile(s0, s1, s2)
-            s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 + blend * (p2 - s2)
+            p0, p1 = _tensile(e0, e1, c[e, 0], c[e, 1], c[e, 2])
+            s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 - blend * s2
         w = area[e]
         s0, s1, s2 = w * s0, w * s1, w * s2
         c11, c12, c22, c33 = w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]
