@@ -1,0 +1,184 @@
+"""Runs that are stopped or killed go on where they were, also on another number of ranks."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from launch import DIRECT, Left, done, finish, lyra, start, write_scene
+from numpy.typing import NDArray
+
+LONG = """\
+mesh: {grid: {width: 1.0, height: 1.0, nx: 6, ny: 6}}
+material: {density: 0.15, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}, bending: 2.0e-5, damping: 0.005}
+gravity: [0, 0, -9.81]
+handles:
+  - {nodes: [0, 6]}
+  - {nodes: [45], from: 0.205, motion: lift}
+motions:
+  lift: [{time: 0.3, translate: [0, 0, 0]}, {time: 0.9, translate: [0, 0, 0.2]}]
+time: {end: 0.8, step: 0.005}
+output: {every: 0.05, checkpoint: {seconds: 0.02}, fields: [velocity], reactions: true}
+probes: {middle: {nodes: [24]}}
+"""
+
+
+def history(folder: Path, name: str = "history.csv") -> list[dict[str, str]]:
+    with (folder / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def final_state(folder: Path) -> tuple[float, NDArray[np.float64]]:
+    newest = max(folder.glob("states-*.h5"))
+    with h5py.File(newest, "r") as file:
+        group = file["states"][max(file["states"])]
+        return float(group.attrs["time"]), np.array(group["position"])
+
+
+def state_times(folder: Path) -> list[float]:
+    """Times [s] of all states, rounded; none is there twice."""
+    times = []
+    for path in sorted(folder.glob("states-*.h5")):
+        with h5py.File(path, "r") as file:
+            times += [round(float(group.attrs["time"]), 9) for group in file["states"].values()]
+    assert times == sorted(set(times))
+    return times
+
+
+def wait_for_rows(folder: Path, rows: int) -> None:
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        path = folder / "history.csv"
+        if path.exists() and path.read_text(encoding="utf-8").count("\n") > rows:
+            return
+        time.sleep(0.005)
+    pytest.fail("the run does not get on")
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    done(["run", write_scene(folder, LONG), "--out", "whole", *DIRECT], folder)
+    return folder / "whole"
+
+
+def equal_runs(left: Path, whole: Path) -> None:
+    """Same last state, and each step, probe and reaction once."""
+    (time_a, a), (time_b, b) = final_state(left), final_state(whole)
+    assert time_a == time_b == pytest.approx(0.8, abs=1e-12)
+    np.testing.assert_allclose(a, b, atol=1e-9)
+    for name in ("history.csv", "probes.csv", "reactions.csv"):
+        steps = [int(row["step"]) for row in history(left, name)]
+        assert steps == list(range(len(history(whole, name))))
+    for mine, other in zip(history(left), history(whole), strict=True):
+        assert float(mine["time"]) == pytest.approx(float(other["time"]), abs=1e-12)
+        assert float(mine["dissipation"]) == pytest.approx(float(other["dissipation"]), rel=1e-6, abs=1e-12)
+    assert set(state_times(whole)) <= set(state_times(left))
+
+
+def stopped_by(number: signal.Signals, folder: Path) -> Left:
+    process = start(["run", write_scene(folder, LONG), "--out", "out", *DIRECT], folder)
+    wait_for_rows(folder / "out", 60)
+    process.send_signal(number)
+    return finish(process)
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGUSR1, 143)]
+)
+def test_a_signal_ends_a_step_and_the_run_goes_on(
+    tmp_path: Path, uninterrupted: Path, number: signal.Signals, code: int
+) -> None:
+    left = stopped_by(number, tmp_path)
+    assert left.code == code, left.err
+    (line,) = left.ours
+    assert number.name in line
+    assert "--resume" in line
+    steps = len(history(tmp_path / "out")) - 1
+    assert steps < len(history(uninterrupted)) - 1
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert number.name in summary["outcome"]
+    assert summary["steps"] == steps
+    done(["run", "--out", "out", "--resume", *DIRECT], tmp_path)
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert (summary["outcome"], summary["steps_of_this_run"]) == ("done", summary["steps"] - steps)
+    equal_runs(tmp_path / "out", uninterrupted)
+
+
+def test_a_killed_run_goes_on_from_its_newest_checkpoint(tmp_path: Path, uninterrupted: Path) -> None:
+    assert stopped_by(signal.SIGKILL, tmp_path).code == -signal.SIGKILL
+    done(["run", tmp_path / "scene.yaml", "--out", "out", "--resume", *DIRECT], tmp_path)
+    equal_runs(tmp_path / "out", uninterrupted)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 3), (3, 1)])
+def test_goes_on_with_another_number_of_ranks(
+    tmp_path: Path, uninterrupted: Path, before: int, after: int
+) -> None:
+    scene = write_scene(tmp_path, LONG)
+    direct = [*DIRECT, "-pc_factor_mat_solver_type", "mumps"]
+    done(["run", scene, "--out", "out", "-ts_max_steps", "61", *direct], tmp_path, before)
+    assert len(history(tmp_path / "out")) == 62
+    done(["run", scene, "--out", "out", "--resume", *direct], tmp_path, after)
+    equal_runs(tmp_path / "out", uninterrupted)
+    assert json.loads((tmp_path / "out/summary.json").read_text())["ranks"] == after
+
+
+def test_resume_without_a_folder_takes_the_newest_run_of_the_scene(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path)
+    done(["run", scene], tmp_path)
+    done(["run", scene, "-ts_max_steps", "2"], tmp_path)
+    done(["run", scene, "--resume"], tmp_path)
+    assert len(history(tmp_path / "runs/scene-2")) == 6
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["scene", "scene-2"]
+
+
+FAILING = """
+import sys
+from mpi4py import MPI
+import lyra_petsc.{module} as module
+from lyra_petsc.cli.app import run_command_line
+
+right = module.{name}
+calls = 0
+
+def wrong(*arguments, **keywords):
+    global calls
+    calls += 1
+    if MPI.COMM_WORLD.rank == 1 and calls > {after}:
+        raise {error}
+    return right(*arguments, **keywords)
+
+module.{name} = wrong
+sys.exit(run_command_line(sys.argv))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "after"),
+    [
+        ("simulation", "build_model", 0),
+        ("stepping.system", "ReducedSystem.residual", 7),
+        ("stepping.system", "ReducedSystem.jacobian", 3),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("error", ["ZeroDivisionError('on one rank')", "MemoryError()"])
+def test_an_exception_on_one_rank_ends_the_job(
+    tmp_path: Path, module: str, name: str, after: int, error: str
+) -> None:
+    program = tmp_path / "failing.py"
+    program.write_text(FAILING.format(module=module, name=name, after=after, error=error))
+    began = time.monotonic()
+    left = lyra(
+        ["run", write_scene(tmp_path), "--out", "out"], tmp_path, 2, patience=30, program=(str(program),)
+    )
+    assert left.code not in (0, 2, 3)
+    assert time.monotonic() - began < 20
+    assert error.split("(")[0] in left.err
