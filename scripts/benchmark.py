@@ -22,7 +22,6 @@ petsc4py.init([sys.argv[0], *petsc])
 
 import click  # noqa: E402
 from mpi4py import MPI  # noqa: E402
-from petsc4py import PETSc  # noqa: E402
 
 from lyra_petsc.scene.schema import Scene  # noqa: E402
 from lyra_petsc.simulation import Simulation  # noqa: E402
@@ -67,8 +66,6 @@ def benchmark(vertices: tuple[int, ...], steps: int) -> None:
                 flush=True,
             )
         simulation.destroy()
-        for name in simulation.stepper.our_options:
-            PETSc.Options().delValue(name)
 
 
 if __name__ == "__main__":

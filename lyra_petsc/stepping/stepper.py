@@ -181,16 +181,16 @@ class Stepper:
             return None
         time, step = self.ts.getTime(), self.ts.getStepNumber()
         self.destroy()
-        database = PETSc.Options()
-        for name in self._filled:
-            database.delValue(name)
         self.presets.pop(0)
         self._create()
         self.start(time, step)
         return self.preset
 
     def destroy(self) -> None:
-        """Free all PETSc objects; collective."""
+        """Free all PETSc objects and take back the options that were filled in; collective."""
+        database = PETSc.Options()
+        for name in self._filled:
+            database.delValue(name)
         self.ts.destroy()
         self.matrix.destroy()
         if self.preconditioner is not self.matrix:
