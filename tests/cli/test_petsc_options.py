@@ -1,0 +1,91 @@
+"""PETSc's options do what they do in every PETSc program, and unused ones are named."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from launch import SCENE, Left, done, write_scene
+
+
+def history(folder: Path) -> list[dict[str, str]]:
+    with (folder / "history.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def ran(folder: Path, *options: str, scene: str = SCENE, ranks: int = 1, petsc_options: str = "") -> Left:
+    extra = {"PETSC_OPTIONS": petsc_options} if petsc_options else {}
+    return done(["run", write_scene(folder, scene), "--out", "out", *options], folder, ranks, extra)
+
+
+def test_monitors_print_and_a_direct_solver_is_taken(tmp_path: Path) -> None:
+    left = ran(
+        tmp_path, "-ts_monitor", "-snes_monitor", "-ksp_type", "cg", "-pc_type", "lu", "-ksp_rtol", "1e-12"
+    )
+    assert "1 TS dt 0.01 time 0.01" in left.out
+    assert "0 SNES Function norm" in left.out
+    assert left.ours == []
+    # a factorisation leaves conjugate gradients a few iterations, point-block Jacobi tens
+    for row in history(tmp_path / "out")[1:]:
+        assert 0 < int(row["linear_iterations"]) <= 4 * int(row["newton_iterations"])
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_unused_options_are_one_warning(tmp_path: Path, ranks: int) -> None:
+    left = ran(tmp_path, "-ksp_typo", "3", "-nonsense", ranks=ranks)
+    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo, -nonsense"]
+
+
+def test_an_unused_option_of_the_scene_is_named_too(tmp_path: Path) -> None:
+    left = ran(tmp_path, scene=SCENE + "petsc: {ksp_typo: 3}\n")
+    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -ksp_typo"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["-options_left"], "There are no unused options"),
+        (["-options_view"], "-options_view"),
+        (["-log_view"], "PETSc Performance Summary"),
+        (["-ts_view"], "TS Object"),
+        (["-help"], "-ksp_type"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_petsc_prints_what_is_asked_for(tmp_path: Path, options: list[str], words: str) -> None:
+    left = ran(tmp_path, *options)
+    assert words in left.out
+    assert left.ours == []
+
+
+@pytest.mark.parametrize(
+    ("options", "times"),
+    [
+        (["-ts_max_steps", "3"], [0, 0.01, 0.02, 0.03]),
+        (["-ts_dt", "0.005", "-ts_max_time", "0.015"], [0, 0.005, 0.01, 0.015]),
+        (["-ts_adapt_dt_max", "0.02", "-ts_dt", "0.04"], [0, 0.02, 0.04, 0.05]),
+    ],
+    ids=["max_steps", "dt and max_time", "adapt_dt_max"],
+)
+def test_times_follow_the_options(tmp_path: Path, options: list[str], times: list[float]) -> None:
+    ran(tmp_path, *options)
+    assert [float(row["time"]) for row in history(tmp_path / "out")] == pytest.approx(times, abs=1e-12)
+
+
+def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_path: Path) -> None:
+    scene = SCENE + "petsc: {ts_max_steps: 1, ts_dt: 0.001}\n"
+
+    def steps(name: str, *options: str, petsc_options: str = "") -> tuple[int, float]:
+        folder = tmp_path / name
+        folder.mkdir()
+        ran(folder, *options, scene=scene, petsc_options=petsc_options)
+        rows = history(folder / "out")
+        return len(rows) - 1, float(rows[1]["dt"])
+
+    assert steps("scene") == (1, pytest.approx(0.001))
+    assert steps("environment", petsc_options="-ts_max_steps 2") == (2, pytest.approx(0.001))
+    assert steps("line", "-ts_max_steps", "3", petsc_options="-ts_max_steps 2 -ts_dt 0.002") == (
+        3,
+        pytest.approx(0.002),
+    )
