@@ -130,7 +130,7 @@ class Stepper:
             snes.setConvergenceTest(newton.converged)
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
-            snes.setMaxLinearSolveFailures(scene.solver.max_iterations)
+            snes.setMaxKSPFailures(scene.solver.max_iterations)
             ksp.setTolerances(rtol=1e-2, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)

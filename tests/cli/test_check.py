@@ -1,0 +1,53 @@
+"""``check`` says what a run would do, and does nothing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from launch import lyra
+
+MEMBRANE = """
+mesh: {grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}
+material: {density: 0.1, membrane: {c11: 100, c22: 100, c12: 20, c33: 40}}
+time: {end: 1.0, step: 0.01}
+output: {every: 0.1}
+"""
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3])
+def test_plan(tmp_path: Path, ranks: int) -> None:
+    (tmp_path / "plain.yaml").write_text(MEMBRANE)
+    result = lyra(["check", "plain.yaml"], tmp_path, ranks=ranks)
+    assert result.code == 0, result.err
+    plan = result.out
+    assert "121 vertices, 200 triangles" in plan
+    assert "100 of 0.01 s to t = 1 s, 11 states" in plan
+    assert "363" in plan  # unknowns
+    # a vertex couples with its neighbours along the 320 edges, twice, and with itself
+    assert f"{9 * 761} in 761 blocks" in plan
+    assert "load imbalance" in plan
+    assert "ghost share" in plan
+    table = [line.split() for line in plan.splitlines() if line.split()[:1] and line.split()[0].isdigit()]
+    assert sum(int(row[1]) for row in table) == 121
+    assert len(table) == ranks
+    assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
+
+
+def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:
+    (tmp_path / "plain.yaml").write_text(MEMBRANE)
+    program = (
+        "import sys; from lyra_petsc.cli.app import run_command_line;"
+        "code = run_command_line(['lyra-petsc', 'check', 'plain.yaml']);"
+        "print('LOADED', *sorted(m for m in sys.modules if m.startswith('lyra_petsc.terms.')));"
+        "sys.exit(code)"
+    )
+
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120, check=True
+    )
+    loaded = result.stdout.split("LOADED")[1].split()
+    names = {name.removeprefix("lyra_petsc.terms.") for name in loaded}
+    assert names == {"kernel", "membrane", "registry", "rest", "term"}
