@@ -8,7 +8,6 @@ import os
 import pty
 import select
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -196,7 +195,6 @@ def on_a_terminal(folder: Path, *options: str) -> str:
     return shown.decode()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
 def test_a_terminal_gets_a_bar_and_a_closing_table(tmp_path: Path) -> None:
     shown = on_a_terminal(tmp_path)
     assert "━" in shown
