@@ -1,6 +1,6 @@
 """Time per step of a square of gray interlock hung by two corners, next to the original Lyra's.
 
-    mpirun -n 1 python scripts/benchmark.py [--vertices 1024 10201 50176] [--steps 10] [-petsc options]
+    mpirun -n 1 python scripts/benchmark.py [--vertices 1024 --vertices 10201] [--steps 10] [-petsc options]
 
 One linear solve a step (semi-implicit), Δt 5 ms, γ 0.03 s, relative residual 1e-6; the median of the
 steps after the first three, with the fastest and slowest. Prints a Markdown table. The original's
