@@ -15,7 +15,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.handles.held import Held, is_exact, select_held
 from lyra_petsc.handles.motion import Window
 from lyra_petsc.meshing.build import build_mesh
-from lyra_petsc.meshing.measure import bounding_diagonal, mean_edge_length
+from lyra_petsc.meshing.measure import mean_edge_length
 from lyra_petsc.meshing.mesh import Mesh
 from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.output.phases import Phases
@@ -46,8 +46,6 @@ class Outline:
     n_triangles: int
     spacing: float
     """Mean rest edge length [m]."""
-    diagonal: float
-    """Diagonal of the rest bounding box [m]."""
     reach: float
     """Largest coordinate [m] of the start and rest shape."""
     terms: list[str]
@@ -164,7 +162,6 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         n_vertices=mesh.n_vertices,
         n_triangles=mesh.n_triangles,
         spacing=mean_edge_length(mesh),
-        diagonal=bounding_diagonal(mesh.rest),
         reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
         terms=names,
         notes=[*mesh.notes, *rest.notes],

@@ -77,7 +77,7 @@ class Simulation:
     def __init__(self, comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> None:
         self.comm, self.scene = comm, scene
         self.phases = phases or Phases()
-        self.scene_options = fill_gaps(scene.petsc)
+        fill_gaps(scene.petsc)
         self.model: Model = build_model(comm, scene, self.phases)
         self.notes = list(self.model.outline.notes)
         outline, system = self.model.outline, self.model.system

@@ -226,24 +226,18 @@ class Stepper:
             self.snes.getIterationNumber(),
             self.snes.getLinearSolveIterations() + self._newton.more_linear,
         )
-        converged = self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0
-        if converged:
+        words, advice = "the velocities are not finite", "try a smaller time.step"
+        self._linear_failed = False
+        if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
-            finite = system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0
-            if finite:
+            if system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0:
                 system.accept(velocity)
                 self.ts.setTime(t1)
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
-            return Attempt(
-                False,
-                newton,
-                linear,
-                self._newton.norm,
-                "the velocities are not finite",
-                "try a smaller time.step",
-            )
-        words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
-        self._linear_failed = reasons.preconditioner_failed(self.ksp)
+        else:
+            words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
+            self._linear_failed = reasons.preconditioner_failed(self.ksp)
+        self.ts.setTime(t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         return Attempt(False, newton, linear, self._newton.norm, words, advice)
