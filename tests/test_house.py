@@ -28,6 +28,7 @@ LEVELS = [
     {"fields"},
     {"simulation"},
     {"recorder"},
+    {"verification"},
     {"cli"},
     {"__main__"},
 ]

@@ -22,7 +22,6 @@ BUG = 70
 
 LATER = {
     "study": "error against run time",
-    "verify": "exact and published answers",
     "stress": "stability on stiff and extreme cases",
     "render": "pictures and films",
     "view": "a live page",
@@ -54,7 +53,7 @@ def run_command_line(argv: Sequence[str]) -> int:
 
     comm = MPI.COMM_WORLD
     try:
-        _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
+        code = _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
     except LyraError as error:
         _say(comm, str(error))
         return _leave_together(comm, error.exit_code)
@@ -68,7 +67,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         if comm.size > 1:
             comm.Abort(BUG)
         return BUG
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _say(comm: Any, line: str) -> None:
@@ -206,6 +205,27 @@ def check(comm: Any, scene: Path | None, settings: tuple[str, ...]) -> None:
     from lyra_petsc.cli.check import check as check_scene
 
     check_scene(comm, scene, settings)
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option("--quick", is_flag=True, help="Only the coarser resolutions of each case.")
+@click.option("--list", "listed", is_flag=True, help="Name the cases; runs nothing.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
+@click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
+@click.pass_obj
+def verify(
+    comm: Any, names: tuple[str, ...], quick: bool, listed: bool, out: Path | None, force: bool
+) -> int:
+    """Run the cases with exact or published answers (default: all); exit code 1 if a verdict fails."""
+    from lyra_petsc.cli.verify import list_cases
+    from lyra_petsc.cli.verify import verify as verify_cases
+
+    if listed:
+        list_cases(comm)
+        return 0
+    return verify_cases(comm, names, quick=quick, out=out, force=force)
 
 
 @_verbs.command(context_settings=_SETTINGS)

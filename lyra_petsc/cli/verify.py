@@ -1,0 +1,117 @@
+"""``verify``: exact and published answers, a table and a verdict for each."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+from mpi4py import MPI
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from lyra_petsc.cli.progress import duration
+from lyra_petsc.cli.signals import StopRequest
+from lyra_petsc.errors import Interrupted
+from lyra_petsc.verification.registry import NAMES, load
+from lyra_petsc.verification.results import prepare, write
+from lyra_petsc.verification.runner import Outcome, run_case
+
+FAILED = 1
+"""Exit code when a verdict failed."""
+
+WIDTH = 110
+"""Columns at least, so that numbers are never cut."""
+
+
+def verify(comm: MPI.Comm, names: Sequence[str], *, quick: bool, out: Path | None, force: bool) -> int:
+    """Run cases (all of them without names) and print what came of each; the exit code; collective.
+
+    Raises
+    ------
+    InputError
+        An unknown case, or a folder that cannot be used; nothing has run then.
+    Interrupted
+        A signal; what had been done is in the folder.
+    """
+    cases = [load(name) for name in dict.fromkeys(names or NAMES)]
+    prepare(comm, out, force=force)
+    stop = StopRequest(comm)
+
+    def watch() -> None:
+        number = stop.signal_number()
+        if number:
+            raise Interrupted(f"stopped by {signal.Signals(number).name}", number)
+
+    console = Console(width=WIDTH if Console().width < WIDTH else None, highlight=False, soft_wrap=True)
+    outcomes: list[Outcome] = []
+    for number, case in enumerate(cases, 1):
+        if comm.rank == 0 and sys.stderr.isatty():
+            print(f"{number} of {len(cases)}: {case.name} …", file=sys.stderr, end="\r", flush=True)
+        outcome = run_case(comm, case, quick=quick, watch=watch)
+        outcomes.append(outcome)
+        if comm.rank == 0:
+            _print_case(console, outcome)
+        write(comm, out, outcomes)
+    passed = sum(outcome.passed for outcome in outcomes)
+    if comm.rank == 0:
+        _print_summary(console, outcomes, out)
+    return 0 if passed == len(outcomes) else FAILED
+
+
+def list_cases(comm: MPI.Comm) -> None:
+    """Print name and title of every case on rank 0."""
+    cases = [load(name) for name in NAMES]
+    if comm.rank == 0:
+        width = max(len(name) for name in NAMES)
+        for case in cases:
+            click.echo(f"{case.name:<{width}}  {case.title}")
+
+
+def _print_case(console: Console, outcome: Outcome) -> None:
+    case = outcome.case
+    console.print(Text(f"{case.name}: {case.title}", style="bold"))
+    console.print(Text(f"source: {case.source}; n: {case.counts}"))
+    for quantity in outcome.quantities():
+        rows = outcome.rows_of(quantity)
+        verdict = outcome.verdicts[quantity]
+        if not rows[0].problem:
+            unit = f" [{rows[0].unit}]" if rows[0].unit != "1" else ""
+            table = Table(Text("n"), box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
+            table.columns[0].justify = "right"
+            for heading in ("h", f"value{unit}", f"exact{unit}", "error", "order", "steps", "wall [s]"):
+                table.add_column(Text(heading), justify="right")
+            for row in rows:
+                order = "" if math.isnan(row.order) else f"{row.order:.2f}"
+                table.add_row(
+                    f"{row.n:g}",
+                    f"{row.h:.4g}",
+                    f"{row.value:.9g}",
+                    f"{row.exact:.9g}",
+                    f"{row.error:.2e}",
+                    order,
+                    str(row.steps),
+                    f"{row.wall_seconds:.2f}",
+                )
+            console.print(Text(f"  {quantity}"))
+            console.print(table)
+        word = "passed" if verdict.passed else "FAILED"
+        console.print(Text(f"  {word}: {verdict.words}", style="" if verdict.passed else "bold red"))
+    console.print()
+
+
+def _print_summary(console: Console, outcomes: Sequence[Outcome], out: Path | None) -> None:
+    table = Table("case", "verdict", box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(Text("wall [s]"), justify="right")
+    for outcome in outcomes:
+        table.add_row(outcome.case.name, "passed" if outcome.passed else "FAILED", f"{outcome.seconds:.1f}")
+    console.print(table)
+    passed = sum(outcome.passed for outcome in outcomes)
+    total = sum(outcome.seconds for outcome in outcomes)
+    console.print(f"{passed} of {len(outcomes)} cases passed, {duration(total)} in all")
+    if out is not None:
+        console.print(f"results: {out}")

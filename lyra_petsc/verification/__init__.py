@@ -1,0 +1,1 @@
+"""Exact and published answers: small named cases, their errors, and a verdict on each."""

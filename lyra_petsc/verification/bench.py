@@ -1,0 +1,173 @@
+"""Where cases run their simulations: a direct linear solver, tight tolerances, counted steps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from pydantic import ValidationError
+
+from lyra_petsc.errors import LyraError
+from lyra_petsc.scene.messages import input_error
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.simulation import Simulation
+from lyra_petsc.solvers.options import is_set
+from lyra_petsc.verification.case import Measured
+
+Array = NDArray[np.float64]
+
+TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+"""Where a scene of a case says nothing: Newton being quadratic, it ends at round-off."""
+
+
+def data(name: str) -> dict[str, Any]:
+    """A file of ``verification/data``, without ``.json``."""
+    text = files("lyra_petsc.verification").joinpath("data", f"{name}.json").read_text(encoding="utf-8")
+    content: dict[str, Any] = json.loads(text)
+    return content
+
+
+class Trial:
+    """One simulation of a case, with its state in mesh order on every rank.
+
+    Attributes
+    ----------
+    simulation : Simulation
+    """
+
+    def __init__(self, bench: Bench, simulation: Simulation) -> None:
+        self._bench = bench
+        self.simulation = simulation
+
+    def step(self) -> None:
+        """One accepted step; collective."""
+        self._bench.watch()
+        self.simulation.step()
+        self._bench.steps += 1
+
+    def run(self) -> Trial:
+        """Steps to the end of the scene; collective."""
+        while not self.simulation.finished:
+            self.step()
+        return self
+
+    def gather(self, owned: Array) -> Array:
+        """Rows of the owned vertices (n_owned, …) in mesh order (V, …), on every rank; collective."""
+        points = self.simulation.model.points
+        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_owned])))
+        out = np.empty((points.n_global, *owned.shape[1:]))
+        for original, rows in pieces:
+            out[original] = rows
+        return out
+
+    @property
+    def x(self) -> Array:
+        """Positions (V, 3) [m] in mesh order."""
+        return self.gather(self.simulation.model.system.x)
+
+    @property
+    def v(self) -> Array:
+        """Velocities (V, 3) [m/s] in mesh order."""
+        return self.gather(self.simulation.model.system.v)
+
+    @property
+    def mass(self) -> Array:
+        """Masses (V,) [kg] in mesh order."""
+        return self.gather(self.simulation.model.system.mass)
+
+    def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
+        """Replace positions [m] or velocities [m/s], (V, 3) in mesh order; collective."""
+        model = self.simulation.model
+        for target, values in ((model.system.x, x), (model.system.v, v)):
+            if values is not None:
+                target[: model.points.n_owned] = values[model.points.original]
+                model.points.update_ghosts(target)
+
+    def total(self, owned: Array) -> float:
+        """Sum over all ranks of this rank's values; collective."""
+        return float(self._bench.comm.allreduce(float(np.sum(owned))))
+
+
+class Bench:
+    """Runs the simulations of a case.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    watch : callable, optional
+        Called before every step on all ranks; may raise to end the work.
+
+    Attributes
+    ----------
+    steps : int
+        Accepted steps so far.
+    """
+
+    def __init__(self, comm: MPI.Comm, watch: Callable[[], None] | None = None) -> None:
+        self.comm = comm
+        self.watch = watch or (lambda: None)
+        self.steps = 0
+
+    @contextmanager
+    def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
+        """Set a scene up; freed, with the options it set, when the block ends; collective.
+
+        ``content`` is a scene as in a file. Filled in where it says nothing: a direct linear solver,
+        tight tolerances, no output times.
+        """
+        filled: dict[str, Any] = {"solver": TIGHT, "output": {"every": None}} | dict(content)
+        filled["petsc"] = self._direct() | filled.get("petsc", {})
+        try:
+            scene = Scene.model_validate(filled)
+        except ValidationError as error:
+            raise input_error(error, filled, file="scene of the case") from None
+        ours = [name for name in scene.petsc if not is_set(name)]
+        simulation = None
+        try:
+            simulation = Simulation(self.comm, scene)
+            yield Trial(self, simulation)
+        except LyraError as error:
+            if self.comm.size == 1 or getattr(error, "collective", True):
+                self._free(simulation, ours)
+            raise
+        # after any other error this rank may be alone, and freeing would wait for the others
+        self._free(simulation, ours)
+
+    def _free(self, simulation: Simulation | None, options: list[str]) -> None:
+        if simulation is not None:
+            simulation.destroy()
+        database = PETSc.Options()
+        for name in options:
+            database.delValue(name)
+
+    def _direct(self) -> dict[str, Any]:
+        direct: dict[str, Any] = {"pc_type": "lu", "ksp_rtol": 1e-12}
+        if self.comm.size > 1:
+            if PETSc.Sys.hasExternalPackage("mumps"):
+                direct["pc_factor_mat_solver_type"] = "mumps"
+            else:
+                direct |= {"pc_type": "redundant", "redundant_pc_type": "lu"}
+        return direct
+
+
+def simulated(
+    scene: Callable[[float], Mapping[str, Any]],
+    measure: Callable[[Trial, float], Sequence[Measured]],
+) -> Callable[[Bench, float], Sequence[Measured]]:
+    """The ``measure`` of a case that runs one scene a resolution to its end and then looks.
+
+    ``scene`` maps n to the content of a scene; ``measure`` gets the finished trial and n.
+    """
+
+    def both(bench: Bench, n: float) -> Sequence[Measured]:
+        with bench.simulation(scene(n)) as trial:
+            return measure(trial.run(), n)
+
+    return both

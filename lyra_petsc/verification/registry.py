@@ -1,0 +1,26 @@
+"""The cases by name, in the order in which ``verify`` runs them; the file of each bears its name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.nearest import nearest
+from lyra_petsc.verification.case import Case
+
+NAMES = ("free-fall",)
+
+
+def load(name: str) -> Case:
+    """A case by its name.
+
+    Raises
+    ------
+    InputError
+        For a name that is not listed, with the nearest that is.
+    """
+    if name not in NAMES:
+        raise InputError(f"unknown case, {nearest(name, NAMES)}", key=name)
+    module = import_module(f"lyra_petsc.verification.cases.{name.replace('-', '_')}")
+    case: Case = module.CASE
+    return case

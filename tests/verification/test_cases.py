@@ -1,0 +1,34 @@
+"""Every case of ``verify`` holds, on one rank and on several."""
+
+from __future__ import annotations
+
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.verification.registry import NAMES, load
+from lyra_petsc.verification.runner import run_case
+
+SOME = ("free-fall",)
+"""Cases that are run whatever is selected: each takes no more than a second or two."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_describes_itself(name: str) -> None:
+    case = load(name)
+    assert case.name == name
+    assert case.title
+    assert case.source
+    assert list(case.resolutions) == sorted(set(case.resolutions))
+    assert 1 <= case.quick <= len(case.resolutions)
+    sizes = [case.size(n) for n in case.resolutions]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    "name", [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
+def test_passes(comm: MPI.Comm, name: str) -> None:
+    outcome = run_case(comm, load(name), quick=True, warm=False)
+    words = "; ".join(f"{quantity}: {verdict.words}" for quantity, verdict in outcome.verdicts.items())
+    assert outcome.passed, words
