@@ -81,9 +81,8 @@ def _print_case(console: Console, outcome: Outcome) -> None:
         verdict = outcome.verdicts[quantity]
         if not rows[0].problem:
             unit = f" [{rows[0].unit}]" if rows[0].unit != "1" else ""
-            table = Table(Text("n"), box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
-            table.columns[0].justify = "right"
-            for heading in ("h", f"value{unit}", f"exact{unit}", "error", "order", "steps", "wall [s]"):
+            table = Table(box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
+            for heading in ("n", "h", f"value{unit}", f"exact{unit}", "error", "order", "steps", "wall [s]"):
                 table.add_column(Text(heading), justify="right")
             for row in rows:
                 order = "" if math.isnan(row.order) else f"{row.order:.2f}"
