@@ -8,7 +8,12 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
 from lyra_petsc.verification.case import Case
 
-NAMES = ("free-fall",)
+NAMES = (
+    "free-fall",
+    "hinge-strip",
+    "hinge-sheet",
+    "hinge-plate",
+)
 
 
 def load(name: str) -> Case:
