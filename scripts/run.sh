@@ -8,5 +8,5 @@ set -euo pipefail
 source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
 ranks=${RANKS:-2}
 [[ $ranks =~ ^[1-9][0-9]*$ ]] || give_up "RANKS=$ranks is not a number of ranks"
-set_up
+set_up study
 exec "${launcher[@]}" -n "$ranks" "${python[@]}" -m lyra_petsc run "$@"

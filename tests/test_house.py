@@ -28,6 +28,7 @@ LEVELS = [
     {"fields"},
     {"simulation"},
     {"recorder"},
+    {"report"},
     {"verification"},
     {"cli"},
     {"__main__"},

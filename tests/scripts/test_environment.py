@@ -22,6 +22,9 @@ NEEDED = {
     "gmsh": "4.12",
     "mpi4py": "4.0.0",
     "petsc4py": "3.20.1",
+    "matplotlib": "3.9",
+    "jinja2": "3.1.4",
+    "scipy": "1.14",
 }
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")

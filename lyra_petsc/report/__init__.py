@@ -1,0 +1,1 @@
+"""Reports of several results: self-contained HTML, Markdown, figures as PNG and SVG."""
