@@ -15,7 +15,7 @@ from lyra_petsc.scene.load import load_scene
 from lyra_petsc.simulation import Simulation
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SHIPPED = ("drape", "flag", "plate", "sail", "spin")
+SHIPPED = ("drape", "flag", "plate", "sail", "spin", "swing")
 
 
 @contextmanager
@@ -100,3 +100,12 @@ def test_plate_bends_like_a_beam_under_a_small_weight() -> None:
     stiffness = 2.0e11 * 0.0005**3 / (12 * (1 - 0.3**2))
     beam = 3.925 * 0.0981 / (8 * stiffness)
     assert sag / beam == pytest.approx(1.05, abs=0.03)
+
+
+def test_swings_free_edge_falls_freely_in_the_steps_of_backward_euler() -> None:
+    # no tension reaches it before 0.3 s: z = -½ g t (t + Δt), of which ½ g t Δt is the scheme's own error
+    small = ("mesh.grid.nx=20", "mesh.grid.ny=2", "mesh.grid.height=0.1", "time.integrator=beuler")
+    with simulated("swing", *small, "time.end=0.3", "time.step=0.01") as simulation:
+        edge = mean_of(simulation, "edge")
+    assert edge[2] == pytest.approx(-0.5 * 9.81 * 0.3 * (0.3 + 0.01), abs=1e-6)
+    assert edge[0] == pytest.approx(0.7916, abs=2.5e-3)  # of a converged calculation in one dimension
