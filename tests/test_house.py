@@ -28,7 +28,7 @@ LEVELS = [
     {"fields"},
     {"simulation"},
     {"recorder"},
-    {"report"},
+    {"exact", "report"},
     {"verification"},
     {"cli"},
     {"__main__"},
