@@ -25,6 +25,7 @@ from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.start import start_positions, start_velocities
+from lyra_petsc.stepping.schemes import scheme_of
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import REGISTRY, Registration, active
@@ -46,6 +47,8 @@ class Outline:
     n_triangles: int
     spacing: float
     """Mean rest edge length [m]."""
+    size: float
+    """Diagonal [m] of the rest shape's bounding box."""
     reach: float
     """Largest coordinate [m] of the start and rest shape."""
     terms: list[str]
@@ -129,6 +132,13 @@ def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
         return _local(scene, outline, part, mesh)
 
 
+def events(scene: Scene) -> list[float]:
+    """Times [s] on which a step must end: handles and loads begin and end there."""
+    windows = [Window.of(handle) for handle in scene.handles]
+    windows += [Window(load.start, load.until) for load in scene.loads]
+    return [t for window in windows for t in window.events()]
+
+
 def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     """Everything there is to distribute (rank 0)."""
     rest = RestShape(scene, mesh)
@@ -162,6 +172,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         n_vertices=mesh.n_vertices,
         n_triangles=mesh.n_triangles,
         spacing=mean_edge_length(mesh),
+        size=float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
         reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
         terms=names,
         notes=[*mesh.notes, *rest.notes],
@@ -176,11 +187,11 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         name: registered[name].module().make(part.elements.get(name), scene, mass) for name in outline.terms
     }
     points = part.points
-    explicit = scene.time.integrator == "semi-implicit"
+    scheme = scheme_of(scene.time.scheme, scene.time.spectral_radius)
     coupling = {
         name: term.stencil
         for name, term in terms.items()
-        if isinstance(term, Elastic) or (isinstance(term, Viscous) and not explicit)
+        if isinstance(term, Elastic) or (isinstance(term, Viscous) and not scheme.explicit)
     }
     pattern = BlockPattern(coupling, points.n_owned, points.n_local, points.global_number)
     held = Held(
@@ -195,8 +206,9 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         [t for t in terms.values() if isinstance(t, Load)],
         held,
         BlockRows(pattern),
+        scheme=scheme,
         starts=[Window.of(handle).start for handle in scene.handles],
-        explicit_wind=explicit,
+        events=events(scene),
     )
     data = part.vertex_data
     system.x[: points.n_owned] = data["position"]

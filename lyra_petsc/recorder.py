@@ -76,7 +76,7 @@ class Recorder:
             system.resume(float(start), checkpoint.arrays[f"start_{number}"])
         system.x[:n] = checkpoint.arrays["position"]
         system.v[:n] = checkpoint.arrays["velocity"]
-        simulation.resume(memory)
+        simulation.resume(memory, checkpoint.arrays)
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
         self._open(folder, simulation.step_number)
@@ -188,7 +188,7 @@ class Recorder:
         """Replace the checkpoint by the present state."""
         simulation = self._simulation
         system, n = simulation.model.system, simulation.model.points.n_owned
-        arrays = {"position": system.x[:n], "velocity": system.v[:n]}
+        arrays = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.late_starts)):
             arrays[f"start_{number}"] = system.late_starts[start]
         write_checkpoint(

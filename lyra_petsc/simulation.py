@@ -13,12 +13,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.handles.motion import Window
-from lyra_petsc.model import Model, build_model
+from lyra_petsc.model import Model, build_model, events
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers.options import fill_gaps, petsc_number
-from lyra_petsc.stepping.control import StepControl
+from lyra_petsc.stepping.control import LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.equilibrium import Equilibrium
+from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.work import Budget, Ledger
 
@@ -26,6 +27,12 @@ Array = NDArray[np.float64]
 
 SMALLEST_FRACTION = 2.0**-12
 """Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""
+
+LARGEST_FRACTION = 0.1
+"""Largest Δt of an adaptive run over its length (``-ts_adapt_dt_max`` overrides it)."""
+
+SMALLEST_ADAPTED = 1e-6
+"""Smallest Δt of an adaptive run over the largest (``-ts_adapt_dt_min`` overrides it)."""
 
 
 @dataclass
@@ -86,20 +93,33 @@ class Simulation:
                 scene, system, self.model.pattern, outline.spacing, system.roundoff(outline.reach)
             )
         ts = self.stepper.ts
-        step = _positive("-ts_dt", ts.getTimeStep())
-        step = _positive("-ts_adapt_dt_max", min(step, petsc_number("ts_adapt_dt_max", step)))
-        smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", SMALLEST_FRACTION * step))
-        _positive("-ts_max_time", ts.getMaxTime())
         self.max_steps = ts.getMaxSteps()
-        self.control = StepControl(step, ts.getMaxTime(), scene.output.every, self._events(), smallest)
+        self.control = self._control(
+            _positive("-ts_dt", ts.getTimeStep()), _positive("-ts_max_time", ts.getMaxTime())
+        )
         self.time, self.step_number = 0.0, 0
+        self.local_error = LocalError(system) if scene.time.adaptive else None
+        self.estimated_error = 0.0
+        self._told_of_error = False
         self.stepper.start(0.0, 0)
         self.ledger = Ledger(system)
+        self._seek: Equilibrium | Stepper = self.stepper
+        if scene.time.analysis == "static":
+            floor = system.roundoff(outline.reach)
+            self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, floor)
 
-    def _events(self) -> list[float]:
-        windows = [Window.of(handle) for handle in self.scene.handles]
-        windows += [Window(load.start, load.until) for load in self.scene.loads]
-        return [t for window in windows for t in window.events()]
+    def _control(self, step: float, end: float) -> StepControl:
+        """Plan of the steps: fixed, by a tolerance, or of a load factor."""
+        time, every = self.scene.time, self.scene.output.every
+        largest = LARGEST_FRACTION * end if time.adaptive else step
+        largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
+        smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
+        smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
+        if time.analysis == "static":
+            return LoadControl(largest, end, None, events(self.scene), smallest)
+        if time.adaptive:
+            return ToleranceControl(step, largest, end, every, events(self.scene), smallest)
+        return StepControl(largest, end, every, events(self.scene), smallest)
 
     @property
     def budget(self) -> Budget:
@@ -121,29 +141,55 @@ class Simulation:
         """
         started = clock.perf_counter()
         system, n = self.model.system, self.model.points.n_owned
-        x_before, v_before = system.x[:n].copy(), system.v[:n].copy()
+        x_before, v_before = system.x.copy(), system.v.copy()
         newton = linear = rejected = 0
         while True:
             end = self.control.next_end(self.time)
+            past = system.scheme.memory()
             with self.phases("solve"):
-                attempt = self.stepper.attempt(self.time, end)
+                attempt = self._seek.attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
-            if attempt.converged:
+            if not attempt.converged:
+                self._recover(attempt, end)
+            elif self._accurate(v_before[:n], end - self.time):
                 break
+            else:
+                system.x[:], system.v[:] = x_before, v_before
+                system.scheme.restore(*past)
+                self.stepper.start(self.time, self.step_number)
             rejected += 1
-            self._recover(attempt, end)
-        self.control.succeeded()
+        self.control.succeeded(newton)
         dt, self.time = end - self.time, end
         self.step_number += 1
         with self.phases("output"):
-            self.ledger.record(x_before, v_before)
+            self.ledger.record(x_before[:n])
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
         return StepReport(
             self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds
         )
+
+    def _accurate(self, v_before: Array, dt: float) -> bool:
+        """Whether the step just taken keeps its share of the tolerance."""
+        control = self.control
+        if self.local_error is None or not isinstance(control, ToleranceControl):
+            return True
+        size = self.model.outline.size
+        error = self.local_error.of(v_before, dt) / size
+        share = (self.scene.time.tolerance or 0.0) * dt / control.end
+        stands = control.judge(dt, error / share, self.model.system.scheme.order)
+        if stands:
+            self.local_error.accepted(v_before, dt)
+            self.estimated_error += error
+            if error > share and not self._told_of_error:
+                self._told_of_error = True
+                self.notes.append(
+                    f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
+                    f"the smallest Δt = {dt:.3g} s (-ts_adapt_dt_min)"
+                )
+        return stands
 
     def _recover(self, attempt: Attempt, end: float) -> None:
         if self.stepper.linear_solver_failed:
@@ -169,14 +215,24 @@ class Simulation:
             "time": self.time,
             "step": self.step_number,
             "budget": asdict(self.budget),
-            "factor": self.control.factor,
-            "good": self.control.good,
+            **self.control.memory(),
+            "estimated_error": self.estimated_error,
+            "integrator": self._numbers(),
             "blend": self.stepper.blend,
             "preset": self.stepper.preset,
             "late_starts": sorted(self.model.system.late_starts),
         }
 
-    def resume(self, memory: Mapping[str, Any]) -> None:
+    def _numbers(self) -> dict[str, float]:
+        numbers = self.model.system.scheme.memory()[1]
+        return numbers if self.local_error is None else numbers | self.local_error.memory()[1]
+
+    def arrays(self) -> dict[str, Array]:
+        """Vertex arrays (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
+        arrays = self.model.system.scheme.memory()[0]
+        return arrays if self.local_error is None else arrays | self.local_error.memory()[0]
+
+    def resume(self, memory: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         """Go on from a state already put into ``model.system`` (x and v of owned points)."""
         system = self.model.system
         system.points.update_ghosts(system.x)
@@ -185,7 +241,11 @@ class Simulation:
         for name, value in memory["budget"].items():
             setattr(self.budget, name, float(value))
         self.ledger.measure()
-        self.control.factor, self.control.good = float(memory["factor"]), int(memory["good"])
+        self.control.restore(memory)
+        self.estimated_error = float(memory["estimated_error"])
+        system.scheme.restore(arrays, memory["integrator"])
+        if self.local_error is not None:
+            self.local_error.restore(arrays, memory["integrator"])
         while memory["preset"] in self.stepper.presets[1:]:
             self.stepper.next_preset()
         self.stepper.blend = float(memory["blend"])

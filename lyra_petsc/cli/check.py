@@ -56,8 +56,20 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     model, scene, control = simulation.model, simulation.scene, simulation.control
     outline = model.outline
     blocks = int(ranks[:, 2].sum())
-    steps = math.ceil(control.end / control.step - 1e-9)
-    states = 1 + (steps if scene.output.every is None else math.ceil(control.end / scene.output.every - 1e-9))
+    time = scene.time
+    if time.analysis == "static":
+        plan_of_steps = f"load factor to {control.end:g}, first increment {control.step:g}; a state at each"
+    else:
+        steps = math.ceil(control.end / control.step - 1e-9)
+        every = scene.output.every
+        states = 1 + (steps if every is None else math.ceil(control.end / every - 1e-9))
+        plan_of_steps = f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"
+        if time.adaptive:
+            written = "a state at each" if every is None else f"{states} states"
+            plan_of_steps = (
+                f"adaptive to t = {control.end:g} s, {control.smallest:g} to {control.step:g} s, "
+                f"tolerance {time.tolerance:g}; {written}"
+            )
     console = Console(width=None if Console().is_terminal else 100, highlight=False, soft_wrap=True)
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
@@ -72,8 +84,8 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
             f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row",
         ),
         ("memory", f"about {_megabytes(ranks):.0f} MB on the fullest rank, beside Python and PETSc"),
-        ("integrator", scene.time.integrator),
-        ("steps", f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"),
+        ("integrator", time.scheme),
+        ("steps", plan_of_steps),
         ("linear solver", f"{simulation.stepper.preset}: {_solver_options(simulation)}"),
         ("partitioner", model.partitioner),
     ):

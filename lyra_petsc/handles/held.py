@@ -69,16 +69,16 @@ class Held:
             mask[np.ix_(self._vertices[number], self._axes[number])] = True
         return mask
 
-    def targets(self, t0: float, t1: float, out: Array) -> None:
-        """Write the positions [m] prescribed at t1 into ``out`` (n_owned, 3)."""
+    def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
+        """Write the positions [m] prescribed at time ``at`` of the step t0..t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
-            goal = self._motions[number].carried(self._start[number], self._windows[number].start, t1)
+            goal = self._motions[number].carried(self._start[number], self._windows[number].start, at)
             out[np.ix_(self._vertices[number], self._axes[number])] = goal[:, self._axes[number]]
 
-    def velocities(self, t0: float, t1: float, out: Array) -> None:
-        """Write the velocities [m/s] ẋ*(t1) into ``out`` (n_owned, 3)."""
+    def velocities(self, t0: float, t1: float, at: float, out: Array) -> None:
+        """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
-            rate = self._motions[number].velocity(self._start[number], self._windows[number].start, t1)
+            rate = self._motions[number].velocity(self._start[number], self._windows[number].start, at)
             out[np.ix_(self._vertices[number], self._axes[number])] = rate[:, self._axes[number]]
 
     def vertices(self, number: int) -> NDArray[np.int64]:

@@ -142,12 +142,13 @@ class Window:
         slack = 1e-9 * max(t1 - t0, 0.0)
         return t0 >= self.start - slack and t1 <= self.until + slack
 
-    def strength(self, t0: float, t1: float) -> float:
-        """1 within the window, (1 − (t1 − until)/fade)⁴ while it fades, else 0."""
+    def strength(self, t0: float, t1: float, at: float | None = None) -> float:
+        """1 within the window, (1 − (t − until)/fade)⁴ at t = ``at`` (t1) while it fades, else 0."""
         if self.holds(t0, t1):
             return 1.0
+        time = t1 if at is None else at
         if self.fade > 0.0 and t1 > self.until and t0 >= self.start:
-            return max(0.0, 1.0 - (t1 - self.until) / self.fade) ** 4
+            return max(0.0, min(1.0, 1.0 - (time - self.until) / self.fade)) ** 4
         return 0.0
 
     def events(self) -> list[float]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, PlainValidator, field_validator
+from pydantic import Field, PlainValidator, field_validator, model_validator
+from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.values import Count, Flag, Positive, number, problem, shown
+from lyra_petsc.scene.values import Count, Flag, Fraction, Positive, StepLength, number, problem, shown
 
-INTEGRATORS = ("beuler", "semi-implicit")
-LATER_INTEGRATORS = ("midpoint", "alpha2", "bdf2")
-WHAT_IS_THERE = f"there is: end and step in seconds, integrator {' or '.join(INTEGRATORS)}"
+INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "alpha2", "bdf2")
+ANALYSES = ("dynamic", "static")
+TOLERANCE = 1e-3
+SPECTRAL_RADIUS = 0.5
+LOAD_STEP = 0.25
 FIELDS = (
     "velocity",
     "green_strain",
@@ -25,42 +28,95 @@ FIELDS = (
 )
 
 
+def _word_of(value: Any, known: tuple[str, ...]) -> Any:
+    if value not in known:
+        raise problem(f"must be one of {', '.join(known)}, not {shown(value)}")
+    return value
+
+
 class Time(Block):
-    """Time stepping.
+    """Time stepping, or the way to an equilibrium.
 
     Attributes
     ----------
+    analysis : str
+        ``dynamic``: a motion in time; ``static``: the equilibrium under the loads, which grow with a
+        load factor from 0 to 1 that takes the place of time.
     end : float [s]
-    step : float [s]
-        Nominal and largest Δt.
-    integrator : str
-        ``beuler`` (full Newton) or ``semi-implicit`` (one linear solve a step).
+        1 in a static analysis.
+    step : float [s] or "auto"
+        Nominal and largest Δt; ``auto``: as the tolerance asks. In a static analysis the first
+        increment of the load factor.
+    tolerance : float or None
+        With ``step: auto``: error in the positions that the steps may add up to by the end, as a fraction
+        of the diagonal of the rest shape's bounding box.
+    integrator : str or None
+        ``beuler`` (first order, full Newton), ``semi-implicit`` (one linear solve a step), ``midpoint``,
+        ``alpha2`` (generalised-α), ``bdf2`` (second order); None in a static analysis.
+    spectral_radius : float or None
+        Of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
     """
 
-    not_yet: ClassVar[dict[str, str]] = {
-        "analysis": f"static analysis is not there yet; {WHAT_IS_THERE}",
-        "tolerance": f"adaptive steps are not there yet; {WHAT_IS_THERE}",
-    }
-
+    analysis: Literal["dynamic", "static"] = "dynamic"
     end: Positive
-    step: Positive
-    integrator: Literal["beuler", "semi-implicit"] = "beuler"
+    step: StepLength
+    tolerance: Positive | None = None
+    integrator: Literal["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"] | None = None
+    spectral_radius: Fraction | None = None
+
+    @property
+    def scheme(self) -> str:
+        """Name of the time scheme: the integrator, or ``static``."""
+        return self.integrator or "static"
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the step length follows a tolerance."""
+        return self.step == "auto"
 
     @classmethod
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
-        """Refuse ``step: auto`` in words: a number is what it takes."""
+        """Defaults that depend on the analysis and on the integrator."""
+        if data.get("analysis") == "static":
+            return {"end": 1.0, "step": LOAD_STEP, **data}
+        data = {"integrator": "beuler", **data}
         if data.get("step") == "auto":
-            raise problem(f"adaptive steps are not there yet; {WHAT_IS_THERE}", "step")
+            data.setdefault("tolerance", TOLERANCE)
+        if data["integrator"] == "alpha2":
+            data.setdefault("spectral_radius", SPECTRAL_RADIUS)
         return data
+
+    @field_validator("analysis", mode="before")
+    @classmethod
+    def _known_analysis(cls, value: Any) -> Any:
+        return _word_of(value, ANALYSES)
 
     @field_validator("integrator", mode="before")
     @classmethod
-    def _there(cls, value: Any) -> Any:
-        if value in LATER_INTEGRATORS:
-            raise problem(f"{value} is not there yet; {WHAT_IS_THERE}")
-        if value not in INTEGRATORS:
-            raise problem(f"must be one of {', '.join(INTEGRATORS)}, not {shown(value)}")
-        return value
+    def _known_integrator(cls, value: Any) -> Any:
+        return value if value is None else _word_of(value, INTEGRATORS)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.analysis == "static":
+            for name in self.given("integrator", "tolerance", "spectral_radius"):
+                raise problem("has no meaning in a static analysis; leave it out", name)
+            if self.end != 1.0:
+                raise problem("is 1 in a static analysis (the full load); leave it out", "end")
+            if self.step == "auto" or self.step > 1.0:
+                raise problem(
+                    f"is the first increment of the load factor, at most 1, not {shown(self.step)}", "step"
+                )
+            return self
+        if self.tolerance is not None and not self.adaptive:
+            raise problem("is for step: auto; with a fixed step leave it out", "tolerance")
+        if self.tolerance is not None and self.tolerance >= 1.0:
+            raise problem(f"is a fraction of the sheet's size, below 1, not {self.tolerance:g}", "tolerance")
+        if self.spectral_radius is not None and self.integrator != "alpha2":
+            raise problem(
+                f"is for integrator: alpha2; {self.integrator} has none, leave it out", "spectral_radius"
+            )
+        return self
 
 
 class Checkpoint(Block):

@@ -141,6 +141,10 @@ class Scene(Block):
                     i,
                     "motion",
                 )
+        if self.time.analysis == "static" and self.initial is not None:
+            for name in ("velocity", "angular_velocity"):
+                if any(getattr(self.initial, name)):
+                    raise problem("has no meaning in a static analysis; leave it out", "initial", name)
         groups: set[str | None] = set()
         for i, material in enumerate(self.material):
             if material.group in groups:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import PlainValidator
 from pydantic_core import PydanticCustomError
@@ -169,9 +169,22 @@ def _bending(value: Any) -> float | Vec3:
     return given
 
 
+def _step_length(value: Any) -> float | str:
+    if value == "auto":
+        return "auto"
+    if isinstance(value, str) and not _reads_as_number(value):
+        raise problem(f"must be a number or auto, not {shown(value)}")
+    step = number(value)
+    if step <= 0:
+        raise problem(f"must be > 0, not {shown(value)}")
+    return step
+
+
 Number = Annotated[float, PlainValidator(number)]
 Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0"))]
 NonNegative = Annotated[float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0"))]
+Fraction = Annotated[float, PlainValidator(_bounded(lambda x: 0 <= x <= 1, "from 0 to 1"))]
+StepLength = Annotated[float | Literal["auto"], PlainValidator(_step_length)]
 Poisson = Annotated[float, PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]"))]
 Until = Annotated[float, PlainValidator(_until)]
 Vector = Annotated[Vec3, PlainValidator(vector)]

@@ -11,6 +11,8 @@ from __future__ import annotations
 from lyra_petsc.solvers.options import Value, is_set
 
 PRESETS: dict[str, dict[str, Value]] = {
+    # what an equilibrium without inertia's help asks for: bending is a millionth of the membrane
+    "direct": {"mat_type": "aij", "ksp_type": "cg", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
     # symmetric sweeps instead of PETSc's Chebyshev default, whose bounds age within a step. No
@@ -31,10 +33,16 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor"})
 """What is used with block storage; every other ``-pc_type`` gets ``aij``."""
 
 
-def candidates(n_vertices: int) -> list[str]:
+DIRECT_UNTIL = 30_000
+"""Vertices up to which an equilibrium is sought with a direct factorisation."""
+
+
+def candidates(n_vertices: int, *, static: bool = False) -> list[str]:
     """Presets to try in order; only ``user`` when the user chose the preconditioner."""
     if is_set("pc_type"):
         return ["user"]
+    if static and n_vertices <= DIRECT_UNTIL:
+        return ["direct", "gamg", "block-jacobi"]
     return ["gamg", "block-jacobi"] if n_vertices >= MULTIGRID_FROM else ["block-jacobi", "gamg"]
 
 

@@ -1,10 +1,10 @@
-"""Which step comes next: the nominal Δt, shortened to land on events and after failures."""
+"""Which step comes next: its length, where it must land, and what a failure or an error makes of it."""
 
 from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 SLACK = 1e-6
 """Fraction of Δt by which a step may differ from its length to avoid an extra tiny one."""
@@ -12,9 +12,13 @@ SLACK = 1e-6
 GROW_AFTER = 2
 """Successful steps after which a shortened Δt is doubled."""
 
+SAFETY = 0.85
+SHRINK, GROW = 0.2, 2.0
+"""By how much a tolerance may change Δt at once; BDF2 is stable up to a factor of 2.4."""
+
 
 class StepControl:
-    """Plans the end of each step.
+    """Plans the end of each step of a nominal length; halved after a failure.
 
     Parameters
     ----------
@@ -50,7 +54,11 @@ class StepControl:
         dt = self.step * self.factor
         target = min(self._next_event(time), self._next_state(time))
         # landing exactly on the event also when it lies a rounding beyond the step
-        return target if target - time <= dt * (1.0 + SLACK) else time + dt
+        return target if target - time <= dt * (1.0 + SLACK) else time + self._part(dt, target - time)
+
+    def _part(self, dt: float, left: float) -> float:
+        """Length of a step that does not reach what lies ``left`` [s] ahead."""
+        return dt
 
     def _next_event(self, time: float) -> float:
         index = bisect.bisect_right(self._events, time + SLACK * self.smallest)
@@ -80,9 +88,69 @@ class StepControl:
         self.factor *= 0.5
         return True
 
-    def succeeded(self) -> None:
+    def succeeded(self, iterations: int) -> None:
         """Let a shortened Δt recover."""
         self.good += 1
         if self.factor < 1.0 and self.good >= GROW_AFTER:
             self.factor = min(1.0, 2.0 * self.factor)
             self.good = 0
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold to go on alike."""
+        return {"factor": self.factor, "good": self.good}
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory."""
+        self.factor, self.good = float(memory["factor"]), int(memory["good"])
+
+
+class ToleranceControl(StepControl):
+    """Chooses Δt such that local errors add up to a tolerance by the end.
+
+    ``step`` is the largest Δt; ``factor`` begins at ``first`` over it.
+    """
+
+    def __init__(
+        self,
+        first: float,
+        step: float,
+        end: float,
+        every: float | None,
+        events: Iterable[float],
+        smallest: float,
+    ) -> None:
+        super().__init__(step, end, every, events, smallest)
+        self.factor = min(1.0, first / step)
+
+    def _part(self, dt: float, left: float) -> float:
+        # two equal steps rather than a full one and a crumb
+        return 0.5 * left if left < 2.0 * dt else dt
+
+    def judge(self, dt: float, ratio: float, order: int) -> bool:
+        """Whether a step of length dt [s] may stand, with its error over what it may be; plans the next.
+
+        A step that cannot be shortened stands whatever its error.
+        """
+        planned = self.factor * self.step
+        allowed = math.inf if ratio == 0.0 else dt * SAFETY * ratio ** (-1.0 / order)
+        stands = ratio <= 1.0 or dt <= self.smallest * (1.0 + SLACK)
+        # a step cut short to land somewhere says nothing against the longer one planned
+        most = max(GROW * dt, planned) if stands else 0.9 * dt
+        self.factor = max(min(max(allowed, SHRINK * dt), most, self.step), self.smallest) / self.step
+        return stands
+
+    def succeeded(self, iterations: int) -> None:
+        """The error alone decides."""
+
+
+class LoadControl(StepControl):
+    """Increments of the load factor: larger after an easy step, halved after a failure.
+
+    ``step`` is the first increment; ``factor`` may grow beyond 1.
+    """
+
+    EASY = 12
+    """Newton iterations of a load step after which the next is twice as large."""
+
+    def succeeded(self, iterations: int) -> None:
+        self.factor *= 2.0 if iterations <= self.EASY else 1.0

@@ -70,16 +70,16 @@ class Newton:
         self._length = self._first_norm = self._at_norm = 0.0
         self._at = (0.0, 0.0)
 
-    def assemble(self, u: PETSc.Vec, shift: float) -> None:
+    def assemble(self, u: PETSc.Vec) -> None:
         """Jacobian, and preconditioning matrix, at velocities u."""
         v = u.getArray(readonly=True).reshape(self._shape)
-        self._matrix.set(self._system.jacobian(v, shift, self._blend.after(self._taken(u))))
+        self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         if self._preconditioner is not self._matrix:
-            self._preconditioner.set(self._system.jacobian(v, shift, 1.0))
+            self._preconditioner.set(self._system.jacobian(v, 1.0))
 
-    def remember(self, u: PETSc.Vec, shift: float) -> None:
+    def remember(self, u: PETSc.Vec) -> None:
         """Note energy and residual of the present iterate, against which trial points are judged."""
-        self._at = self._system.objective(u.getArray(readonly=True).reshape(self._shape), shift)
+        self._at = self._system.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
 
     def _taken(self, u: PETSc.Vec) -> float:
@@ -98,7 +98,7 @@ class Newton:
         residual = self._snes.getFunction()[0]
         while self._useless(residual, y) and self._blend.raise_():
             v = x.getArray(readonly=True).reshape(self._shape)
-            self._matrix.set(self._system.jacobian(v, 1.0 / self._system.dt, self._blend.value))
+            self._matrix.set(self._system.jacobian(v, self._blend.value))
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
             self.more_linear += self._ksp.getIterationNumber()
@@ -118,14 +118,13 @@ class Newton:
     def objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
         """Energy of a trial point; where differences drown in round-off, judged by its residual."""
         v = u.getArray(readonly=True).reshape(self._shape)
-        sigma = 1.0 / self._system.dt
-        value, size = self._system.objective(v, sigma)
+        value, size = self._system.objective(v)
         here, here_size = self._at
         noise = ENERGY_ROUNDOFF * max(size, here_size)
         if value == here or not abs(value - here) < noise:
             return value
         trial = np.empty(self._shape)
-        self._system.residual(v, sigma * (v - self._system.v[: self._shape[0]]), sigma, trial)
+        self._system.residual(v, self._system.stage.sigma * (v - self._system.history), trial)
         square = self._system.points.comm.allreduce(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._at_norm)
         return here - noise if smaller else here + noise
@@ -147,7 +146,7 @@ class Newton:
             return None
         if residual <= rtol * self._first_norm:
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.dt
+        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
         forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
         scale = float(np.sqrt(forces.max()))
         if (

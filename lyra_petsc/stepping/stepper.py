@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import Value, fill_gaps, is_set
@@ -36,12 +37,18 @@ class Attempt:
     at_roundoff: bool = False
 
 
+FIRST_OF_ALL = 1e-3
+"""First Δt of an adaptive run over its length; the estimate corrects it at once."""
+
 TRUE_NORM = ("cg", "fcg", "pipecg", "groppcg")
 """Krylov methods that can watch the true residual with left preconditioning."""
 
 
 class Stepper:
-    """Backward Euler by TSBEULER on the reduced system.
+    """Each step's stage by TSBEULER or TSTHETA on the reduced system.
+
+    TSBDF and TSALPHA2 keep their histories where neither a checkpoint nor a changed linear solver reaches
+    them; ours are in the scheme, and TS solves for the stage.
 
     Parameters
     ----------
@@ -75,8 +82,8 @@ class Stepper:
     ) -> None:
         self._scene, self._system, self._pattern = scene, system, pattern
         self._spacing, self._floor = spacing, floor
-        self._iterates = scene.time.integrator != "semi-implicit"
-        self.presets = candidates(system.points.n_global)
+        self._iterates = scene.time.scheme != "semi-implicit"
+        self.presets = candidates(system.points.n_global, static=scene.time.scheme == "static")
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
@@ -87,7 +94,8 @@ class Stepper:
     # -- objects -------------------------------------------------------------------------------------
 
     def _create(self) -> None:
-        points, scene = self._system.points, self._scene
+        system, scene = self._system, self._scene
+        points = system.points
         self.preset = self.presets[0]
         self._fill(options_of(self.preset, PETSc.Options().getString("pc_type", "")))
         self.matrix = SystemMatrix(points, self._pattern, "baij")
@@ -100,11 +108,13 @@ class Stepper:
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
-        ts.setType(PETSc.TS.Type.BEULER)
+        ts.setType(system.scheme.ts_type)
+        if system.scheme.ts_type == "theta":
+            ts.setTheta(0.5)
         ts.setIFunction(self._ifunction, self.residual)
         ts.setIJacobian(self._ijacobian, self.matrix.mat, self.preconditioner.mat)
         ts.setMaxTime(scene.time.end)
-        ts.setTimeStep(scene.time.step)
+        ts.setTimeStep(FIRST_OF_ALL * scene.time.end if scene.time.step == "auto" else scene.time.step)
         ts.setMaxSteps(np.iinfo(PETSc.IntType).max - 1)
         ts.setMaxSNESFailures(1)
         ts.setErrorIfStepFails(False)
@@ -162,16 +172,15 @@ class Stepper:
 
     def _refuse_contradictions(self) -> None:
         kind = self.ts.getType()
-        if kind != "beuler":
+        if kind != self._system.scheme.ts_type:
             raise InputError(
-                f"'{kind}' is not a time scheme of this program; choose time.integrator in the scene "
-                "(beuler, semi-implicit) and leave -ts_type out",
+                f"'{kind}' is not what solves the steps of this scene; choose time.integrator in the scene "
+                f"({', '.join(INTEGRATORS)}) and leave -ts_type out",
                 key="-ts_type",
             )
-        if is_set("ts_theta_endpoint"):
-            raise InputError(
-                "has no meaning for the reduced velocity form; leave it out", key="-ts_theta_endpoint"
-            )
+        for name in ("ts_theta_endpoint", "ts_theta_theta"):
+            if is_set(name):
+                raise InputError("has no meaning for the reduced velocity form; leave it out", key=f"-{name}")
         if PETSc.Options().getString("ts_adapt_type", "none") != "none":
             raise InputError("TS cannot judge steps of the reduced form; leave it out", key="-ts_adapt_type")
 
@@ -210,10 +219,13 @@ class Stepper:
         """Try the step from t0 to t1 [s]; on success the system holds the new state; collective."""
         system = self._system
         system.begin_step(t0, t1)
-        self.velocity.setArray(system.v[: self._shape[0]].ravel())
+        self.velocity.setArray(system.history.ravel())
         number = self.ts.getStepNumber()
-        self.ts.setTime(t0)
-        self.ts.setTimeStep(t1 - t0)
+        # a TS step that ends where its stage shall be, with the shift that the scheme wants
+        theta = 0.5 if system.scheme.ts_type == "theta" else 1.0
+        length = 1.0 / (theta * system.stage.sigma)
+        self.ts.setTime(t0 + system.stage.after - theta * length)
+        self.ts.setTimeStep(length)
         self._newton.begin_step()
         try:
             self.ts.step()
@@ -231,13 +243,18 @@ class Stepper:
         if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
             if system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0:
+                if theta < 1.0:
+                    velocity = (1.0 - theta) * system.history + theta * velocity
                 system.accept(velocity)
+                self.velocity.setArray(system.v[: self._shape[0]].ravel())
                 self.ts.setTime(t1)
+                self.ts.setTimeStep(t1 - t0)
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
         else:
             words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
             self._linear_failed = reasons.preconditioner_failed(self.ksp)
         self.ts.setTime(t0)
+        self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
         return Attempt(False, newton, linear, self._newton.norm, words, advice)
@@ -268,7 +285,7 @@ class Stepper:
             udot.getArray(readonly=True).reshape(self._shape),
         )
         out = f.getArray().reshape(self._shape)
-        self._system.residual(v, rate, 1.0 / self._system.dt, out)
+        self._system.residual(v, rate, out)
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         self._system.first_guess(u.getArray().reshape(self._shape))
@@ -276,7 +293,7 @@ class Stepper:
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
     ) -> bool:
-        self._newton.assemble(u, shift)
+        self._newton.assemble(u)
         if self._iterates:
-            self._newton.remember(u, shift)
+            self._newton.remember(u)
         return True

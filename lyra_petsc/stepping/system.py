@@ -1,16 +1,20 @@
 """The reduced implicit system of one step: residual, Jacobian and objective in the velocities.
 
-Unknown v (the velocity of the step), x = x_n + v/σ with σ the shift of the time scheme::
+Unknown v (the velocity of the scheme's stage), with the scheme's history x_h, v_h and numbers σ, c::
 
-    F(v, v̇) = M v̇ + ∇E(x_n + v/σ) + D v + ∇P(v) − f        Jacobian  σ M + K/σ + D + ∇∇P
+    F(v, v̇) = M v̇ + ∇E(x_h + c v) + D v + ∇P(v) − f,  v̇ = σ (v − v_h)       Jacobian  σ M + c K + D + ∇∇P
 
-with the elastic energy E, damping D = γ K⁺(x_n), the wind's potential P and the loads f. For backward
-Euler it is the gradient of ``objective``. Source: the Lyra paper, eq. 10-18, as a Newton iteration.
+with the elastic energy E, damping D = γ K⁺, the wind's potential P and the loads f. It is the gradient
+of ``objective``. Backward Euler has x_h = x_n, v_h = v_n, σ = 1/c = 1/Δt: the Lyra paper, eq. 10-18, as
+a Newton iteration. The geometry of D, P and f is frozen during a step: at x_n for first-order schemes,
+at the extrapolated stage x_n + (t_s − t_n) v_n for second-order ones.
 
 Arrays only: no PETSc here. Collective where sums over ranks are returned.
 """
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -19,10 +23,25 @@ from numpy.typing import NDArray
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
+from lyra_petsc.stepping.schemes import Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+
+class Follower(Protocol):
+    """What depends on the accelerations at the start of a step, in part."""
+
+    @property
+    def needs_acceleration(self) -> bool:
+        """Whether it must be told them."""
+
+    def start_from(self, acceleration: Array) -> None:
+        """Take them, (n_owned, 3) [m/s²]."""
+
+    def disturbed(self) -> None:
+        """Forces jump at the start of the coming step."""
 
 
 class ReducedSystem:
@@ -35,10 +54,11 @@ class ReducedSystem:
     elastic, viscous, loads : lists of terms
     held : Held
     blocks : BlockRows
+    scheme : Scheme
     starts : list of float
         Times [s] at which handles start to act.
-    explicit_wind : bool
-        Velocity-dependent loads at (x_n, v_n) instead of implicitly (``semi-implicit``).
+    events : list of float
+        Times [s] at which forces may jump.
 
     Attributes
     ----------
@@ -47,7 +67,15 @@ class ReducedSystem:
     mask : (n_local, 3) bool
         Prescribed coordinates of the step.
     anchored : float
-        Energy [J] of this rank's clamps at the start of the step, against where they stand at its end.
+        Energy [J] of this rank's clamps at the start of the step, against where they stand at its stage.
+    dt, t0, t1 : float
+        Length, start and end of the step [s].
+    followers : list of Follower
+        Who must hear of jumps and of the accelerations after them: the scheme, an error estimate.
+    load_factor : float
+        Factor on all loads (1 in a motion).
+    unbalanced : (n_owned, 3) or None
+        Force [N] of the start shape that a static analysis lets go of with the load factor.
     """
 
     def __init__(
@@ -60,25 +88,31 @@ class ReducedSystem:
         held: Held,
         blocks: BlockRows,
         *,
+        scheme: Scheme,
         starts: list[float],
-        explicit_wind: bool,
+        events: list[float],
     ) -> None:
-        self.points, self.mass = points, mass
+        self.points, self.mass, self.scheme = points, mass, scheme
         self.elastic, self.viscous, self.loads, self.held = elastic, viscous, loads, held
         self._blocks = blocks
         self._starts = sorted(set(starts))
         self._begun: set[float] = set()
         self.late_starts: dict[float, Array] = {}
-        self._explicit = explicit_wind
+        self._events = events
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
-        self._damped = [t for t in elastic if t.damped and np.any(t.elements.data["damping"])]
+        self._damped = [
+            t for t in elastic if scheme.moves and t.damped and np.any(t.elements.data["damping"])
+        ]
         self.damped = bool(points.comm.allreduce(len(self._damped), MPI.MAX))
         self._damping = blocks.zeros() if self.damped else None
         self._values = blocks.zeros()
         n_local, n_owned = points.n_local, points.n_owned
         self.x, self.v = np.zeros((n_local, 3)), np.zeros((n_local, 3))
         self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(3))
+        self._xh = self.x
+        self._vh = self.v[:n_owned]
+        self.stage = Stage(1.0, 1.0, 1.0)
         self._force = np.zeros((n_local, 3))
         self.mask: Mask = np.zeros((n_local, 3), dtype=bool)
         self._free: Mask = ~self.mask[:n_owned]
@@ -90,6 +124,9 @@ class ReducedSystem:
         self._energy_scales: list[Array] = []
         self.dt = 0.0
         self.t0 = self.t1 = 0.0
+        self.followers: list[Follower] = [scheme]
+        self.load_factor = 1.0
+        self.unbalanced: Array | None = None
 
     def begin(self, time: float) -> None:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
@@ -123,34 +160,66 @@ class ReducedSystem:
     def begin_step(self, t0: float, t1: float) -> None:
         """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
+        after = self.scheme.stage_after(self.dt)
+        self._hold(t0, t1)
+        self._freeze(t0 + after)
+        if t0 in self._events:
+            self._disturb()
+        self._tell_accelerations()
         n = self.points.n_owned
-        self._constrain(t0, t1)
+        self.stage = stage = self.scheme.stage(self.x[:n], self.v[:n], self.dt)
+        self._vh = self.v[:n].copy() if stage.v is None else stage.v
+        self._set_history(stage, t0 + after)
+        self.anchored = self._clamped()
+
+    def _disturb(self) -> None:
+        for follower in self.followers:
+            follower.disturbed()
+
+    def _tell_accelerations(self) -> None:
+        asking = [follower for follower in self.followers if follower.needs_acceleration]
+        if asking:
+            acceleration = self.out_of_balance()[0] / self.mass[:, None]
+            for follower in asking:
+                follower.start_from(acceleration)
+
+    def _freeze(self, at: float) -> None:
+        """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
+        n, t0, t1 = self.points.n_owned, self.t0, self.t1
         for term in self.elastic:
-            term.prepare(t0, t1)
-        self.anchored = sum(float(t.energies(self.x).sum()) for t in self.elastic if t.name == "clamp")
+            term.prepare(t0, t1, at)
         reach = float(np.abs(self.x).max(initial=0.0))
         self._energy_scales = [reach * term.force_scale(reach)[: term.n_owned] for term in self.elastic]
+        x = self.x
+        if self.scheme.centred and (self.viscous or self.loads or self._damped):
+            x = x + (at - t0) * self.v
         self._force[:] = 0.0
         for load in self.loads:
-            load.add_force(self.x, t0, t1, self._force)
+            load.add_force(x, t0, t1, self._force)
         for wind in self.viscous:
-            wind.freeze(self.x, self.v)
-            if self._explicit:
+            wind.freeze(x, self.v)
+            if self.scheme.explicit:
                 push = np.zeros_like(self._force)
                 wind.add_gradient(self.v, push)
                 self._force -= push
         self._force[n:] = 0.0
+        self._force *= self.load_factor
+        if self.unbalanced is not None:
+            self._force[:n] += (1.0 - self.load_factor) * self.unbalanced
         if self._damping is not None:
             self._damping[:] = 0.0
             for damped in self._damped:
-                self._add_stiffness(damped, self.x, 1.0, damped.elements.data["damping"], self._damping)
+                self._add_stiffness(damped, x, 1.0, damped.elements.data["damping"], self._damping)
 
-    def _constrain(self, t0: float, t1: float) -> None:
+    def _hold(self, t0: float, t1: float) -> None:
+        """Which coordinates are prescribed in the step, and where they stand at its end."""
         n = self.points.n_owned
         if not self.held:
             return
         active = self.held.active(t0, t1)
         if active != self._active:
+            if self._active is not None:
+                self._disturb()
             self._active = active
             # ranks own different vertices of a handle, but all agree on which handles hold
             flags = np.zeros((self.points.n_local, 3))
@@ -160,21 +229,64 @@ class ReducedSystem:
             self._free = ~self.mask[:n]
             self._held_rows = self._blocks.rows_beside(self.mask)
         self._goal[:] = self.x[:n]
-        self.held.targets(t0, t1, self._goal)
-        self._prescribed = np.where(self._free, 0.0, (self._goal - self.x[:n]) / self.dt)
+        self.held.targets(t0, t1, t1, self._goal)
+
+    def _set_history(self, stage: Stage, at: float) -> None:
+        """x_h with its ghosts, and the velocities of the prescribed coordinates."""
+        n = self.points.n_owned
+        given = bool(self.held) and self.scheme.given
+        if stage.x is None and not given:
+            self._xh = self.x
+        else:
+            self._xh = np.empty_like(self.x)
+            self._xh[:n] = self.x[:n] if stage.x is None else stage.x
+        if self.held:
+            if given:
+                position, rate = self.x[:n].copy(), self.v[:n].copy()
+                self.held.targets(self.t0, self.t1, at, position)
+                self.held.velocities(self.t0, self.t1, at, rate)
+                np.copyto(self._xh[:n], position - stage.reach * rate, where=~self._free)
+            else:
+                rate = (self._goal - self._xh[:n]) / stage.reach
+            self._prescribed = np.where(self._free, 0.0, rate)
+        if self._xh is not self.x:
+            self.points.update_ghosts(self._xh)
+
+    def out_of_balance(self) -> tuple[Array, float]:
+        """Force (n_owned, 3) [N] on the free coordinates at the start of the step, and the norm [N] of the
+        largest part of it; collective."""
+        parts = self._parts(self.x, self.v, np.zeros_like(self._vh))
+        squares = self.points.comm.allreduce(np.array([self._norm(part) for part in parts.values()]))
+        return np.where(self._free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
+
+    @property
+    def stage_velocity(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
+        return self._vs[: self.points.n_owned]
+
+    @property
+    def history(self) -> Array:
+        """The stage's v_h (n_owned, 3) [m/s]."""
+        return self._vh
 
     def first_guess(self, v: Array) -> None:
         """Overwrite v (n_owned, 3) by where Newton starts: prescribed coordinates exactly."""
-        if self._explicit:
-            v[:] = 0.0
+        v[:] = 0.0 if self.scheme.explicit else self.v[: self.points.n_owned]
         np.copyto(v, self._prescribed, where=~self._free)
 
     def accept(self, v: Array) -> None:
-        """Take v (n_owned, 3) as the velocity of the step: x_{n+1} = x_n + Δt v; collective."""
+        """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
         n = self.points.n_owned
-        moved = self.x[:n] + self.dt * v
+        self._evaluate_at(v)  # what the step's forces are taken at afterwards
+        before, rate_before = self.x[:n].copy(), self.v[:n].copy()
+        moved, rate = self.scheme.end(before, rate_before, v, self.dt)
+        given = self.scheme.given
+        self.scheme.accepted(before, rate_before, self._free, self.dt)
         self.x[:n] = np.where(self._free, moved, self._goal)
-        self.v[:n] = v
+        if self.held and given:
+            rate = rate.copy()
+            self.held.velocities(self.t0, self.t1, self.t1, rate)
+        self.v[:n] = rate
         self.points.update_ghosts(self.x)
         self.points.update_ghosts(self.v)
 
@@ -182,28 +294,40 @@ class ReducedSystem:
         """Velocities (n_owned, 3) to write out: those of prescribed coordinates are ẋ*(t)."""
         velocity = self.v[: self.points.n_owned].copy()
         if self.held and self.dt > 0.0:
-            self.held.velocities(self.t0, self.t1, velocity)
+            self.held.velocities(self.t0, self.t1, self.t1, velocity)
         return velocity
 
     # -- what Newton asks for ----------------------------------------------------------------------
 
-    def _stage(self, v: Array, sigma: float) -> tuple[Array, Array]:
+    def _evaluate_at(self, v: Array) -> tuple[Array, Array]:
         """Positions and velocities (n_local, 3) of the stage, ghosts up to date; collective."""
-        n = self.points.n_owned
-        self._vs[:n] = v
+        self._vs[: self.points.n_owned] = v
         self.points.update_ghosts(self._vs)
-        np.multiply(self._vs, 1.0 / sigma, out=self._xs)
-        self._xs += self.x
+        np.multiply(self._vs, self.stage.reach, out=self._xs)
+        self._xs += self._xh
         return self._xs, self._vs
 
-    def forces(self, v: Array, vdot: Array, sigma: float) -> dict[str, Array]:
+    def forces(self, v: Array, vdot: Array) -> dict[str, Array]:
         """The parts of F, unconstrained, each (n_owned, 3) [N]; collective."""
-        x, vs = self._stage(v, sigma)
+        x, vs = self._evaluate_at(v)
         return self._parts(x, vs, vdot)
 
-    def forces_at_end(self, vdot: Array) -> dict[str, Array]:
-        """The parts of F at the state (x, v) just accepted, each (n_owned, 3) [N]."""
-        return self._parts(self.x, self.v, vdot)
+    def forces_at_stage(self) -> dict[str, Array]:
+        """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
+        n = self.points.n_owned
+        return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self._vh))
+
+    def turn_to_end(self) -> float:
+        """Let moving targets stand where the step ends; energy [J] that this gives the rank's clamps."""
+        if self.stage.after == self.dt:
+            return 0.0
+        before = self._clamped()
+        for term in self.elastic:
+            term.prepare(self.t0, self.t1, self.t1)
+        return self._clamped() - before
+
+    def _clamped(self) -> float:
+        return sum(float(term.energies(self.x).sum()) for term in self.elastic if term.name == "clamp")
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
         n = self.points.n_owned
@@ -217,18 +341,18 @@ class ReducedSystem:
         parts["loads"] = -self._force[:n]
         if self._damping is not None:
             parts["damping"] = self._blocks.product(self._damping, vs)
-        if self.viscous and not self._explicit:
+        if self.viscous and not self.scheme.explicit:
             self._gradient[:] = 0.0
             for wind in self.viscous:
                 wind.add_gradient(vs, self._gradient)
             parts["wind"] = self._gradient[:n].copy()
         return parts
 
-    def residual(self, v: Array, vdot: Array, sigma: float, out: Array) -> None:
+    def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
-        parts = self.forces(v, vdot, sigma)
+        parts = self.forces(v, vdot)
         total = sum(parts.values())
-        held = (sigma * self.mass)[:, None] * (v - self._prescribed)
+        held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed)
         out[:] = np.where(self._free, total, held)
         self.force_norms = {name: self._norm(part) for name, part in parts.items()}
 
@@ -236,23 +360,23 @@ class ReducedSystem:
         """Square of the norm over this rank's free coordinates."""
         return float(np.sum(part * part, where=self._free))
 
-    def jacobian(self, v: Array, sigma: float, blend: float) -> Array:
-        """Block rows (n_blocks, 3, 3) of σ M + K/σ + D + ∇∇P, prescribed coordinates decoupled.
+    def jacobian(self, v: Array, blend: float) -> Array:
+        """Block rows (n_blocks, 3, 3) of σ M + c K + D + ∇∇P, prescribed coordinates decoupled.
 
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
-        x, vs = self._stage(v, sigma)
+        x, vs = self._evaluate_at(v)
         values = self._values
         if self._damping is not None:
             values[:] = self._damping
         else:
             values[:] = 0.0
         for term in self.elastic:
-            self._add_stiffness(term, x, blend, 1.0 / sigma, values)
-        if not self._explicit:
+            self._add_stiffness(term, x, blend, self.stage.reach, values)
+        if not self.scheme.explicit:
             for wind in self.viscous:
                 self._add_wind(wind, vs, values)
-        self._blocks.add_diagonal(sigma * self.mass, values)
+        self._blocks.add_diagonal(self.stage.sigma * self.mass, values)
         if len(self._held_rows):
             self._blocks.constrain(values, self.mask, self._held_rows)
         return values
@@ -265,16 +389,16 @@ class ReducedSystem:
     def _add_wind(self, wind: Viscous, v: Array, values: Array) -> None:
         self._blocks.add(wind.name, lambda lo, hi, out: wind.hessians(v, lo, hi, out), 1.0, values)
 
-    def objective(self, v: Array, sigma: float) -> tuple[float, float]:
-        """The function whose gradient F is (backward Euler), and what its round-off is relative to [W].
+    def objective(self, v: Array) -> tuple[float, float]:
+        """The function whose gradient F is, and what its round-off is relative to [W].
 
         Collective. The latter is the size of its summands, and for each elastic energy the root of itself
         times the energy at which strains are of order one: small strains are small differences of large
         coordinates.
         """
-        n = self.points.n_owned
-        x, vs = self._stage(v, sigma)
-        change = v - self.v[:n]
+        n, sigma, rate = self.points.n_owned, self.stage.sigma, 1.0 / self.stage.reach
+        x, vs = self._evaluate_at(v)
+        change = v - self._vh
         inertia = 0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))
         energies, square = [], 0.0
         for term, scale in zip(self.elastic, self._energy_scales, strict=True):
@@ -282,12 +406,12 @@ class ReducedSystem:
             energies.append(float(each.sum()))
             square += 2.0 * float(np.vdot(each, scale))
         work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
-        parts = [inertia, *(sigma * e for e in energies), -sigma * work]
+        parts = [inertia, *(rate * e for e in energies), -rate * work]
         if self._damping is not None:
             parts.append(0.5 * float(np.vdot(v, self._blocks.product(self._damping, vs))))
-        if not self._explicit:
+        if not self.scheme.explicit:
             parts += [float(wind.potentials(vs).sum()) for wind in self.viscous]
-        local = np.array([sum(parts), sum(abs(part) for part in parts), sigma * sigma * square])
+        local = np.array([sum(parts), sum(abs(part) for part in parts), rate * rate * square])
         value, size, square = self.points.comm.allreduce(local)
         return float(value), float(size) + float(np.sqrt(square))
 

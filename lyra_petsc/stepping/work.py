@@ -52,6 +52,7 @@ class Ledger:
             if load.name == "gravity":
                 load.add_force(system.x, 0.0, 0.0, self._weight)
         self._anchored = 0.0
+        self._pull = np.zeros_like(self.reaction)
         self.measure()
 
     def measure(self) -> Budget:
@@ -78,26 +79,27 @@ class Ledger:
         )
         return budget
 
-    def record(self, x_before: Array, v_before: Array) -> Budget:
-        """Add the works of the step just accepted; x, v (n_owned, 3) at its start."""
+    def record(self, x_before: Array) -> Budget:
+        """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
         n, dt = system.points.n_owned, system.dt
-        v, x = system.v[:n], system.x[:n]
-        # residual at the new state, reached from the old one: v = v_{n+1}, v̇ = (v − v_n)/Δt
-        parts = system.forces_at_end((v - v_before) / dt)
+        x = system.x[:n]
+        parts = system.forces_at_stage()
         self.reaction = sum(parts.values())  # type: ignore[assignment]
         self.reaction[~system.mask[:n]] = 0.0
         moved = x - x_before
-        external = -parts["loads"] - self._weight[:n] + self.reaction
+        external = -parts["loads"] - system.load_factor * self._weight[:n] + self.reaction
         if "wind" in parts:
             external -= parts["wind"]
         if "springs" in parts:
             external -= parts["springs"]
+        if not system.scheme.moves:  # the way to an equilibrium has no stage in its middle
+            external, self._pull = 0.5 * (external + self._pull), external
         # a clamp's plane turns with its handle, which works on the sheet through it
-        turned = system.anchored - self._anchored
+        turned = system.anchored - self._anchored + system.turn_to_end()
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         if "damping" in parts:
-            local[1] = dt * float(np.vdot(v, parts["damping"]))
+            local[1] = dt * float(np.vdot(system.stage_velocity, parts["damping"]))
         work, heat = system.points.comm.allreduce(local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)

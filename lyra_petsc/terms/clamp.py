@@ -94,13 +94,13 @@ class Clamp(Elastic):
             along = ((opposite - tail) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
             self._start[mine] = 2.0 * (tail + along[:, None] * edge) - opposite
 
-    def prepare(self, t0: float, t1: float) -> None:
+    def prepare(self, t0: float, t1: float, at: float) -> None:
         for number, (motion, window) in self._handles.items():
             mine = self._handle == number
             holds = window.holds(t0, t1)
             self._k[mine] = self.elements.data["k"][mine] if holds else 0.0
             # also while it does not hold: the angle of k = 0 must stay a number
-            self._mirror[mine] = motion.carried(self._start[mine], window.start, t1)
+            self._mirror[mine] = motion.carried(self._start[mine], window.start, at)
 
     def energies(self, x: Array) -> Array:
         out = np.empty(self.n_owned)

@@ -51,13 +51,13 @@ class Spring(Pulling):
                 mine = self._handle == number
                 self._start[mine] = x[self.stencil[mine, 0]]
 
-    def prepare(self, t0: float, t1: float) -> None:
+    def prepare(self, t0: float, t1: float, at: float) -> None:
         for number, (motion, window, fading_only) in self._handles.items():
             mine = self._handle == number
-            strength = 0.0 if fading_only and window.holds(t0, t1) else window.strength(t0, t1)
+            strength = 0.0 if fading_only and window.holds(t0, t1) else window.strength(t0, t1, at)
             self._k[mine] = strength * self.elements.data["stiffness"][mine]
             if strength > 0.0:
-                self._target[mine] = motion.carried(self._start[mine], window.start, t1)
+                self._target[mine] = motion.carried(self._start[mine], window.start, at)
 
     def _pull(self, x: Array) -> Array:
         change: Array = x[self.stencil[:, 0]] - self._target

@@ -61,8 +61,8 @@ class Elastic(Term):
     def begin(self, time: float, x: Array) -> None:
         """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""
 
-    def prepare(self, t0: float, t1: float) -> None:
-        """Set what depends on time for the step from t0 to t1 [s] (moving targets)."""
+    def prepare(self, t0: float, t1: float, at: float) -> None:
+        """Let moving targets stand where they are at time ``at`` of the step from t0 to t1 [s]."""
 
 
 class Pulling(Elastic):

@@ -57,7 +57,7 @@ def bent_state(simulation: Simulation) -> tuple[Array, Array]:
 def residual(simulation: Simulation, v: Array) -> Array:
     system = simulation.system
     out = np.empty_like(v)
-    system.residual(v, (v - system.v[: len(v)]) / DT, 1.0 / DT, out)
+    system.residual(v, (v - system.v[: len(v)]) / DT, out)
     return out
 
 
@@ -79,7 +79,7 @@ def largest(comm: MPI.Comm, values: Array) -> float:
 def test_matrix_is_the_derivative_of_the_residual(comm: MPI.Comm, kind: str) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        values = simulation.system.jacobian(v, 1.0 / DT, 0.0)
+        values = simulation.system.jacobian(v, 0.0)
         database = PETSc.Options()
         before = database.getString("mat_type", "")
         database.setValue("mat_type", kind)
@@ -111,7 +111,7 @@ def test_matrix_is_the_derivative_of_the_residual(comm: MPI.Comm, kind: str) -> 
 def test_formats_agree_and_the_matrix_is_symmetric(comm: MPI.Comm, blend: float) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        values = simulation.system.jacobian(v, 1.0 / DT, blend).copy()
+        values = simulation.system.jacobian(v, blend).copy()
         products = []
         database = PETSc.Options()
         before = database.getString("mat_type", "")
@@ -143,7 +143,7 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
         h = 1e-3
 
         def value(step: float) -> float:
-            return simulation.system.objective(v + step * d, 1.0 / DT)[0]
+            return simulation.system.objective(v + step * d)[0]
 
         numeric = (8.0 * (value(h) - value(-h)) - (value(2 * h) - value(-2 * h))) / (12.0 * h)
         slope = comm.allreduce(float(np.vdot(residual(simulation, v), d)))
@@ -153,7 +153,7 @@ def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
 def test_product_of_rows_needs_no_petsc(comm: MPI.Comm) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        values = simulation.system.jacobian(v, 1.0 / DT, 0.0)
+        values = simulation.system.jacobian(v, 0.0)
         simulation.stepper.matrix.set(values)
         points = simulation.model.points
         local = np.zeros((points.n_local, 3))

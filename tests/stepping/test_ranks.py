@@ -53,9 +53,9 @@ def outcome(
         ledger = Ledger(simulation.system)
         n = simulation.system.points.n_owned
         for _ in range(steps):
-            x, v = simulation.system.x[:n].copy(), simulation.system.v[:n].copy()
+            x = simulation.system.x[:n].copy()
             simulation.step(0.01)
-            ledger.record(x, v)
+            ledger.record(x)
         return simulation.x, simulation.v, list(vars(ledger.budget).values())
 
 

@@ -116,7 +116,7 @@ def test_is_a_term_of_one_known_kind(term: Term, name: str) -> None:
 @pytest.fixture
 def elastic(term: Term) -> Elastic:
     assert isinstance(term, Elastic)
-    term.prepare(0.0, 0.01)
+    term.prepare(0.0, 0.01, 0.01)
     return term
 
 
@@ -206,7 +206,7 @@ def test_force_scale_bounds_the_round_off_of_the_force(term: Term, simulation: S
     x = simulation.system.x + far
     term.begin(0.0, x)  # springs and clamps set out from where they stand
     before = term.force_scale(far + 1.0)
-    term.prepare(0.0, 0.01)
+    term.prepare(0.0, 0.01, 0.01)
     np.testing.assert_array_equal(term.force_scale(far + 1.0), before)
     assert np.all(before > 0.0)
     scale = term.force_scale(far + 1.0)

@@ -1,0 +1,122 @@
+"""Static equilibrium at a load factor, by proximal steps: backward Euler from rest with growing Δτ.
+
+Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian where the
+shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy, until
+the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
+are taken anew before every solve.
+
+Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.schemes import Static
+from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.stepping.system import ReducedSystem
+
+Array = NDArray[np.float64]
+
+MOST_SOLVES = 100
+"""Proximal steps after which a load step is given up."""
+
+EASY, FAIR = 6, 15
+"""Newton iterations up to which Δτ grows fast, and up to which it grows."""
+
+GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
+
+
+class Equilibrium:
+    """Finds the equilibrium at one load factor after another; collective.
+
+    Parameters
+    ----------
+    system : ReducedSystem
+        With the scheme `Static`; its positions are the start shape.
+    stepper : Stepper
+    tolerances : Solver
+    spacing : float
+        Mean edge length [m].
+    floor : float
+        Norm [N] of the residual's round-off.
+    """
+
+    def __init__(
+        self, system: ReducedSystem, stepper: Stepper, tolerances: Solver, spacing: float, floor: float
+    ) -> None:
+        assert isinstance(system.scheme, Static)
+        self._system, self._stepper, self._scheme = system, stepper, system.scheme
+        self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
+        self._first = True
+        system.load_factor = 0.0
+        system.begin_step(0.0, 0.0)
+        force, _ = system.out_of_balance()
+        self._scale = self._norm(force)
+        if self._scale > floor:
+            system.unbalanced = force
+
+    def attempt(self, before: float, factor: float) -> Attempt:
+        """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""
+        system, n = self._system, self._system.points.n_owned
+        x = system.x[:n].copy()
+        system.load_factor = factor
+        newton = linear = solves = 0
+        anchored = 0.0
+        attempt = Attempt(False, 0, 0, 0.0)
+        while solves < MOST_SOLVES:
+            force = self._out_of_balance(before, factor)
+            anchored = anchored if solves else system.anchored
+            if solves and attempt.converged and force <= self._allowed():
+                system.anchored = anchored
+                return dataclasses.replace(
+                    attempt, newton_iterations=newton, linear_iterations=linear, residual=force
+                )
+            attempt = self._stepper.attempt(before, factor)
+            solves += 1
+            newton += attempt.newton_iterations
+            linear += attempt.linear_iterations
+            if attempt.converged:
+                self._scheme.pseudo *= growth(attempt.newton_iterations)
+            elif self._stepper.linear_solver_failed:
+                break
+            else:
+                self._scheme.pseudo *= SHRINK
+        system.x[:n] = x
+        system.points.update_ghosts(system.x)
+        words = attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps"
+        return dataclasses.replace(
+            attempt, converged=False, newton_iterations=newton, linear_iterations=linear, words=words
+        )
+
+    def _out_of_balance(self, before: float, factor: float) -> float:
+        """Norm [N] of the force at the present shape; with it, Δτ for the first solve of all."""
+        system = self._system
+        system.begin_step(before, factor)
+        force, largest = system.out_of_balance()
+        norm = self._norm(force)
+        self._scale = max(self._scale, largest)
+        if self._first and norm > 0.0:
+            self._first = False
+            fastest = float(np.abs(force / system.mass[:, None]).max(initial=0.0))
+            fastest = system.points.comm.allreduce(fastest, MPI.MAX)
+            self._scheme.pseudo = float(np.sqrt(self._spacing / fastest))
+        return norm
+
+    def _allowed(self) -> float:
+        return max(self._tolerances.force_tolerance * self._scale, self._floor)
+
+    def _norm(self, vector: Array) -> float:
+        return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
+
+
+def growth(iterations: int) -> float:
+    """Factor on Δτ after a solve of so many Newton iterations."""
+    if iterations <= EASY:
+        return GROW_FAST
+    return GROW if iterations <= FAIR else 1.0

@@ -1,0 +1,83 @@
+"""Local error of a step in the positions, from the velocities at its ends.
+
+Order 1: ½ Δt² ẍ, with Δt ẍ = v_{n+1} − v_n. Order 2: C Δt³ x⃛, with x⃛ from the second divided difference
+of the velocities over this step and the one before (or the accelerations at the start, where there is
+none or forces have jumped), C the scheme's error constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.schemes import Bdf2
+from lyra_petsc.stepping.system import ReducedSystem
+
+Array = NDArray[np.float64]
+
+
+class LocalError:
+    """Estimates the error of each step of a run; collective.
+
+    Parameters
+    ----------
+    system : ReducedSystem
+    """
+
+    def __init__(self, system: ReducedSystem) -> None:
+        self._system = system
+        self._slope: Array | None = None
+        self._dt = 0.0
+        system.followers.append(self)
+
+    @property
+    def needs_acceleration(self) -> bool:
+        """Whether the coming step's accelerations at its start are asked for."""
+        return self._system.scheme.order > 1 and self._slope is None
+
+    def start_from(self, acceleration: Array) -> None:
+        """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
+        self._slope, self._dt = acceleration, 0.0
+
+    def disturbed(self) -> None:
+        """Forces jump at the start of the coming step."""
+        self._slope = None
+
+    def of(self, v_before: Array, dt: float) -> float:
+        """Largest local error [m] over the free coordinates of the step just taken, from v_before on."""
+        system = self._system
+        n = system.points.n_owned
+        slope = (system.v[:n] - v_before) / dt
+        if system.scheme.order == 1:
+            error = 0.5 * dt * dt * slope
+        else:
+            assert self._slope is not None
+            third = 2.0 * (slope - self._slope) / (dt + self._dt)
+            error = self._constant(dt) * dt**3 * third
+        largest = float(np.abs(error).max(initial=0.0, where=~system.mask[:n]))
+        return float(system.points.comm.allreduce(largest, MPI.MAX))
+
+    def accepted(self, v_before: Array, dt: float) -> None:
+        """The step stands."""
+        if self._system.scheme.order > 1:
+            n = self._system.points.n_owned
+            self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
+
+    def _constant(self, dt: float) -> float:
+        scheme = self._system.scheme
+        if isinstance(scheme, Bdf2) and self._dt > 0.0:
+            r = dt / self._dt
+            return (1.0 + r) ** 2 / (6.0 * r * (1.0 + 2.0 * r))
+        return scheme.error_constant
+
+    def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
+        """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
+        return ({} if self._slope is None else {"slope": self._slope}), {"slope_dt": self._dt}
+
+    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
+        """Go on with a memory."""
+        self._slope = arrays.get("slope")
+        self._dt = float(numbers.get("slope_dt", 0.0))

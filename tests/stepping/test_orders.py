@@ -1,0 +1,56 @@
+"""Observed order in Δt of every integrator, on a nonlinear sheet with moving handles, wind and damping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import Simulation, grid
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+END = 0.16
+
+MOVING: dict[str, Any] = {
+    "mesh": grid(0.5, 0.4, 4, 3, "alternating"),
+    "material": {
+        "density": 0.2,
+        "membrane": {"c11": 60.0, "c22": 40.0, "c12": 15.0, "c33": 12.0},  # so soft that Δt resolves it
+        "bending": 1e-3,
+        "damping": 0.01,
+    },
+    "gravity": [0.0, 0.0, -9.81],
+    "wind": {"velocity": [1.0, 2.0, 3.0], "density": 1.2, "drag": 0.3},
+    "handles": [
+        {"nodes": [0, 5, 10, 15], "clamp": True, "motion": "sway"},
+        {"nodes": [19], "stiffness": 3.0, "motion": "sway"},
+    ],
+    "loads": [{"pressure": 1.0}],
+    "motions": {
+        "sway": [
+            {"time": 0},
+            {"time": 0.4, "rotate": {"axis": [0, 1, 0], "degrees": 60}, "translate": [0.1, 0, 0]},
+        ]
+    },
+}
+
+ORDERS = {"beuler": 1.0, "semi-implicit": 1.0, "midpoint": 2.0, "alpha2": 2.0, "bdf2": 2.0}
+
+
+def at_end(integrator: str, steps: int, comm: MPI.Comm, **time: float) -> Array:
+    """Positions of the moving sheet at the end."""
+    content = MOVING | {"time": {"end": END, "step": END / steps, "integrator": integrator, **time}}
+    with Simulation(content, comm) as simulation:
+        return simulation.run(END / steps, steps)
+
+
+@pytest.mark.parametrize("integrator", ORDERS)
+def test_observed_order(integrator: str, comm: MPI.Comm) -> None:
+    shapes = [at_end(integrator, steps, comm) for steps in (80, 160, 320)]
+    first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
+    assert np.log2(first / second) == pytest.approx(ORDERS[integrator], abs=0.1)
