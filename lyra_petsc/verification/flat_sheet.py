@@ -128,7 +128,7 @@ def stiffness(trial: Trial) -> Stiffness:
     for name in BENDING_TERMS:
         term = model.terms.get(name)
         if isinstance(term, Elastic):
-            term.prepare(0.0, 1.0)
+            term.prepare(0.0, 1.0, 1.0)
             rows.add(name, _filled_by(term, system.x), 1.0, values)
     numbers = mesh_numbers(trial)
     row = np.repeat(numbers[: points.n_owned], np.diff(pattern.indptr))
