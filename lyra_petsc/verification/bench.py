@@ -6,6 +6,9 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,7 @@ from petsc4py import PETSc
 from pydantic import ValidationError
 
 from lyra_petsc.errors import LyraError
+from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.messages import input_error
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation
@@ -22,6 +26,7 @@ from lyra_petsc.solvers.options import is_set
 from lyra_petsc.verification.case import Measured
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 """Where a scene of a case says nothing: Newton being quadratic, it ends at round-off."""
@@ -32,6 +37,11 @@ def data(name: str) -> dict[str, Any]:
     text = files("lyra_petsc.verification").joinpath("data", f"{name}.json").read_text(encoding="utf-8")
     content: dict[str, Any] = json.loads(text)
     return content
+
+
+def farthest(values: Array, exact: float) -> float:
+    """The one of the values that differs most from the exact one."""
+    return float(values[np.argmax(np.abs(values - exact))])
 
 
 class Trial:
@@ -45,6 +55,7 @@ class Trial:
     def __init__(self, bench: Bench, simulation: Simulation) -> None:
         self._bench = bench
         self.simulation = simulation
+        self._start = self.x
 
     def step(self) -> None:
         """One accepted step; collective."""
@@ -78,6 +89,11 @@ class Trial:
         return self.gather(self.simulation.model.system.v)
 
     @property
+    def start(self) -> Array:
+        """Positions (V, 3) [m] in mesh order before the first step."""
+        return self._start
+
+    @property
     def mass(self) -> Array:
         """Masses (V,) [kg] in mesh order."""
         return self.gather(self.simulation.model.system.mass)
@@ -95,8 +111,33 @@ class Trial:
         return float(self._bench.comm.allreduce(float(np.sum(owned))))
 
 
+def direct_options(comm: MPI.Comm) -> dict[str, Any]:
+    """PETSc options of a direct solver that this build has on so many ranks."""
+    if comm.size == 1:
+        return {"pc_type": "lu"}
+    if PETSc.Sys.hasExternalPackage("mumps"):
+        return {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    return {"pc_type": "redundant", "redundant_pc_type": "lu"}
+
+
+def direct_solver(comm: MPI.Comm, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    """A solver that factors the matrix once; collective. To be destroyed."""
+    solver = PETSc.KSP().create(comm)
+    solver.setOperators(matrix)
+    solver.setType(PETSc.KSP.Type.PREONLY)
+    preconditioner = solver.getPC()
+    options = direct_options(comm)
+    preconditioner.setType(options["pc_type"])
+    if "pc_factor_mat_solver_type" in options:
+        preconditioner.setFactorSolverType(options["pc_factor_mat_solver_type"])
+    solver.setOptionsPrefix(prefix)
+    solver.setFromOptions()
+    solver.setUp()
+    return solver
+
+
 class Bench:
-    """Runs the simulations of a case.
+    """Runs the simulations of a case; a context manager that removes what it wrote.
 
     Parameters
     ----------
@@ -114,6 +155,30 @@ class Bench:
         self.comm = comm
         self.watch = watch or (lambda: None)
         self.steps = 0
+        self._folder: TemporaryDirectory[str] | None = None
+        self._files = 0
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def mesh(self, vertices: Array, triangles: Ints) -> dict[str, Any]:
+        """The mesh block of a scene for a surface (V, 3) [m], (F, 3), its own rest shape; collective."""
+
+        def write() -> str:
+            if self._folder is None:
+                self._folder = TemporaryDirectory(prefix="lyra-verify-")
+            self._files += 1
+            path = Path(self._folder.name) / f"{self._files}.obj"
+            lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+            lines += [f"f {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            return str(path)
+
+        return {"file": on_root(self.comm, write)}
 
     @contextmanager
     def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
@@ -123,7 +188,7 @@ class Bench:
         tight tolerances, no output times.
         """
         filled: dict[str, Any] = {"solver": TIGHT, "output": {"every": None}} | dict(content)
-        filled["petsc"] = self._direct() | filled.get("petsc", {})
+        filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
         try:
             scene = Scene.model_validate(filled)
         except ValidationError as error:
@@ -146,15 +211,6 @@ class Bench:
         database = PETSc.Options()
         for name in options:
             database.delValue(name)
-
-    def _direct(self) -> dict[str, Any]:
-        direct: dict[str, Any] = {"pc_type": "lu", "ksp_rtol": 1e-12}
-        if self.comm.size > 1:
-            if PETSc.Sys.hasExternalPackage("mumps"):
-                direct["pc_factor_mat_solver_type"] = "mumps"
-            else:
-                direct |= {"pc_type": "redundant", "redundant_pc_type": "lu"}
-        return direct
 
 
 def simulated(

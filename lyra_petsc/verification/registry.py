@@ -9,7 +9,12 @@ from lyra_petsc.nearest import nearest
 from lyra_petsc.verification.case import Case
 
 NAMES = (
+    "patch-states",
     "free-fall",
+    "oscillator",
+    "rigid-rotation",
+    "wind-drag",
+    "stretched-membrane",
     "hinge-strip",
     "hinge-sheet",
     "hinge-plate",

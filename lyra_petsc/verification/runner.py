@@ -72,11 +72,11 @@ def run_case(
     began = time.perf_counter()
     resolutions = list(case.resolutions)[: case.quick] if quick else list(case.resolutions)
     if warm and len(resolutions) > 1:
-        _rows_at(Bench(comm, watch), case, resolutions[0])
+        _rows_at(comm, watch, case, resolutions[0])
     tables: dict[str, list[Row]] = {}
     problems: list[Row] = []
     for n in resolutions:
-        for row in _rows_at(Bench(comm, watch), case, n):
+        for row in _rows_at(comm, watch, case, n):
             if row.problem:
                 problems.append(row)
                 continue
@@ -97,18 +97,19 @@ def run_case(
     return outcome
 
 
-def _rows_at(bench: Bench, case: Case, n: float) -> list[Row]:
+def _rows_at(comm: MPI.Comm, watch: Callable[[], None] | None, case: Case, n: float) -> list[Row]:
     """The rows of one resolution; one that says why where it cannot run."""
-    bench.comm.Barrier()
+    comm.Barrier()
     began = time.perf_counter()
     try:
-        measured = case.measure(bench, n)
+        with Bench(comm, watch) as bench:
+            measured = case.measure(bench, n)
     except (InputError, SolverError) as error:
         # what one rank alone met cannot be gone past: the others still wait for it
-        if isinstance(error, SolverError) and not error.collective and bench.comm.size > 1:
+        if isinstance(error, SolverError) and not error.collective and comm.size > 1:
             raise
         return [Row("could not run", "", n, case.size(n), problem=" ".join(str(error).split()))]
-    seconds = bench.comm.allreduce(time.perf_counter() - began, MPI.MAX)
+    seconds = comm.allreduce(time.perf_counter() - began, MPI.MAX)
     return [
         Row(
             one.quantity,
