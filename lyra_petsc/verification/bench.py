@@ -165,8 +165,11 @@ class Bench:
         if self._folder is not None:
             self._folder.cleanup()
 
-    def mesh(self, vertices: Array, triangles: Ints) -> dict[str, Any]:
-        """The mesh block of a scene for a surface (V, 3) [m], (F, 3), its own rest shape; collective."""
+    def mesh(self, vertices: Array, triangles: Ints, rest: Array | None = None) -> dict[str, Any]:
+        """The mesh block of a scene for a surface (V, 3) [m] of triangles (F, 3); collective.
+
+        ``rest`` (V, 2) [m] is its flat rest shape; without, the surface is its own.
+        """
 
         def write() -> str:
             if self._folder is None:
@@ -174,7 +177,12 @@ class Bench:
             self._files += 1
             path = Path(self._folder.name) / f"{self._files}.obj"
             lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-            lines += [f"f {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
+            corners = (triangles + 1).tolist()
+            if rest is None:
+                lines += [f"f {a} {b} {c}" for a, b, c in corners]
+            else:
+                lines += [f"vt {u!r} {v!r}" for u, v in rest.tolist()]
+                lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in corners]
             path.write_text("\n".join(lines) + "\n", encoding="utf-8")
             return str(path)
 

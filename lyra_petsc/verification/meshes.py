@@ -9,22 +9,38 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+def rectangle(nx: int, ny: int, width: float, height: float) -> tuple[Array, Ints]:
+    """A rectangle of nx × ny cells in the xy plane, numbered as a grid; diagonals alternate."""
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(nx + 1), np.arange(ny + 1)))
+    vertices = np.column_stack([i * (width / nx), j * (height / ny), 0.0 * i])
+    column, row = (k.ravel() for k in np.meshgrid(np.arange(nx), np.arange(ny)))
+    return vertices, _halved(nx, column, row, (column + row) % 2 == 1)
+
+
 def irregular_rectangle(n: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
     """A rectangle of n × n cells in the xy plane: inner vertices displaced, diagonals at random.
 
     Inner vertices move by up to 0.3 of a cell in each direction.
     """
     random = np.random.default_rng(seed)
+    vertices, _ = rectangle(n, n, width, height)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
-    shift = random.uniform(-0.3, 0.3, (len(i), 2))
+    shift = random.uniform(-0.3, 0.3, (len(i), 2)) * [width / n, height / n]
     shift[(i == 0) | (i == n) | (j == 0) | (j == n)] = 0.0
-    vertices = np.column_stack([(i + shift[:, 0]) * width / n, (j + shift[:, 1]) * height / n, 0.0 * i])
-    a = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
-    b, c, d = a + 1, a + n + 2, a + n + 1
-    flipped = random.integers(0, 2, len(a))[:, None] == 1
-    first = np.where(flipped, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
-    second = np.where(flipped, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
-    return vertices, np.concatenate([first, second])
+    vertices[:, :2] += shift
+    column, row = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n)))
+    return vertices, _halved(n, column, row, random.integers(0, 2, n * n) == 1)
+
+
+def _halved(nx: int, column: Ints, row: Ints, flipped: NDArray[np.bool_]) -> Ints:
+    """Two triangles of every cell, cut from its low left to its high right corner or the other way."""
+    a = row * (nx + 1) + column
+    b, c, d = a + 1, a + nx + 2, a + nx + 1
+    other = flipped[:, None]
+    first = np.where(other, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
+    second = np.where(other, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
+    halves: Ints = np.concatenate([first, second])
+    return halves
 
 
 def quarter_disc(n: int, radius: float = 1.0) -> tuple[Array, Ints]:

@@ -15,6 +15,8 @@ NAMES = (
     "rigid-rotation",
     "wind-drag",
     "stretched-membrane",
+    "hanging-chain",
+    "released-mode",
     "hinge-strip",
     "hinge-sheet",
     "hinge-plate",

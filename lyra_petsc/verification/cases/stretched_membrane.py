@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from lyra_petsc.verification.bench import Bench, data
 from lyra_petsc.verification.case import Case, Measured
 from lyra_petsc.verification.claims import Converges
+from lyra_petsc.verification.meshes import rectangle
 from lyra_petsc.verification.spectrum import lowest_modes
 
 DATA = data("vibrations")["membrane"]
@@ -15,21 +18,23 @@ MODES = ("11", "21", "31", "12")
 """Half waves along and across, by ascending frequency."""
 
 
-def stretched(n: float, time: dict[str, Any]) -> dict[str, Any]:
-    """The scene of the membrane at rest, all its edges held; n × n/2 cells."""
+def stretched(bench: Bench, n: int, time: dict[str, Any]) -> dict[str, Any]:
+    """The scene of the membrane in its stretched state, all edges held there; n × n/2 cells."""
+    vertices, triangles = rectangle(n, n // 2, DATA["A"], DATA["B"])
+    number = np.arange(len(vertices)).reshape(n // 2 + 1, n + 1)
+    edge = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
+    mesh = bench.mesh(vertices * [DATA["lam1"], DATA["lam2"], 0.0], triangles, rest=vertices[:, :2])
     membrane = {name.lower(): DATA[name] for name in ("C11", "C22", "C12", "C33")}
-    cells = {"nx": int(n), "ny": int(n) // 2, "pattern": "alternating"}
     return {
-        "mesh": {"grid": {"width": DATA["A"], "height": DATA["B"], **cells}},
+        "mesh": mesh,
         "material": {"density": DATA["rho"], "membrane": membrane},
-        "handles": [{"group": side} for side in ("left", "right", "bottom", "top")],
+        "handles": [{"nodes": edge.tolist()}],
         "time": time,
     }
 
 
 def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    with bench.simulation(stretched(n, {"end": 1.0, "step": 1.0})) as trial:
-        trial.set_state(x=trial.x * [DATA["lam1"], DATA["lam2"], 1.0])
+    with bench.simulation(stretched(bench, int(n), {"end": 1.0, "step": 1.0})) as trial:
         found, _ = lowest_modes(trial, len(MODES))
     return [
         Measured(f"ω of mode {mode}", float(omega), DATA["omega"][mode], "rad/s")
