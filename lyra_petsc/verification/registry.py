@@ -20,6 +20,9 @@ NAMES = (
     "hinge-strip",
     "hinge-sheet",
     "hinge-plate",
+    "tip-load",
+    "heavy-cantilever",
+    "cloth-overhang",
 )
 
 
