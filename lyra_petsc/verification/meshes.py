@@ -9,12 +9,14 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def rectangle(nx: int, ny: int, width: float, height: float) -> tuple[Array, Ints]:
-    """A rectangle of nx × ny cells in the xy plane, numbered as a grid; diagonals alternate."""
+def rectangle(
+    nx: int, ny: int, width: float, height: float, *, alternating: bool = True
+) -> tuple[Array, Ints]:
+    """A rectangle of nx × ny cells in the xy plane, numbered as a grid; alternating or diagonal."""
     i, j = (k.ravel() for k in np.meshgrid(np.arange(nx + 1), np.arange(ny + 1)))
     vertices = np.column_stack([i * (width / nx), j * (height / ny), 0.0 * i])
     column, row = (k.ravel() for k in np.meshgrid(np.arange(nx), np.arange(ny)))
-    return vertices, _halved(nx, column, row, (column + row) % 2 == 1)
+    return vertices, _halved(nx, column, row, alternating & ((column + row) % 2 == 1))
 
 
 def irregular_rectangle(n: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
@@ -48,7 +50,6 @@ def quarter_disc(n: int, radius: float) -> tuple[Array, Ints]:
 
     Diagonals alternate, as they also do where the quarter is mirrored: cut otherwise, the centre would
     carry more or less than its neighbours do, and its deflection err by h² log h.
-
 
     Vertex j (n + 1) + i as in a grid: i = 0 and j = 0 are the straight sides, i = n and j = n the rim.
     """

@@ -1,0 +1,36 @@
+"""Catenaries of a strip that hardly stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lyra_petsc.verification.bar_strip import LENGTH, hung
+from lyra_petsc.verification.bench import Bench, data
+from lyra_petsc.verification.case import Case, Measured
+from lyra_petsc.verification.claims import Converges
+
+DATA = data("catenary")
+SPANS = (0.95, 0.8, 0.5, 0.3)
+WEIGHT = 1e-6
+"""of c11: the strip stretches by no more than that"""
+
+
+def _measure(bench: Bench, n: float) -> Sequence[Measured]:
+    measured = []
+    for span, sag in DATA["inextensible"]["rows"]:
+        if span in SPANS:
+            with bench.simulation(hung(bench, int(n), WEIGHT, span * LENGTH, 0.0)) as trial:
+                low = -float(trial.run().x[int(n) // 2, 2])
+            measured.append(Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m"))
+    return measured
+
+
+CASE = Case(
+    name="catenary",
+    title="A stiff strip hung by both ends at one height, static: sag of the inextensible catenary",
+    source=DATA["source"],
+    resolutions=(8, 16, 32, 64),
+    measure=_measure,
+    claim=Converges(2.0, 1e-3),
+    counts="cells along the strip",
+)
