@@ -30,6 +30,7 @@ NAMES = (
     "tip-load",
     "heavy-cantilever",
     "cloth-overhang",
+    "strip-vibration",
 )
 
 
