@@ -64,7 +64,7 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
     ArithmeticError
         If Newton's method does not converge.
     """
-    s, derivative, integral = _collocation(NODES)
+    s, derivative, integral = chebyshev(NODES)
     theta = np.zeros(len(s))
     second = derivative @ derivative
     load = max(weight, tip_load)
@@ -73,7 +73,7 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
         part = ((1.0 + load) ** (step / steps) - 1.0) / load if load > 0.0 else 1.0
         force = part * (tip_load + weight * (1.0 - s))
         theta = _newton(theta, force, stretch, second, derivative)
-    length = _stretch(force * np.sin(theta), stretch)[0]
+    length = stretches(force * np.sin(theta), stretch)[0]
     return Cantilever(
         reach=float(integral @ (length * np.cos(theta))),
         drop=float(integral @ (length * np.sin(theta))),
@@ -103,7 +103,7 @@ def _slope(weight: float) -> float:
 def _newton(theta: Array, force: Array, stretch: float, second: Array, derivative: Array) -> Array:
     for _ in range(40):
         tension = force * np.sin(theta)
-        length, by_tension = _stretch(tension, stretch)
+        length, by_tension = stretches(tension, stretch)
         shear = force * np.cos(theta)
         residual = second @ theta + length * shear
         jacobian = second + np.diag(by_tension * shear * shear - length * tension)
@@ -118,7 +118,7 @@ def _newton(theta: Array, force: Array, stretch: float, second: Array, derivativ
     raise ArithmeticError(f"no equilibrium found at load {force.max():g}")
 
 
-def _stretch(tension: Array, compliance: float) -> tuple[Array, Array]:
+def stretches(tension: Array, compliance: float) -> tuple[Array, Array]:
     """Stretch λ of ½ (λ³ − λ) = tension × compliance and its derivative by the tension."""
     length = np.ones_like(tension)
     if compliance == 0.0:
@@ -131,7 +131,7 @@ def _stretch(tension: Array, compliance: float) -> tuple[Array, Array]:
     return length, compliance / (1.5 * length**2 - 0.5)
 
 
-def _collocation(n: int) -> tuple[Array, Array, Array]:
+def chebyshev(n: int) -> tuple[Array, Array, Array]:
     """Chebyshev points on [0, 1] ascending (n + 1,), differentiation matrix, Clenshaw-Curtis weights."""
     k = np.arange(n + 1)
     t = -np.cos(np.pi * k / n)

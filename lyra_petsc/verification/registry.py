@@ -29,6 +29,7 @@ NAMES = (
     "hinge-plate",
     "tip-load",
     "heavy-cantilever",
+    "coiling-strip",
     "cloth-overhang",
     "strip-vibration",
 )

@@ -42,7 +42,7 @@ class AtFinest(Claim):
         return Verdict(good, words)
 
 
-def strip(pattern: str, n: float, **more: Any) -> dict[str, Any]:
+def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> dict[str, Any]:
     """A scene: n square cells along the strip, its end clamped, static.
 
     ``more`` are further keys of the scene; ``material`` is added to.
@@ -50,7 +50,7 @@ def strip(pattern: str, n: float, **more: Any) -> dict[str, Any]:
     along = round(n)
     material = {
         "density": DENSITY,
-        "membrane": {"c11": MEMBRANE, "c22": MEMBRANE, "c12": 0.0, "c33": 0.5 * MEMBRANE},
+        "membrane": {"c11": membrane, "c22": membrane, "c12": 0.0, "c33": 0.5 * membrane},
         "bending": 1.0,
     }
     return {
