@@ -29,7 +29,7 @@ LEVELS = [
     {"simulation"},
     {"recorder"},
     {"exact", "report"},
-    {"verification"},
+    {"study", "verification"},
     {"cli"},
     {"__main__"},
 ]

@@ -21,7 +21,6 @@ BUG = 70
 """Exit code of what should never happen."""
 
 LATER = {
-    "study": "error against run time",
     "stress": "stability on stiff and extreme cases",
     "render": "pictures and films",
     "view": "a live page",
@@ -226,6 +225,40 @@ def verify(
         list_cases(comm)
         return 0
     return verify_cases(comm, names, quick=quick, out=out, force=force)
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@_scene
+@_set
+@click.option(
+    "--vary",
+    multiple=True,
+    metavar="KEY=V,V,…",
+    help="What varies: dt, mesh, integrator, tolerance, ksp_rtol (any PETSc option), any key of the scene; "
+    "may be repeated, all combinations are run.",
+)
+@click.option("--reference", metavar="auto|exact:NAME|run:DIR", help="What errors are measured against.")
+@click.option("--quantities", metavar="NAME,NAME,…", help="position, energy, probes, or a probe's name.")
+@click.option("--repeats", type=int, metavar="N", help="How often each combination is timed (3).")
+@click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
+@click.option("--force", is_flag=True, help="Replace the results in DIR.")
+@click.option("--resume", is_flag=True, help="Go on without repeating finished combinations.")
+@click.option("--job", type=click.Path(path_type=Path), hidden=True)
+@click.pass_obj
+def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
+    """Error against run time: run, time and compare combinations of settings of SCENE."""
+    from lyra_petsc.report.extras import require
+
+    require("study")
+    from lyra_petsc.cli.study import Asked, run_job
+    from lyra_petsc.cli.study import study as study_scene
+
+    if job is not None:
+        run_job(comm, job)
+    else:
+        study_scene(comm, Asked(**asked))
 
 
 @_verbs.command(context_settings=_SETTINGS)

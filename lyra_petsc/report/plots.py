@@ -90,6 +90,7 @@ def work_precision(
     y_label: str,
     x_label: str = "run time [s]",
     front: Sequence[tuple[float, float]] = (),
+    bounds: Sequence[tuple[float, float]] = (),
     recommended: tuple[float, float] | None = None,
     recommendation: str = "",
     floor: float | None = None,
@@ -102,6 +103,8 @@ def work_precision(
     series : sequence of Series
     front : sequence of (time, error)
         Points that no other beats in both; drawn as a staircase.
+    bounds : sequence of (time, error)
+        Points of which is known only that their error is at most so large.
     recommended : (time, error), optional
     recommendation : str
         Its name.
@@ -136,6 +139,17 @@ def work_precision(
             [p[0] for p in best], [p[1] for p in best], "o", ms=10, mfc="none", mec="#1b1f24", mew=0.9,
             zorder=0,
         )  # fmt: skip
+    at_most = [point for point in bounds if _visible(point[0]) and _visible(point[1])]
+    if at_most:
+        axes.plot(
+            [p[0] for p in at_most],
+            [p[1] for p in at_most],
+            "v",
+            ms=7,
+            mfc="none",
+            mec="#5b6470",
+            label="not resolved: at most",
+        )
     if recommended is not None and _visible(recommended[0]) and _visible(recommended[1]):
         axes.plot(
             *recommended, "*", ms=17, mfc="#f6c344", mec="#1b1f24", mew=0.9, zorder=5,

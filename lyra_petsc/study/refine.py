@@ -1,0 +1,263 @@
+"""The reference where nothing is exact: which runs to make, finer than all that is studied.
+
+The reference refines what the study varies. Where integrators, Δt or tolerances of steps vary: a
+second-order integrator at a quarter of the smallest Δt. Where element sizes vary: half the smallest.
+Solver tolerances are a hundredth of the tightest. Beside it stand coarser runs, each coarser in one
+thing by a factor of two from the next, from which its own error is estimated (Richardson).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from lyra_petsc.report.numbers import seconds
+from lyra_petsc.scene.control import INTEGRATORS
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.study.axes import Value
+from lyra_petsc.study.combination import mesh_overrides, time_overrides
+from lyra_petsc.study.measure import Errors
+from lyra_petsc.study.plan import Plan
+
+FINER = 4
+"""How many times smaller than the smallest Δt of the study the reference's is."""
+
+SECOND_ORDER = ("bdf2", "alpha2", "midpoint")
+TIGHTER = 100.0
+TIGHTEST = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+TIMES = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius")
+
+SAFETY = 3.0
+"""An error below so many times the reference's own cannot be told from it."""
+
+SLOWEST = 0.5
+"""Order of convergence below which an estimate is not trusted to follow it."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One run of the reference's family.
+
+    Attributes
+    ----------
+    name : str
+        The folder.
+    label : str
+        In words.
+    overrides : tuple of str
+    weight : float
+        Its cost beside a run at the study's finest.
+    """
+
+    name: str
+    label: str
+    overrides: tuple[str, ...]
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Runs that differ in one thing by factors of two, finest first.
+
+    Attributes
+    ----------
+    what : str
+        ``Δt``, ``h`` or ``solver tolerance``.
+    levels : tuple of Level
+    order : int
+        Expected; 0 where none is.
+    """
+
+    what: str
+    levels: tuple[Level, ...]
+    order: int
+
+
+@dataclass
+class Family:
+    """All runs of a reference.
+
+    Attributes
+    ----------
+    best : Level
+        The reference.
+    chains : list of Chain
+        Their finest differ from each other only where meshes are refined too.
+    """
+
+    best: Level
+    chains: list[Chain] = field(default_factory=list)
+
+    @property
+    def levels(self) -> list[Level]:
+        """Each run once, cheapest last."""
+        found = {level.name: level for level in [self.best, *(le for c in self.chains for le in c.levels)]}
+        return list(found.values())
+
+
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> Family:
+    """The runs of the reference of one physical scene.
+
+    Parameters
+    ----------
+    plan : Plan
+    physics : sequence of str
+        Overrides that make this scene, and what the whole study sets.
+    smallest : float or None
+        Smallest Δt [s] among the runs, where the time integration is refined.
+    integrator : str
+        With which it is.
+    """
+    common = [*physics, *_tolerances(plan, TIGHTER)]
+    mesh = plan.axis("mesh")
+    meshes: list[float | None] = [None]
+    if mesh is not None:
+        size = min(float(value) for value in mesh.values)
+        meshes = [size / 2.0, size, 2.0 * size]
+    if smallest is None or plan.static:
+        best = _level(plan.base, common, meshes[0], None, "")
+        if mesh is None:
+            loose = Level(
+                "reference-loose",
+                "tolerances ten times larger",
+                (*physics, *_tolerances(plan, TIGHTER / 10.0)),
+            )
+            return Family(best, [Chain("solver tolerance", (best, loose), 0)])
+        chain = tuple(_level(plan.base, common, h, None, "") for h in meshes)
+        return Family(best, [Chain("h", chain, 2)])
+    finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
+    steps = [finest, 2.0 * finest, 4.0 * finest]
+    order = 2 if integrator in SECOND_ORDER else 1
+    best = _level(plan.base, common, meshes[0], steps[0], integrator)
+    if mesh is None:
+        in_time = tuple(_level(plan.base, common, None, step, integrator) for step in steps)
+        return Family(best, [Chain("Δt", in_time, order)])
+    in_space = tuple(_level(plan.base, common, h, steps[0], integrator) for h in meshes)
+    in_time = tuple(_level(plan.base, common, meshes[1], step, integrator) for step in steps)
+    return Family(best, [Chain("h", in_space, 2), Chain("Δt", in_time, order)])
+
+
+def refines_time(plan: Plan) -> bool:
+    """Whether the study varies how time is integrated, or nothing of how the scene is solved."""
+    if plan.static:
+        return False
+    return any(axis.path in TIMES for axis in plan.axes) or all(axis.physical for axis in plan.axes)
+
+
+def integrators(plan: Plan) -> list[str]:
+    """Those to try for the reference, in order."""
+    wanted: list[str] = []
+    if plan.base.time.integrator in SECOND_ORDER:
+        wanted.append(str(plan.base.time.integrator))
+    wanted += [name for name in SECOND_ORDER if name in INTEGRATORS and name not in wanted]
+    return [*wanted, "beuler"]
+
+
+def _level(base: Scene, common: list[str], h: float | None, step: float | None, integrator: str) -> Level:
+    further, words, name, weight = [], [], ["reference"], 1.0
+    if integrator:
+        words.append(integrator)
+        name.append(integrator)
+    if step is not None:
+        chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
+        further += [f"time.integrator={integrator}", f"time.step={step!r}", *time_overrides(base, chosen)]
+        words.append(f"Δt {seconds(step)}")
+        name.append(f"dt{step:.6g}")
+    if h is not None:
+        further += mesh_overrides(base, h)
+        words.append(f"h {h:g} m")
+        name.append(f"h{h:.6g}")
+        weight = h**-2
+    weight /= step or 1.0
+    return Level("-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight)
+
+
+def _tolerances(plan: Plan, tighter: float) -> list[str]:
+    """Solver tolerances below the tightest of the study."""
+    found = []
+    for name, least in TIGHTEST.items():
+        axis = plan.axis(f"solver.{name}")
+        values = [float(v) for v in axis.values] if axis else [float(getattr(plan.base.solver, name))]
+        found.append(f"solver.{name}={max(least, min(values) / tighter)!r}")
+    for axis in plan.axes:
+        if axis.path.startswith("petsc.") and axis.numeric and axis.path.endswith(("tol", "_atol")):
+            least = min(float(value) for value in axis.values)
+            found.append(f"{axis.path}={max(1e-13, least / tighter)!r}")
+    return found
+
+
+# -- its own error -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Own error of a reference in one quantity.
+
+    Attributes
+    ----------
+    error : float
+        Relative, as the errors measured against it.
+    order : float
+        Observed; NaN where two runs agree, or only two were made.
+    trusted : bool
+        Whether the runs converge.
+    """
+
+    error: float
+    order: float
+    trusted: bool
+
+
+def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:
+    """Own error of the finest of three runs.
+
+    Parameters
+    ----------
+    first, second : float
+        Differences of the two finest runs, and of the finest but one from the third.
+    ratio : float
+        Factor by which each is coarser than the one before.
+    order : int
+        Expected; the observed one is used where it is smaller.
+    """
+    if math.isnan(first) or math.isnan(second):
+        return Estimate(math.nan, math.nan, False)
+    if first == 0.0:
+        return Estimate(0.0, math.nan, True)
+    observed = math.log(second / first) / math.log(ratio) if second > 0.0 else -math.inf
+    used = min(float(order), max(observed, SLOWEST))
+    trusted = observed >= SLOWEST
+    largest = first if trusted else max(first, second)
+    return Estimate(largest / (ratio**used - 1.0), observed, trusted)
+
+
+def joined(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
+    """Sums of the errors in time and in space."""
+    names = dict.fromkeys(name for estimate in estimates for name in estimate)
+    found = {}
+    for name in names:
+        parts = [estimate[name] for estimate in estimates]
+        found[name] = Estimate(
+            math.fsum(part.error for part in parts),
+            parts[0].order if len(parts) == 1 else math.nan,
+            all(part.trusted for part in parts),
+        )
+    return found
+
+
+def of_chain(differences: Sequence[Errors], chain: Chain, ratio: float = 2.0) -> dict[str, Estimate]:
+    """Own error of a chain's finest run, by quantity.
+
+    Parameters
+    ----------
+    differences : sequence of Errors
+        Between neighbours, finest first.
+    """
+    found = {}
+    for name, first in differences[0].items():
+        if len(differences) == 1:
+            found[name] = Estimate(first, math.nan, True)
+        else:
+            found[name] = richardson(first, differences[1][name], ratio, chain.order)
+    return found
