@@ -73,7 +73,7 @@ class Recorder:
         checkpoint = read_checkpoint(folder, self._vertices)
         memory = checkpoint.scalars
         for number, start in enumerate(memory["late_starts"]):
-            system.resume(float(start), checkpoint.arrays[f"start_{number}"])
+            system.departures.resume(float(start), checkpoint.arrays[f"start_{number}"])
         system.x[:n] = checkpoint.arrays["position"]
         system.v[:n] = checkpoint.arrays["velocity"]
         simulation.resume(memory, checkpoint.arrays)
@@ -189,8 +189,8 @@ class Recorder:
         simulation = self._simulation
         system, n = simulation.model.system, simulation.model.points.n_owned
         arrays = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
-        for number, start in enumerate(sorted(system.late_starts)):
-            arrays[f"start_{number}"] = system.late_starts[start]
+        for number, start in enumerate(sorted(system.departures.late)):
+            arrays[f"start_{number}"] = system.departures.late[start]
         write_checkpoint(
             self._folder, self._vertices, arrays, {**simulation.memory(), "last_state": self._last_state}
         )

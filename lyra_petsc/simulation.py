@@ -220,7 +220,7 @@ class Simulation:
             "integrator": self._numbers(),
             "blend": self.stepper.blend,
             "preset": self.stepper.preset,
-            "late_starts": sorted(self.model.system.late_starts),
+            "late_starts": sorted(self.model.system.departures.late),
         }
 
     def _numbers(self) -> dict[str, float]:

@@ -14,8 +14,6 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -23,25 +21,13 @@ from numpy.typing import NDArray
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
-from lyra_petsc.stepping.schemes import Scheme, Stage
+from lyra_petsc.stepping.departures import Departures
+from lyra_petsc.stepping.prescribed import Prescribed
+from lyra_petsc.stepping.schemes import Follower, Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-
-class Follower(Protocol):
-    """What depends on the accelerations at the start of a step, in part."""
-
-    @property
-    def needs_acceleration(self) -> bool:
-        """Whether it must be told them."""
-
-    def start_from(self, acceleration: Array) -> None:
-        """Take them, (n_owned, 3) [m/s²]."""
-
-    def disturbed(self) -> None:
-        """Forces jump at the start of the coming step."""
 
 
 class ReducedSystem:
@@ -64,8 +50,9 @@ class ReducedSystem:
     ----------
     x, v : (n_local, 3)
         Positions [m] and velocities [m/s] at the start of the step, ghosts up to date.
-    mask : (n_local, 3) bool
-        Prescribed coordinates of the step.
+    history : (n_owned, 3)
+        The stage's v_h [m/s].
+    departures : Departures
     anchored : float
         Energy [J] of this rank's clamps at the start of the step, against where they stand at its stage.
     dt, t0, t1 : float
@@ -95,9 +82,8 @@ class ReducedSystem:
         self.points, self.mass, self.scheme = points, mass, scheme
         self.elastic, self.viscous, self.loads, self.held = elastic, viscous, loads, held
         self._blocks = blocks
-        self._starts = sorted(set(starts))
-        self._begun: set[float] = set()
-        self.late_starts: dict[float, Array] = {}
+        self.departures = Departures(points, held, elastic, starts)
+        self._prescribed = Prescribed(points, held, blocks)
         self._events = events
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
@@ -108,52 +94,26 @@ class ReducedSystem:
         self._damping = blocks.zeros() if self.damped else None
         self._values = blocks.zeros()
         n_local, n_owned = points.n_local, points.n_owned
-        self.x, self.v = np.zeros((n_local, 3)), np.zeros((n_local, 3))
-        self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(3))
+        self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(5))
         self._xh = self.x
-        self._vh = self.v[:n_owned]
+        self.history = self.v[:n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
         self._force = np.zeros((n_local, 3))
-        self.mask: Mask = np.zeros((n_local, 3), dtype=bool)
-        self._free: Mask = ~self.mask[:n_owned]
-        self._held_rows = np.empty(0, dtype=np.int64)
-        self._prescribed = np.zeros((n_owned, 3))
-        self._goal = np.zeros((n_owned, 3))
-        self._active: tuple[int, ...] | None = None
         self.anchored = 0.0
         self._energy_scales: list[Array] = []
-        self.dt = 0.0
-        self.t0 = self.t1 = 0.0
+        self.dt = self.t0 = self.t1 = 0.0
         self.followers: list[Follower] = [scheme]
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
 
     def begin(self, time: float) -> None:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
-        for start in self.starts():
-            if start <= time and start not in self._begun:
-                self._begun.add(start)
-                if start > 0.0:
-                    self.late_starts[start] = self.x[: self.points.n_owned].copy()
-                self._set_out(start, self.x)
+        self.departures.until(time, self.x)
 
-    def resume(self, start: float, x: Array) -> None:
-        """Let what started at ``start`` [s] set out from positions x (n_owned, 3); collective."""
-        shape = np.zeros((self.points.n_local, 3))
-        shape[: self.points.n_owned] = x
-        self.points.update_ghosts(shape)
-        self._begun.add(start)
-        self.late_starts[start] = shape[: self.points.n_owned].copy()
-        self._set_out(start, shape)
-
-    def _set_out(self, start: float, x: Array) -> None:
-        self.held.begin(start, x)
-        for term in self.elastic:
-            term.begin(start, x)
-
-    def starts(self) -> list[float]:
-        """Times at which handles start, ascending."""
-        return self._starts
+    @property
+    def mask(self) -> Mask:
+        """Prescribed coordinates (n_local, 3) of the step."""
+        return self._prescribed.mask
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -161,27 +121,23 @@ class ReducedSystem:
         """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
         after = self.scheme.stage_after(self.dt)
-        self._hold(t0, t1)
+        changed = self._prescribed.begin_step(t0, t1, self.x)
         self._freeze(t0 + after)
-        if t0 in self._events:
-            self._disturb()
+        if changed or t0 in self._events:
+            for follower in self.followers:
+                follower.disturbed()
         self._tell_accelerations()
         n = self.points.n_owned
         self.stage = stage = self.scheme.stage(self.x[:n], self.v[:n], self.dt)
-        self._vh = self.v[:n].copy() if stage.v is None else stage.v
+        self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.anchored = self._clamped()
 
-    def _disturb(self) -> None:
-        for follower in self.followers:
-            follower.disturbed()
-
     def _tell_accelerations(self) -> None:
         asking = [follower for follower in self.followers if follower.needs_acceleration]
-        if asking:
-            acceleration = self.out_of_balance()[0] / self.mass[:, None]
-            for follower in asking:
-                follower.start_from(acceleration)
+        acceleration = self.out_of_balance()[0] / self.mass[:, None] if asking else self.history
+        for follower in asking:
+            follower.start_from(acceleration)
 
     def _freeze(self, at: float) -> None:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
@@ -211,68 +167,39 @@ class ReducedSystem:
             for damped in self._damped:
                 self._add_stiffness(damped, x, 1.0, damped.elements.data["damping"], self._damping)
 
-    def _hold(self, t0: float, t1: float) -> None:
-        """Which coordinates are prescribed in the step, and where they stand at its end."""
-        n = self.points.n_owned
-        if not self.held:
-            return
-        active = self.held.active(t0, t1)
-        if active != self._active:
-            if self._active is not None:
-                self._disturb()
-            self._active = active
-            # ranks own different vertices of a handle, but all agree on which handles hold
-            flags = np.zeros((self.points.n_local, 3))
-            flags[:n] = self.held.mask(t0, t1, n)
-            self.points.update_ghosts(flags)
-            self.mask = flags > 0.5
-            self._free = ~self.mask[:n]
-            self._held_rows = self._blocks.rows_beside(self.mask)
-        self._goal[:] = self.x[:n]
-        self.held.targets(t0, t1, t1, self._goal)
-
     def _set_history(self, stage: Stage, at: float) -> None:
         """x_h with its ghosts, and the velocities of the prescribed coordinates."""
         n = self.points.n_owned
         given = bool(self.held) and self.scheme.given
         if stage.x is None and not given:
             self._xh = self.x
+            self._prescribed.solve(self.x[:n], stage.reach)
+            return
+        self._xh = np.empty_like(self.x)
+        self._xh[:n] = self.x[:n] if stage.x is None else stage.x
+        if given:
+            self._prescribed.give(at, self._xh[:n], stage.reach)
         else:
-            self._xh = np.empty_like(self.x)
-            self._xh[:n] = self.x[:n] if stage.x is None else stage.x
-        if self.held:
-            if given:
-                position, rate = self.x[:n].copy(), self.v[:n].copy()
-                self.held.targets(self.t0, self.t1, at, position)
-                self.held.velocities(self.t0, self.t1, at, rate)
-                np.copyto(self._xh[:n], position - stage.reach * rate, where=~self._free)
-            else:
-                rate = (self._goal - self._xh[:n]) / stage.reach
-            self._prescribed = np.where(self._free, 0.0, rate)
-        if self._xh is not self.x:
-            self.points.update_ghosts(self._xh)
+            self._prescribed.solve(self._xh[:n], stage.reach)
+        self.points.update_ghosts(self._xh)
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free coordinates at the start of the step, and the norm [N] of the
         largest part of it; collective."""
-        parts = self._parts(self.x, self.v, np.zeros_like(self._vh))
+        parts = self._parts(self.x, self.v, np.zeros_like(self.history))
         squares = self.points.comm.allreduce(np.array([self._norm(part) for part in parts.values()]))
-        return np.where(self._free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
+        return np.where(self._prescribed.free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
 
     @property
     def stage_velocity(self) -> Array:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
         return self._vs[: self.points.n_owned]
 
-    @property
-    def history(self) -> Array:
-        """The stage's v_h (n_owned, 3) [m/s]."""
-        return self._vh
-
     def first_guess(self, v: Array) -> None:
         """Overwrite v (n_owned, 3) by where Newton starts: prescribed coordinates exactly."""
         v[:] = 0.0 if self.scheme.explicit else self.v[: self.points.n_owned]
-        np.copyto(v, self._prescribed, where=~self._free)
+        if self.held:
+            np.copyto(v, self._prescribed.velocity, where=~self._prescribed.free)
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
@@ -280,21 +207,19 @@ class ReducedSystem:
         self._evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
         moved, rate = self.scheme.end(before, rate_before, v, self.dt)
-        given = self.scheme.given
-        self.scheme.accepted(before, rate_before, self._free, self.dt)
-        self.x[:n] = np.where(self._free, moved, self._goal)
-        if self.held and given:
-            rate = rate.copy()
-            self.held.velocities(self.t0, self.t1, self.t1, rate)
+        given, free = self.scheme.given, self._prescribed.free
+        self.scheme.accepted(before, rate_before, free, self.dt)
+        self.x[:n] = np.where(free, moved, self._prescribed.goal) if self.held else moved
         self.v[:n] = rate
-        self.points.update_ghosts(self.x)
-        self.points.update_ghosts(self.v)
+        if given:
+            self._prescribed.overwrite_with_rates(self.v[:n])
+        for values in (self.x, self.v):
+            self.points.update_ghosts(values)
 
     def written_velocity(self) -> Array:
         """Velocities (n_owned, 3) to write out: those of prescribed coordinates are ẋ*(t)."""
         velocity = self.v[: self.points.n_owned].copy()
-        if self.held and self.dt > 0.0:
-            self.held.velocities(self.t0, self.t1, self.t1, velocity)
+        self._prescribed.overwrite_with_rates(velocity)
         return velocity
 
     # -- what Newton asks for ----------------------------------------------------------------------
@@ -307,15 +232,10 @@ class ReducedSystem:
         self._xs += self._xh
         return self._xs, self._vs
 
-    def forces(self, v: Array, vdot: Array) -> dict[str, Array]:
-        """The parts of F, unconstrained, each (n_owned, 3) [N]; collective."""
-        x, vs = self._evaluate_at(v)
-        return self._parts(x, vs, vdot)
-
     def forces_at_stage(self) -> dict[str, Array]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
         n = self.points.n_owned
-        return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self._vh))
+        return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self.history))
 
     def turn_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives the rank's clamps."""
@@ -350,15 +270,17 @@ class ReducedSystem:
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
-        parts = self.forces(v, vdot)
+        parts = self._parts(*self._evaluate_at(v), vdot)
         total = sum(parts.values())
-        held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed)
-        out[:] = np.where(self._free, total, held)
+        out[:] = total
+        if self.held:
+            held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed.velocity)
+            np.copyto(out, held, where=~self._prescribed.free)
         self.force_norms = {name: self._norm(part) for name, part in parts.items()}
 
     def _norm(self, part: Array) -> float:
         """Square of the norm over this rank's free coordinates."""
-        return float(np.sum(part * part, where=self._free))
+        return float(np.sum(part * part, where=self._prescribed.free))
 
     def jacobian(self, v: Array, blend: float) -> Array:
         """Block rows (n_blocks, 3, 3) of σ M + c K + D + ∇∇P, prescribed coordinates decoupled.
@@ -377,8 +299,8 @@ class ReducedSystem:
             for wind in self.viscous:
                 self._add_wind(wind, vs, values)
         self._blocks.add_diagonal(self.stage.sigma * self.mass, values)
-        if len(self._held_rows):
-            self._blocks.constrain(values, self.mask, self._held_rows)
+        if len(self._prescribed.rows):
+            self._blocks.constrain(values, self.mask, self._prescribed.rows)
         return values
 
     def _add_stiffness(
@@ -398,7 +320,7 @@ class ReducedSystem:
         """
         n, sigma, rate = self.points.n_owned, self.stage.sigma, 1.0 / self.stage.reach
         x, vs = self._evaluate_at(v)
-        change = v - self._vh
+        change = v - self.history
         inertia = 0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))
         energies, square = [], 0.0
         for term, scale in zip(self.elastic, self._energy_scales, strict=True):

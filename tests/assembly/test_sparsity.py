@@ -76,7 +76,7 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert not system.viscous
         assert not system.loads
         assert system._damping is None
-        assert len(system._held_rows) == 0
+        assert len(system._prescribed.goal) == len(system._prescribed.rows) == 0
         assert simulation.model.probes == {}
 
 

@@ -1,0 +1,134 @@
+"""Steps that follow a tolerance, and the plan of a load factor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import grid, scene_of
+
+from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.control import ToleranceControl
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+SWING: dict[str, Any] = {
+    "mesh": grid(0.5, 0.1, 5, 1),
+    "material": {"density": 0.2, "membrane": {"c11": 200.0, "c22": 200.0, "c12": 0.0, "c33": 100.0}},
+    "gravity": [0, 0, -9.81],
+    "handles": [{"box": [[0, 0, 0], [0, 1, 0]]}],
+    "output": {"every": 0.05},
+}
+END = 0.2
+SIZE = float(np.hypot(0.5, 0.1))
+
+
+@contextmanager
+def simulated(comm: MPI.Comm, options: dict[str, str] | None = None, **content: Any) -> Iterator[Simulation]:
+    """A scene in its Simulation with a direct solver; the options are removed again."""
+    direct = {"pc_type": "lu", "ksp_rtol": "1e-10"} | (options or {})
+    if comm.size > 1:
+        direct["pc_factor_mat_solver_type"] = "mumps"
+    database = PETSc.Options()
+    for name, value in direct.items():
+        database.setValue(name, value)
+    simulation = Simulation(comm, scene_of(SWING | content))
+    try:
+        yield simulation
+        simulation.destroy()
+    finally:
+        for name in [*direct, *simulation.stepper.our_options]:
+            database.delValue(name)
+
+
+def positions(simulation: Simulation) -> Array:
+    points = simulation.model.points
+    out = np.zeros((points.n_global, 3))
+    for original, rows in simulation.comm.allgather(
+        (points.original, simulation.model.system.x[: points.n_owned])
+    ):
+        out[original] = rows
+    return out
+
+
+@pytest.fixture(scope="module")
+def converged() -> Array:
+    """Positions at the end, in time far beyond every tolerance below."""
+    shapes, comm = [], MPI.COMM_WORLD
+    for step in (5e-4, 2.5e-4):
+        time = {"end": END, "step": step, "integrator": "midpoint"}
+        with simulated(comm, time=time) as simulation:
+            while not simulation.finished:
+                simulation.step()
+            shapes.append(positions(simulation))
+    return (4.0 * shapes[1] - shapes[0]) / 3.0
+
+
+@pytest.mark.parametrize(
+    ("integrator", "tolerance"),
+    [("bdf2", 1e-2), ("bdf2", 1e-3), ("alpha2", 1e-3), ("midpoint", 1e-3), ("beuler", 1e-2)],
+)
+def test_the_error_keeps_the_tolerance(
+    integrator: str, tolerance: float, comm: MPI.Comm, converged: Array
+) -> None:
+    time = {"end": END, "step": "auto", "tolerance": tolerance, "integrator": integrator}
+    with simulated(comm, time=time) as simulation:
+        lengths = []
+        while not simulation.finished:
+            lengths.append(simulation.step().dt)
+        error = np.linalg.norm(positions(simulation) - converged, axis=1).max() / SIZE
+        assert 0.05 * tolerance < error < 2.0 * tolerance
+        assert simulation.estimated_error < tolerance
+    assert max(lengths) > 1.5 * min(lengths)
+
+
+def test_states_and_events_are_landed_on(comm: MPI.Comm) -> None:
+    handles = [*SWING["handles"], {"nodes": [5], "until": 0.07}]
+    time = {"end": END, "step": "auto", "integrator": "bdf2"}
+    with simulated(comm, handles=handles, time=time) as simulation:
+        ends = []
+        while not simulation.finished:
+            ends.append(simulation.step().time)
+    for landing in (0.05, 0.07, 0.1, 0.15, END):
+        assert min(abs(np.array(ends) - landing)) < 1e-12
+
+
+def test_limits_of_the_step_hold_and_are_told_of(comm: MPI.Comm) -> None:
+    options = {"ts_adapt_dt_min": "0.004", "ts_adapt_dt_max": "0.008", "ts_dt": "0.005"}
+    time = {"end": 0.1, "step": "auto", "tolerance": 1e-7, "integrator": "bdf2"}
+    with simulated(comm, options, time=time) as simulation:
+        lengths = []
+        while not simulation.finished:
+            lengths.append(simulation.step().dt)
+        assert [note for note in simulation.notes if "time.tolerance is not reached" in note]
+    assert lengths[0] == pytest.approx(0.005, rel=0.3)
+    assert min(lengths) > 0.0019
+    assert max(lengths) <= 0.008 + 1e-12
+
+
+def test_a_large_error_shortens_the_step_and_a_small_one_lengthens_it() -> None:
+    control = ToleranceControl(0.01, 0.1, 1.0, None, [], 1e-6)
+    assert control.judge(0.01, 0.01, 2)
+    assert control.next_end(0.0) == pytest.approx(0.02)
+    assert not control.judge(0.02, 4.0, 2)
+    assert control.next_end(0.0) == pytest.approx(0.02 * 0.85 / 2.0)
+    assert not control.judge(0.01, 1e9, 2)
+    assert control.next_end(0.0) == pytest.approx(0.002)
+
+
+def test_no_crumb_is_left_before_a_landing() -> None:
+    control = ToleranceControl(0.01, 0.1, 1.0, 0.05, [], 1e-6)
+    assert control.next_end(0.035) == pytest.approx(0.0425)
+    # a step cut short does not shorten those after it
+    assert control.judge(0.0075, 0.9, 2)
+    assert control.factor * control.step == pytest.approx(0.0075 * 0.85 / 0.9**0.5)
+    assert control.judge(0.0001, 1e-6, 2)
+    assert control.factor * control.step >= 0.0067

@@ -1,0 +1,145 @@
+"""Static equilibrium: out of balance by no more than asked, the same as settled motion, under all loads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import CLOTH, grid, scene_of
+
+from lyra_petsc.simulation import Simulation
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+SHEET: dict[str, Any] = {
+    "mesh": grid(1.0, 0.8, 6, 5, "alternating"),
+    "material": CLOTH | {"bending": 1e-3},
+    "gravity": [0, 0, -9.81],
+    "handles": [{"nodes": [0, 6, 35, 41]}],
+    "solver": {"force_tolerance": 1e-9},
+}
+
+
+@contextmanager
+def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
+    """A scene's static analysis, done."""
+    with motion(comm, **(content | {"time": {"analysis": "static"} | content.get("time", {})})) as simulation:
+        while not simulation.finished:
+            simulation.step()
+        assert simulation.time == 1.0
+        yield simulation
+
+
+@contextmanager
+def motion(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
+    simulation = Simulation(comm, scene_of(SHEET | content))
+    yield simulation
+    simulation.destroy()
+    for name in simulation.stepper.our_options:
+        PETSc.Options().delValue(name)
+
+
+def out_of_balance(simulation: Simulation) -> float:
+    """Largest force [N] on a free coordinate."""
+    system = simulation.model.system
+    return float(simulation.comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
+
+
+def shape(simulation: Simulation) -> Array:
+    points = simulation.model.points
+    out = np.zeros((points.n_global, 3))
+    for original, rows in simulation.comm.allgather(
+        (points.original, simulation.model.system.x[: points.n_owned])
+    ):
+        out[original] = rows
+    return out
+
+
+MOVED = {
+    "handles": [
+        {"nodes": [0, 7, 14, 21, 28, 35], "clamp": True},
+        {"nodes": [6, 13, 20, 27, 34, 41], "motion": "in"},
+    ],
+    "motions": {"in": [{"time": 0}, {"time": 1, "translate": [-0.3, 0, 0.2]}]},
+}
+
+SCENES: dict[str, dict[str, Any]] = {
+    "hung by corners": {},
+    "membrane only": {"material": CLOTH},
+    "hung by one corner": {"handles": [{"nodes": [0]}], "initial": {"noise": 1e-4}},
+    "handles that move": MOVED,
+    "pressure": {
+        "gravity": None,
+        "loads": [{"pressure": 20.0}],
+        "handles": [{"group": side} for side in ("left", "right", "top", "bottom")],
+    },
+    "wind": {"wind": {"velocity": [0, 1, 3], "density": 1.2, "drag": 0.1}},
+    "springs": {"handles": [{"nodes": [0, 6, 35, 41], "stiffness": 50.0}]},
+    "curved rest shape": {
+        "gravity": None,
+        "material": CLOTH | {"bending": 1e-3, "rest_curvature": [2.0, 0.0, 0.0]},
+        "handles": [{"nodes": [0, 7, 14, 21, 28, 35], "clamp": True}],
+    },
+    "no load at all": {"gravity": None},
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_forces_balance(name: str, comm: MPI.Comm) -> None:
+    content = {key: value for key, value in (SHEET | SCENES[name]).items() if value is not None}
+    with at_rest(comm, **content) as simulation:
+        weight = 0.2 * 0.8 * 9.81
+        assert out_of_balance(simulation) < 1e-8 * weight
+        assert simulation.budget.kinetic == 0.0
+        assert simulation.budget.dissipation == 0.0
+
+
+def test_the_answer_is_where_a_damped_motion_settles(comm: MPI.Comm) -> None:
+    with at_rest(comm) as simulation:
+        resting = shape(simulation)
+    with motion(comm, time={"end": 400.0, "step": 2.0}, output={"every": None}) as simulation:
+        while not simulation.finished:
+            simulation.step()
+        assert np.abs(shape(simulation) - resting).max() < 1e-6
+
+
+def test_ranks_agree_on_the_equilibrium(comm: MPI.Comm) -> None:
+    with at_rest(comm, **MOVED) as simulation:
+        together = shape(simulation)
+    with at_rest(MPI.COMM_SELF, **MOVED) as simulation:
+        assert np.abs(shape(simulation) - together).max() < 1e-7
+
+
+def test_work_of_moved_handles_is_the_energy_stored(comm: MPI.Comm) -> None:
+    # from balance to balance in small increments: what is put in is what is there
+    time = {"step": 0.02}
+    stretch = {"in": [{"time": 0}, {"time": 1, "translate": [0.1, 0, 0]}]}
+    handles = [{"nodes": [0, 7, 14, 21, 28, 35]}, {"nodes": [6, 13, 20, 27, 34, 41], "motion": "in"}]
+    content = {"gravity": [0, 0, 0], "handles": handles, "motions": stretch, "time": time}
+    with motion(comm, **(content | {"time": {"analysis": "static", **time}})) as simulation:
+        simulation.control.EASY = -1  # type: ignore[misc]
+        while not simulation.finished:
+            simulation.step()
+        budget = simulation.budget
+        assert simulation.step_number == 50
+        assert budget.membrane > 1.0
+        assert budget.external_work == pytest.approx(budget.membrane + budget.bending, rel=1e-3)
+
+
+def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
+    with motion(comm, time={"analysis": "static", "step": 0.05}) as simulation:
+        factors = []
+        while not simulation.finished:
+            factors.append(simulation.step().time)
+    assert factors[0] == pytest.approx(0.05)
+    increments = np.diff([0.0, *factors])
+    assert increments.max() >= 2.0 * increments[0]
+    assert len(factors) < 20
