@@ -17,6 +17,7 @@ Problems of Elasticity, 2nd ed., chapter 8.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ UNKNOWNS = 7
 """Quaternion of the frame, and the moment in space."""
 
 
+@cache
 def heavy_coupled_strip(weight: float, stretch: float = 0.0) -> tuple[float, float, float]:
     """Tip (reach, sideways, drop) over L of a strip clamped horizontally along x, diagonals towards +y.
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,7 @@ class Cantilever:
     clamp_curvature: float
 
 
+@cache
 def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Cantilever:
     """The shape that grows out of the straight strip.
 
@@ -82,6 +84,7 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
     )
 
 
+@cache
 def overhang_weight(degrees: float) -> float:
     """Γ at which the chord from the clamp to the tip is ``degrees`` below the horizontal (secant method)."""
     target = math.tan(math.radians(degrees))
