@@ -112,25 +112,21 @@ class Trial:
 
 
 def direct_options(comm: MPI.Comm) -> dict[str, Any]:
-    """PETSc options of a direct solver that this build has on so many ranks."""
-    if comm.size == 1:
-        return {"pc_type": "lu"}
-    if PETSc.Sys.hasExternalPackage("mumps"):
-        return {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
-    return {"pc_type": "redundant", "redundant_pc_type": "lu"}
+    """PETSc options of a direct solver.
+
+    On several ranks each factors the whole matrix: cases are small, so that this is faster than a
+    parallel factorisation, and it needs no other package.
+    """
+    return {"pc_type": "lu"} if comm.size == 1 else {"pc_type": "redundant", "redundant_pc_type": "lu"}
 
 
 def direct_solver(comm: MPI.Comm, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
     """A solver that factors the matrix once; collective. To be destroyed."""
     solver = PETSc.KSP().create(comm)
+    solver.setOptionsPrefix(prefix)
     solver.setOperators(matrix)
     solver.setType(PETSc.KSP.Type.PREONLY)
-    preconditioner = solver.getPC()
-    options = direct_options(comm)
-    preconditioner.setType(options["pc_type"])
-    if "pc_factor_mat_solver_type" in options:
-        preconditioner.setFactorSolverType(options["pc_factor_mat_solver_type"])
-    solver.setOptionsPrefix(prefix)
+    solver.getPC().setType(direct_options(comm)["pc_type"])  # whose own default on several ranks is LU
     solver.setFromOptions()
     solver.setUp()
     return solver

@@ -10,16 +10,15 @@ from lyra_petsc.verification.case import Case, Measured
 from lyra_petsc.verification.claims import Converges
 
 DATA = data("catenary")
-SPANS = (0.95, 0.8, 0.5, 0.3)
-WEIGHT = 1e-6
-"""of c11: the strip stretches by no more than that"""
+WEIGHTS = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
+"""Of c11, by span: the strip stretches by no more than that, and the less it sags, the more that counts."""
 
 
 def _measure(bench: Bench, n: float) -> Sequence[Measured]:
     measured = []
     for span, sag in DATA["inextensible"]["rows"]:
-        if span in SPANS:
-            with bench.simulation(hung(bench, int(n), WEIGHT, span * LENGTH, 0.0)) as trial:
+        if span in WEIGHTS:
+            with bench.simulation(hung(bench, int(n), WEIGHTS[span], span * LENGTH, 0.0)) as trial:
                 low = -float(trial.run().x[int(n) // 2, 2])
             measured.append(Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m"))
     return measured
