@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -23,6 +24,10 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.report.numbers import cell
+
+_NUMBER = r"-?\d[\d.]*(e[+-]?\d+)?( ?(s|ms|µs|%))?"
+NUMBER = re.compile(rf"(|–|[<≤] {_NUMBER}|{_NUMBER}( – {_NUMBER})?)")
+"""Cells that are set to the right: nothing, numbers, times and their ranges."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +111,9 @@ class Report:
         marked : sequence of bool, optional
             Rows to be set in bold.
         """
+        texts = [[cell(value) for value in row] for row in rows]
         numeric = [
-            any(isinstance(row[i], int | float) for row in rows)
-            and all(row[i] is None or isinstance(row[i], int | float | str) for row in rows)
+            any(row[i] for row in texts) and all(NUMBER.fullmatch(row[i]) for row in texts)
             for i in range(len(columns))
         ]
         self.blocks.append(
@@ -116,7 +121,7 @@ class Report:
                 "table",
                 caption,
                 columns=list(columns),
-                rows=[[cell(value) for value in row] for row in rows],
+                rows=texts,
                 numeric=numeric,
                 marked=list(marked) if marked is not None else [False] * len(rows),
             )

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lyra_petsc.report.numbers import percent, seconds
-from lyra_petsc.study.analysis import Row, shared_label
+from lyra_petsc.study.analysis import Row, families, shared_label
+from lyra_petsc.study.axes import Axis
 
 TARGETS = (0.1, 0.01, 0.001)
 DEFAULT_TARGET = 0.01
@@ -33,8 +34,16 @@ class Advice:
     words: str
 
 
-def advise(rows: Sequence[Row], quantity: str) -> list[Advice]:
-    """The fastest setting for each accuracy, among what ran; nothing is extrapolated."""
+def advise(rows: Sequence[Row], quantity: str, axis: Axis | None = None) -> list[Advice]:
+    """The fastest setting for each accuracy, among what ran; nothing is extrapolated.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    quantity : str
+    axis : Axis, optional
+        Along it a winner may be the coarsest that ran, which the words then say.
+    """
     able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
     if not able:
         return []
@@ -42,10 +51,13 @@ def advise(rows: Sequence[Row], quantity: str) -> list[Advice]:
     targets = list(TARGETS)
     while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
         targets.append(targets[-1] / 10.0)
-    return [_advice(able, quantity, float(f"{target:.3g}")) for target in targets]
+    coarsest: list[Row] = []
+    if axis is not None:
+        coarsest = [group[0] for group in families(able, axis).values()]
+    return [_advice(able, quantity, float(f"{target:.3g}"), coarsest) for target in targets]
 
 
-def _advice(rows: Sequence[Row], quantity: str, target: float) -> Advice:
+def _advice(rows: Sequence[Row], quantity: str, target: float, coarsest: Sequence[Row]) -> Advice:
     good = [row for row in rows if row.at_most(quantity) <= target]
     if not good:
         best = min(rows, key=lambda row: row.at_most(quantity))
@@ -56,9 +68,9 @@ def _advice(rows: Sequence[Row], quantity: str, target: float) -> Advice:
             f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run)}.",
         )
     winner = min(good, key=lambda row: row.run)
-    words = (
-        f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run)} ({_error(winner, quantity)})"
-    )
+    tried = ", the coarsest that ran" if any(row is winner for row in coarsest) else ""
+    words = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run)}"
+    words += f" ({_error(winner, quantity)}{tried})"
     high = max(winner.result.run_seconds())
     ties = [
         row

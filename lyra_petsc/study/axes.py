@@ -35,6 +35,20 @@ USUAL_OPTIONS = ("ksp_rtol", "ksp_atol", "ksp_max_it", "ksp_type", "pc_type", "s
 NUMERICAL = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius", "solver.", "petsc.")
 """Keys that change how a scene is solved; every other key makes another scene, with its own reference."""
 
+SYNONYMS = {
+    "step": "dt",
+    "timestep": "dt",
+    "time_step": "dt",
+    "h": "mesh",
+    "size": "mesh",
+    "rtol": "ksp_rtol",
+    "scheme": "integrator",
+    "method": "integrator",
+    "ts_dt": "dt",
+    "ts_type": "integrator",
+}
+"""What users may call the keys; refused with the right name."""
+
 MOST_COMBINATIONS = 10_000
 
 
@@ -128,13 +142,13 @@ def path_of(key: str) -> str:
         return SHORT_NAMES.get(key, key)
     if "." in key or "[" in key:
         return key.replace("mesh.size", "mesh") if key == "mesh.size" else key
-    if OPTION.fullmatch(key):
+    if OPTION.fullmatch(key) and key not in SYNONYMS:
         return f"petsc.{key}"
     if key in list(Scene.keys()):
         return key
-    known = ["mesh", *SHORT_NAMES, *USUAL_OPTIONS]
+    hint = nearest(SYNONYMS.get(key.lower(), key), ["mesh", *SHORT_NAMES, *USUAL_OPTIONS])
     raise InputError(
-        f"unknown key, {nearest(key, known)}; any key of the scene can vary by its path, as in time.step",
+        f"unknown key, {hint}; any key of the scene can vary by its path, as in time.step",
         key=f"--vary {key}",
     )
 

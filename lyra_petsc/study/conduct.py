@@ -16,7 +16,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.report.extras import PACKAGES
 from lyra_petsc.study.advice import Advice, advise, choose_recommended
 from lyra_petsc.study.analysis import Row, mark_front, observed_orders
-from lyra_petsc.study.pages import make_report
+from lyra_petsc.study.pages import main_axis, make_report
 from lyra_petsc.study.reference import Physics, physics_of
 from lyra_petsc.study.tables import content, write_csv
 from lyra_petsc.study.work import Known, Work
@@ -70,7 +70,7 @@ def conduct(comm: MPI.Comm, work: Work, command: str) -> Outcome:
     for physics in known:
         mine = [row for row in rows if physics_of(row.combination) == physics]
         mark_front(mine, main)
-        outcome.advice[physics] = advise(mine, main)
+        outcome.advice[physics] = advise(mine, main, main_axis(plan.axes))
         choose_recommended(mine, outcome.advice[physics], main)
     orders = observed_orders(rows, plan.axes, [quantity.name for quantity in plan.quantities])
     facts: dict[str, Any] = {

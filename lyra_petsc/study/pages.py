@@ -16,7 +16,7 @@ from lyra_petsc.study.combination import described
 from lyra_petsc.study.plan import Plan
 from lyra_petsc.study.quantities import Quantity
 from lyra_petsc.study.reference import Physics, physics_of
-from lyra_petsc.study.refine import SAFETY
+from lyra_petsc.study.refine import SAFETY, refines_time
 from lyra_petsc.study.tables import PHASES
 from lyra_petsc.study.work import Known
 
@@ -70,9 +70,24 @@ def _advise(report: Report, plan: Plan, physics: Physics, known: Known, advice: 
     main = plan.quantities[0]
     report.paragraph(
         f"Errors are meant as: {main.title}, at any sample time. Run times are medians of the steps alone, "
-        "without set-up and output. Nothing is extrapolated: only what ran is recommended."
+        "without set-up and output. Nothing is extrapolated: only what ran is recommended. "
+        + _left_out(plan, known)
     )
     report.bullets([one.words for one in advice])
+
+
+def _left_out(plan: Plan, known: Known) -> str:
+    """Which error is common to all runs and their reference, and hence not in the numbers."""
+    if known.kind == "exact":
+        return "The errors are whole: the reference is exact on any mesh."
+    if plan.axis("mesh") is None:
+        return "All runs and the reference share one mesh: its own error is not in these numbers."
+    if known.kind == "finer" and not plan.static and not refines_time(plan):
+        return (
+            "All runs and the reference share the time integration: its error is not in these numbers, "
+            "which are those of the mesh."
+        )
+    return "The errors are those of the mesh and of all else that is solved."
 
 
 def _what(plan: Plan, rows: Sequence[Row], facts: Mapping[str, Any]) -> list[str]:

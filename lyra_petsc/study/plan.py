@@ -121,6 +121,8 @@ def make_plan(request: Request) -> Plan:
     for axis in axes:
         _refuse_fixed(axis)
         _check_alone(request, base, axis)
+        if axis.path == "mesh":
+            notes += _numbered_vertices(base)
     end = petsc_number("ts_max_time", base.time.end)
     every = _sampling(base, axes, end, notes)
     return Plan(request, base, axes, combinations(axes), quantities, end, every, notes)
@@ -185,6 +187,17 @@ def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -
             "to land on them (--set output.every=… changes it)"
         )
     return every
+
+
+def _numbered_vertices(base: Scene) -> list[str]:
+    """A note on vertices picked by number, which are others on another mesh."""
+    picked = [f"handles[{i}]" for i, handle in enumerate(base.handles) if handle.nodes is not None]
+    picked += [f"loads[{i}]" for i, load in enumerate(base.loads) if load.nodes is not None]
+    picked += [f"probes.{name}" for name, probe in base.probes.items() if probe.nodes is not None]
+    if not picked:
+        return []
+    listed = ", ".join(picked)
+    return [f"{listed}: vertices picked by number are others on another mesh; use group or box"]
 
 
 def _refuse_fixed(axis: Axis) -> None:

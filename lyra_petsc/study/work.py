@@ -18,7 +18,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.study.analysis import Row, mark_unresolved
-from lyra_petsc.study.case import Job, Result, fingerprint, read_result
+from lyra_petsc.study.case import RESULT_FILE, Job, Result, fingerprint, read_result
 from lyra_petsc.study.combination import LEAN, Combination, scene_of
 from lyra_petsc.study.folder import CASES
 from lyra_petsc.study.measure import Errors, Party, against_motion, against_run
@@ -174,8 +174,14 @@ class Work:
         )
         assert job is not None
         found = on_root(self.comm, lambda: read_result(folder, job.fingerprint))
+        stale = on_root(self.comm, lambda: found is None and (folder / RESULT_FILE).exists())
         self._observer.case(label, resumed=found is not None)
         if found is None:
+            if stale:
+                self._observer.note(
+                    f"{label} was finished with another scene, program, options, repeats or ranks: "
+                    "it runs again"
+                )
             begun = self._done
 
             def watch(fraction: float) -> None:
@@ -185,6 +191,9 @@ class Work:
             self._warm.add(kind)
         else:
             self.reused += 1
+            self._done += weight
+            self._observer.progress(self._done, self._whole)
+            return found
         if found.problem:
             self._observer.note(f"{label} failed: {found.problem}")
         self._done += weight
