@@ -25,7 +25,7 @@ from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.start import start_positions, start_velocities
-from lyra_petsc.stepping.schemes import scheme_of
+from lyra_petsc.stepping.schemes.registry import scheme_of
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import REGISTRY, Registration, active

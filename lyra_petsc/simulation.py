@@ -20,6 +20,7 @@ from lyra_petsc.solvers.options import fill_gaps, petsc_number
 from lyra_petsc.stepping.control import LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.local_error import LocalError
+from lyra_petsc.stepping.rounding import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.work import Budget, Ledger
 
@@ -90,7 +91,7 @@ class Simulation:
         outline, system = self.model.outline, self.model.system
         with self.phases("solve"):
             self.stepper = Stepper(
-                scene, system, self.model.pattern, outline.spacing, system.roundoff(outline.reach)
+                scene, system, self.model.pattern, outline.spacing, residual_roundoff(system, outline.reach)
             )
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
@@ -105,7 +106,7 @@ class Simulation:
         self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
-            floor = system.roundoff(outline.reach)
+            floor = residual_roundoff(system, outline.reach)
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, floor)
 
     def _control(self, step: float, end: float) -> StepControl:

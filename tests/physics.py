@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from lyra_petsc.model import Model, build_model
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.rounding import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic
 
@@ -101,7 +102,11 @@ class Simulation:
         self.system = self.model.system
         outline = self.model.outline
         self.stepper = Stepper(
-            self.scene, self.system, self.model.pattern, outline.spacing, self.system.roundoff(outline.reach)
+            self.scene,
+            self.system,
+            self.model.pattern,
+            outline.spacing,
+            residual_roundoff(self.system, outline.reach),
         )
         self.stepper.start(0.0, 0)
         self.time = 0.0

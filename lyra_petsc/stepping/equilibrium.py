@@ -3,7 +3,7 @@
 Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian where the
 shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy, until
 the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
-are taken anew before every solve.
+are taken anew before every solve, under-relaxed.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -17,7 +17,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.schema import Solver
-from lyra_petsc.stepping.schemes import Static
+from lyra_petsc.stepping.relaxation import Relaxation
+from lyra_petsc.stepping.schemes.static import Static
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.system import ReducedSystem
 
@@ -30,6 +31,12 @@ EASY, FAIR = 6, 15
 """Newton iterations up to which Δτ grows fast, and up to which it grows."""
 
 GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
+
+LONGEST = 1e7
+"""Largest Δτ over the first one: beyond it the last term is round-off."""
+
+WORSE = 2.0
+"""Growth of the out-of-balance force in a solve after which Δτ was too long."""
 
 
 class Equilibrium:
@@ -54,6 +61,8 @@ class Equilibrium:
         self._system, self._stepper, self._scheme = system, stepper, system.scheme
         self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
         self._first = True
+        self._longest = LONGEST
+        self._follows = bool(system.viscous) or any(load.follows for load in system.loads)
         system.load_factor = 0.0
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
@@ -67,7 +76,8 @@ class Equilibrium:
         x = system.x[:n].copy()
         system.load_factor = factor
         newton = linear = solves = 0
-        anchored = 0.0
+        anchored, last = 0.0, np.inf
+        relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
         while solves < MOST_SOLVES:
             force = self._out_of_balance(before, factor)
@@ -77,12 +87,19 @@ class Equilibrium:
                 return dataclasses.replace(
                     attempt, newton_iterations=newton, linear_iterations=linear, residual=force
                 )
+            if force > WORSE * last:
+                self._scheme.pseudo *= SHRINK
+            last = force
+            system.given_loads = relaxation.following(system.loads_now) if self._follows else None
             attempt = self._stepper.attempt(before, factor)
+            system.given_loads = None
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if attempt.converged:
-                self._scheme.pseudo *= growth(attempt.newton_iterations)
+                self._scheme.pseudo = min(
+                    self._scheme.pseudo * growth(attempt.newton_iterations), self._longest
+                )
             elif self._stepper.linear_solver_failed:
                 break
             else:
@@ -106,6 +123,7 @@ class Equilibrium:
             fastest = float(np.abs(force / system.mass[:, None]).max(initial=0.0))
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
             self._scheme.pseudo = float(np.sqrt(self._spacing / fastest))
+            self._longest = LONGEST * self._scheme.pseudo
         return norm
 
     def _allowed(self) -> float:

@@ -13,7 +13,6 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.stepping.schemes import Bdf2
 from lyra_petsc.stepping.system import ReducedSystem
 
 Array = NDArray[np.float64]
@@ -56,7 +55,7 @@ class LocalError:
         else:
             assert self._slope is not None
             third = 2.0 * (slope - self._slope) / (dt + self._dt)
-            error = self._constant(dt) * dt**3 * third
+            error = system.scheme.error_constant * dt**3 * third
         largest = float(np.abs(error).max(initial=0.0, where=~system.mask[:n]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
@@ -65,13 +64,6 @@ class LocalError:
         if self._system.scheme.order > 1:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
-
-    def _constant(self, dt: float) -> float:
-        scheme = self._system.scheme
-        if isinstance(scheme, Bdf2) and self._dt > 0.0:
-            r = dt / self._dt
-            return (1.0 + r) ** 2 / (6.0 * r * (1.0 + 2.0 * r))
-        return scheme.error_constant
 
     def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""

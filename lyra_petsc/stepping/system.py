@@ -14,6 +14,8 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -23,7 +25,7 @@ from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
 from lyra_petsc.stepping.departures import Departures
 from lyra_petsc.stepping.prescribed import Prescribed
-from lyra_petsc.stepping.schemes import Follower, Scheme, Stage
+from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 
 Array = NDArray[np.float64]
@@ -61,8 +63,9 @@ class ReducedSystem:
         Who must hear of jumps and of the accelerations after them: the scheme, an error estimate.
     load_factor : float
         Factor on all loads (1 in a motion).
-    unbalanced : (n_owned, 3) or None
-        Force [N] of the start shape that a static analysis lets go of with the load factor.
+    unbalanced, given_loads : (n_owned, 3) or None
+        Of a static analysis: force [N] of the start shape, let go of with the load factor; loads to take
+        instead of those at the present shape.
     """
 
     def __init__(
@@ -105,6 +108,7 @@ class ReducedSystem:
         self.followers: list[Follower] = [scheme]
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
+        self.given_loads: Array | None = None
 
     def begin(self, time: float) -> None:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
@@ -126,46 +130,52 @@ class ReducedSystem:
         if changed or t0 in self._events:
             for follower in self.followers:
                 follower.disturbed()
-        self._tell_accelerations()
+        asking = [follower for follower in self.followers if follower.needs_acceleration]
+        acceleration = self.out_of_balance()[0] / self.mass[:, None] if asking else self.history
+        for follower in asking:
+            follower.start_from(acceleration)
         n = self.points.n_owned
         self.stage = stage = self.scheme.stage(self.x[:n], self.v[:n], self.dt)
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.anchored = self._clamped()
 
-    def _tell_accelerations(self) -> None:
-        asking = [follower for follower in self.followers if follower.needs_acceleration]
-        acceleration = self.out_of_balance()[0] / self.mass[:, None] if asking else self.history
-        for follower in asking:
-            follower.start_from(acceleration)
-
     def _freeze(self, at: float) -> None:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
-        n, t0, t1 = self.points.n_owned, self.t0, self.t1
+        n = self.points.n_owned
         for term in self.elastic:
-            term.prepare(t0, t1, at)
+            term.prepare(self.t0, self.t1, at)
         reach = float(np.abs(self.x).max(initial=0.0))
         self._energy_scales = [reach * term.force_scale(reach)[: term.n_owned] for term in self.elastic]
-        x = self.x
-        if self.scheme.centred and (self.viscous or self.loads or self._damped):
-            x = x + (at - t0) * self.v
+        if self.scheme.moves or self.given_loads is None:
+            self._load(at)
+        else:
+            self._force[:n] = self.given_loads
+        if self._damping is not None:
+            self._damping[:] = 0.0
+            for damped in self._damped:
+                weight = damped.elements.data["damping"]
+                self._add_stiffness(damped, self._frozen(at), 1.0, weight, self._damping)
+
+    def _frozen(self, at: float) -> Array:
+        """Positions (n_local, 3) whose geometry stays as it is during the step."""
+        return self.x + (at - self.t0) * self.v if self.scheme.centred else self.x
+
+    def _load(self, at: float) -> None:
+        """Loads that stay as they are during the step, and the wind's geometry."""
+        n, t0, t1 = self.points.n_owned, self.t0, self.t1
+        x = self._frozen(at) if self.viscous or self.loads else self.x
         self._force[:] = 0.0
         for load in self.loads:
             load.add_force(x, t0, t1, self._force)
         for wind in self.viscous:
             wind.freeze(x, self.v)
-            if self.scheme.explicit:
-                push = np.zeros_like(self._force)
-                wind.add_gradient(self.v, push)
-                self._force -= push
+        if self.viscous and self.scheme.explicit:
+            self._force[:n] -= self._sum(self.viscous, self.v)
         self._force[n:] = 0.0
         self._force *= self.load_factor
         if self.unbalanced is not None:
             self._force[:n] += (1.0 - self.load_factor) * self.unbalanced
-        if self._damping is not None:
-            self._damping[:] = 0.0
-            for damped in self._damped:
-                self._add_stiffness(damped, x, 1.0, damped.elements.data["damping"], self._damping)
 
     def _set_history(self, stage: Stage, at: float) -> None:
         """x_h with its ghosts, and the velocities of the prescribed coordinates."""
@@ -182,6 +192,11 @@ class ReducedSystem:
         else:
             self._prescribed.solve(self._xh[:n], stage.reach)
         self.points.update_ghosts(self._xh)
+
+    @property
+    def loads_now(self) -> Array:
+        """The loads in force (n_owned, 3) [N]."""
+        return self._force[: self.points.n_owned].copy()
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free coordinates at the start of the step, and the norm [N] of the
@@ -206,8 +221,8 @@ class ReducedSystem:
         n = self.points.n_owned
         self._evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
-        moved, rate = self.scheme.end(before, rate_before, v, self.dt)
         given, free = self.scheme.given, self._prescribed.free
+        moved, rate = self.scheme.end(before, rate_before, v, self.dt)
         self.scheme.accepted(before, rate_before, free, self.dt)
         self.x[:n] = np.where(free, moved, self._prescribed.goal) if self.held else moved
         self.v[:n] = rate
@@ -254,19 +269,19 @@ class ReducedSystem:
         parts = {"inertia": self.mass[:, None] * vdot}
         for name, terms in (("internal", self._shell), ("springs", self._springs)):
             if terms:
-                self._gradient[:] = 0.0
-                for term in terms:
-                    term.add_gradient(x, self._gradient)
-                parts[name] = self._gradient[:n].copy()
+                parts[name] = self._sum(terms, x)
         parts["loads"] = -self._force[:n]
         if self._damping is not None:
             parts["damping"] = self._blocks.product(self._damping, vs)
         if self.viscous and not self.scheme.explicit:
-            self._gradient[:] = 0.0
-            for wind in self.viscous:
-                wind.add_gradient(vs, self._gradient)
-            parts["wind"] = self._gradient[:n].copy()
+            parts["wind"] = self._sum(self.viscous, vs)
         return parts
+
+    def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
+        self._gradient[:] = 0.0
+        for term in terms:
+            term.add_gradient(at, self._gradient)
+        return self._gradient[: self.points.n_owned].copy()
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
@@ -289,10 +304,7 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         values = self._values
-        if self._damping is not None:
-            values[:] = self._damping
-        else:
-            values[:] = 0.0
+        values[:] = 0.0 if self._damping is None else self._damping
         for term in self.elastic:
             self._add_stiffness(term, x, blend, self.stage.reach, values)
         if not self.scheme.explicit:
@@ -325,26 +337,14 @@ class ReducedSystem:
         energies, square = [], 0.0
         for term, scale in zip(self.elastic, self._energy_scales, strict=True):
             each = term.energies(x)
-            energies.append(float(each.sum()))
-            square += 2.0 * float(np.vdot(each, scale))
+            energies.append(rate * float(each.sum()))
+            square += 2.0 * rate * rate * float(np.vdot(each, scale))
         work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
-        parts = [inertia, *(rate * e for e in energies), -rate * work]
+        parts = [inertia, *energies, -rate * work]
         if self._damping is not None:
             parts.append(0.5 * float(np.vdot(v, self._blocks.product(self._damping, vs))))
         if not self.scheme.explicit:
             parts += [float(wind.potentials(vs).sum()) for wind in self.viscous]
-        local = np.array([sum(parts), sum(abs(part) for part in parts), rate * rate * square])
+        local = np.array([sum(parts), sum(abs(part) for part in parts), square])
         value, size, square = self.points.comm.allreduce(local)
         return float(value), float(size) + float(np.sqrt(square))
-
-    def roundoff(self, size: float) -> float:
-        """Norm [N] that round-off alone may give the residual: 10 ε of the internal force scale.
-
-        ``size`` [m] is the largest coordinate: differences of such numbers make the strains.
-        """
-        scale = np.zeros(self.points.n_local)
-        for term in self.elastic:
-            amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
-            scale += np.bincount(term.stencil.ravel(), amount, self.points.n_local)
-        square = float(np.sum(scale[: self.points.n_owned] ** 2))
-        return 10.0 * float(np.finfo(float).eps) * float(np.sqrt(self.points.comm.allreduce(square)))

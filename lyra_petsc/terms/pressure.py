@@ -40,6 +40,7 @@ class Pressure(Load):
     """Parameters: elements with stencil (E, 3) and data ``load`` (E,), the number of the scene's load."""
 
     name = "pressure"
+    follows = True
 
     def __init__(self, elements: Elements, pressures: Array, windows: list[Window]) -> None:
         super().__init__(elements)

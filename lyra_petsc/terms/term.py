@@ -96,6 +96,9 @@ class Viscous(Term):
 class Load(Term):
     """A force that does not change within a step."""
 
+    #: whether it depends on the positions at the start of the step
+    follows: ClassVar[bool] = False
+
     @abstractmethod
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
         """Add the force [N] of the step from t0 to t1 [s] that starts at positions x to ``out``."""

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from physics import CLOTH, Simulation, equilateral, grid
 
 from lyra_petsc.scene.control import INTEGRATORS
-from lyra_petsc.stepping.schemes import Bdf2, GeneralisedAlpha
+from lyra_petsc.stepping.schemes.alpha2 import GeneralisedAlpha
+from lyra_petsc.stepping.schemes.bdf2 import Bdf2
 
 Array = NDArray[np.float64]
 

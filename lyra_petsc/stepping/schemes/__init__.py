@@ -1,0 +1,1 @@
+"""Time schemes: one module each, and the registry that a scene picks from."""
