@@ -203,10 +203,12 @@ class Simulation:
                 )
                 return
         if not self.control.failed():
+            moves = self.model.system.scheme.moves
+            now = f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
+            last = f"Δt = {end - self.time:.3g} s" if moves else f"an increment of {end - self.time:.3g}"
             raise SolverError(
-                f"step {self.step_number + 1} (t = {self.time:g} s) did not converge even with Δt = "
-                f"{end - self.time:.3g} s: {attempt.words}; last residual {attempt.residual:.3g} N; "
-                f"the state at t = {self.time:g} s is kept; {attempt.advice}",
+                f"step {self.step_number + 1} ({now}) did not converge even with {last}: {attempt.words}; "
+                f"last residual {attempt.residual:.3g} N; the state at {now} is kept; {attempt.advice}",
                 collective=True,
             )
 

@@ -34,6 +34,8 @@ class Progress:
         Simulated time at which it starts or goes on [s].
     plain : bool
         Lines also on a terminal: PETSc's monitors would tear a bar apart.
+    unit : str
+        Of the time; empty: it is a load factor.
     stream : text stream
         Where to write; stderr, so that stdout stays free for results.
     clock : callable
@@ -47,9 +49,12 @@ class Progress:
         *,
         start: float = 0.0,
         plain: bool = False,
+        unit: str = "s",
         stream: TextIO | None = None,
         clock: Callable[[], float] = wall.monotonic,
     ) -> None:
+        self._name = "t" if unit else "load"
+        self._unit = f" {unit}" if unit else ""
         self._shown = comm.rank == 0
         self._start, self._end = start, end
         self._clock = clock
@@ -87,8 +92,8 @@ class Progress:
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
         left = (now - self._began) * (1 - fraction) / fraction if fraction > 0 else math.nan
         state = (
-            f"t {time:.4g} of {self._end:.4g} s  step {step}  Newton {newton_iterations}  "
-            f"linear {linear_iterations}  energy {energy:.4g} J"
+            f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
+            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"
         )
         since = math.inf if self._last_shown is None else now - self._last_shown
         if self._bar is not None:

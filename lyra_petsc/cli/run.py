@@ -89,7 +89,13 @@ class _Journey:
         simulation, recorder = self._simulation, self._recorder
         outcome = "done"
         self._summarise("running")
-        progress = Progress(self._comm, simulation.control.end, start=simulation.time, plain=_petsc_speaks())
+        progress = Progress(
+            self._comm,
+            simulation.control.end,
+            start=simulation.time,
+            plain=_petsc_speaks(),
+            unit="s" if simulation.model.system.scheme.moves else "",
+        )
         try:
             with progress:
                 self._tell(progress)

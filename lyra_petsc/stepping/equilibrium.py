@@ -106,9 +106,13 @@ class Equilibrium:
                 self._scheme.pseudo *= SHRINK
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        words = attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps"
         return dataclasses.replace(
-            attempt, converged=False, newton_iterations=newton, linear_iterations=linear, words=words
+            attempt,
+            converged=False,
+            newton_iterations=newton,
+            linear_iterations=linear,
+            words=attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps",
+            advice=attempt.advice or "is the sheet held? Else try time.step smaller, or a damped motion",
         )
 
     def _out_of_balance(self, before: float, factor: float) -> float:
