@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import sys
 from collections.abc import Sequence
@@ -18,7 +17,8 @@ from lyra_petsc.cli.progress import duration
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import Interrupted
 from lyra_petsc.verification.registry import NAMES, load
-from lyra_petsc.verification.results import prepare, write
+from lyra_petsc.verification.report import cells, headings
+from lyra_petsc.verification.results import finish, prepare, write
 from lyra_petsc.verification.runner import Outcome, run_case
 
 FAILED = 1
@@ -57,10 +57,19 @@ def verify(comm: MPI.Comm, names: Sequence[str], *, quick: bool, out: Path | Non
         if comm.rank == 0:
             _print_case(console, outcome)
         write(comm, out, outcomes)
+    command = _command(comm, names, quick)
+    note = finish(comm, out, outcomes, command)
     passed = sum(outcome.passed for outcome in outcomes)
     if comm.rank == 0:
         _print_summary(console, outcomes, out)
+        if note:
+            console.print(f"note: {note}")
     return 0 if passed == len(outcomes) else FAILED
+
+
+def _command(comm: MPI.Comm, names: Sequence[str], quick: bool) -> list[str]:
+    launcher = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
+    return [*launcher, "python", "-m", "lyra_petsc", "verify", *names, *(["--quick"] if quick else [])]
 
 
 def list_cases(comm: MPI.Comm) -> None:
@@ -80,22 +89,11 @@ def _print_case(console: Console, outcome: Outcome) -> None:
         rows = outcome.rows_of(quantity)
         verdict = outcome.verdicts[quantity]
         if not rows[0].problem:
-            unit = f" [{rows[0].unit}]" if rows[0].unit != "1" else ""
             table = Table(box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
-            for heading in ("n", "h", f"value{unit}", f"exact{unit}", "error", "order", "steps", "wall [s]"):
+            for heading in headings(rows[0].unit):
                 table.add_column(Text(heading), justify="right")
             for row in rows:
-                order = "" if math.isnan(row.order) else f"{row.order:.2f}"
-                table.add_row(
-                    f"{row.n:g}",
-                    f"{row.h:.4g}",
-                    f"{row.value:.9g}",
-                    f"{row.exact:.9g}",
-                    f"{row.error:.2e}",
-                    order,
-                    str(row.steps),
-                    f"{row.wall_seconds:.2f}",
-                )
+                table.add_row(*cells(row))
             console.print(Text(f"  {quantity}"))
             console.print(table)
         word = "passed" if verdict.passed else "FAILED"
@@ -105,7 +103,7 @@ def _print_case(console: Console, outcome: Outcome) -> None:
 
 def _print_summary(console: Console, outcomes: Sequence[Outcome], out: Path | None) -> None:
     table = Table("case", "verdict", box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column(Text("wall [s]"), justify="right")
+    table.add_column(Text("run time [s]"), justify="right")
     for outcome in outcomes:
         table.add_row(outcome.case.name, "passed" if outcome.passed else "FAILED", f"{outcome.seconds:.1f}")
     console.print(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
@@ -145,12 +146,15 @@ class Bench:
     ----------
     steps : int
         Accepted steps so far.
+    latest : (int, float)
+        Accepted steps and wall seconds of the latest simulation, set-up included.
     """
 
     def __init__(self, comm: MPI.Comm, watch: Callable[[], None] | None = None) -> None:
         self.comm = comm
         self.watch = watch or (lambda: None)
         self.steps = 0
+        self.latest = (0, 0.0)
         self._folder: TemporaryDirectory[str] | None = None
         self._files = 0
 
@@ -198,7 +202,7 @@ class Bench:
         except ValidationError as error:
             raise input_error(error, filled, file="scene of the case") from None
         ours = [name for name in scene.petsc if not is_set(name)]
-        simulation = None
+        simulation, began, steps = None, time.perf_counter(), self.steps
         try:
             simulation = Simulation(self.comm, scene)
             yield Trial(self, simulation)
@@ -208,6 +212,7 @@ class Bench:
             raise
         # after any other error this rank may be alone, and freeing would wait for the others
         self._free(simulation, ours)
+        self.latest = (self.steps - steps, time.perf_counter() - began)
 
     def _free(self, simulation: Simulation | None, options: list[str]) -> None:
         if simulation is not None:

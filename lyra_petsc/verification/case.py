@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -58,8 +58,10 @@ class Case:
         Where the answer comes from.
     resolutions : sequence of float
         n, ascending: the higher, the finer.
-    measure : callable (bench, n) → sequence of Measured
-        Collective; the same result on every rank. `simulated` makes one from a scene.
+    measure : callable (bench, n) → Measured, one by one
+        Collective; the same result on every rank. A generator that yields what a simulation gave as soon
+        as that has ended has its steps and run time charged to it, any other iterable those of all its
+        simulations. `simulated` makes one from a scene.
     claim : Claim
         What every quantity must satisfy.
     claims : mapping of quantity → Claim
@@ -76,7 +78,7 @@ class Case:
     title: str
     source: str
     resolutions: Sequence[float]
-    measure: Callable[[Bench, float], Sequence[Measured]]
+    measure: Callable[[Bench, float], Iterable[Measured]]
     claim: Claim
     claims: Mapping[str, Claim] = field(default_factory=dict)
     quick: int = 2

@@ -15,6 +15,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
+from lyra_petsc.verification.report import write_report
 from lyra_petsc.verification.runner import Outcome
 
 COLUMNS = (
@@ -68,6 +69,13 @@ def write(comm: MPI.Comm, folder: Path | None, outcomes: Sequence[Outcome]) -> N
         return
     on_root(comm, lambda: replace_text(folder / "verify.csv", _csv(outcomes)))
     write_summary(folder / "verify.json", _content(comm, outcomes), comm)
+
+
+def finish(comm: MPI.Comm, folder: Path | None, outcomes: Sequence[Outcome], command: Sequence[str]) -> str:
+    """Write the report; what is missing for its plots, in words; collective."""
+    if folder is None:
+        return ""
+    return on_root(comm, lambda: write_report(folder, outcomes, versions(), comm.size, command)) or ""
 
 
 def _csv(outcomes: Sequence[Outcome]) -> str:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.verification.bench import Bench
-from lyra_petsc.verification.case import Case
+from lyra_petsc.verification.case import Case, Measured
 from lyra_petsc.verification.claims import Row, Verdict, observed_order
 
 
@@ -98,29 +99,36 @@ def run_case(
 
 
 def _rows_at(comm: MPI.Comm, watch: Callable[[], None] | None, case: Case, n: float) -> list[Row]:
-    """The rows of one resolution; one that says why where it cannot run."""
+    """The rows of one resolution, and one that says why where it cannot run to its end."""
     comm.Barrier()
     began = time.perf_counter()
-    try:
-        with Bench(comm, watch) as bench:
+    rows: list[Row] = []
+    problem = None
+    measured: Iterable[Measured] = ()
+    with Bench(comm, watch) as bench:
+        bench.watch()
+        try:
             measured = case.measure(bench, n)
-    except (InputError, SolverError) as error:
-        # what one rank alone met cannot be gone past: the others still wait for it
-        if isinstance(error, SolverError) and not error.collective and comm.size > 1:
-            raise
-        return [Row("could not run", "", n, case.size(n), problem=" ".join(str(error).split()))]
-    seconds = comm.allreduce(time.perf_counter() - began, MPI.MAX)
-    return [
-        Row(
-            one.quantity,
-            one.unit,
-            n,
-            case.size(n),
-            one.value,
-            one.exact,
-            one.error,
-            steps=bench.steps,
-            wall_seconds=seconds,
-        )
-        for one in measured
+            for one in measured:
+                steps, seconds = bench.latest
+                row = Row(
+                    one.quantity, one.unit, n, case.size(n), one.value, one.exact, one.error,
+                    steps=steps, wall_seconds=seconds,
+                )  # fmt: skip
+                rows.append(row)
+        except (InputError, SolverError) as error:
+            # what one rank alone met cannot be gone past: the others still wait for it
+            if isinstance(error, SolverError) and not error.collective and comm.size > 1:
+                raise
+            problem = " ".join(str(error).split())
+    if not isinstance(measured, Generator):
+        whole = time.perf_counter() - began
+        rows = [dataclasses.replace(row, steps=bench.steps, wall_seconds=whole) for row in rows]
+    slowest = np.max(comm.allgather([row.wall_seconds for row in rows]), axis=0)
+    rows = [
+        dataclasses.replace(row, wall_seconds=float(seconds))
+        for row, seconds in zip(rows, slowest, strict=True)
     ]
+    if problem is not None:
+        rows.append(Row("could not run", "", n, case.size(n), problem=problem))
+    return rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 from lyra_petsc.verification.bar_strip import LENGTH, hung
 from lyra_petsc.verification.bench import Bench, data
@@ -14,14 +14,12 @@ WEIGHTS = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
 """Of c11, by span: the strip stretches by no more than that, and the less it sags, the more that counts."""
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for span, sag in DATA["inextensible"]["rows"]:
         if span in WEIGHTS:
             with bench.simulation(hung(bench, int(n), WEIGHTS[span], span * LENGTH, 0.0)) as trial:
                 low = -float(trial.run().x[int(n) // 2, 2])
-            measured.append(Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m"))
-    return measured
+            yield Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m")
 
 
 CASE = Case(

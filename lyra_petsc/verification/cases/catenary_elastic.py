@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 from lyra_petsc.verification.bar_strip import LENGTH, hung
 from lyra_petsc.verification.bench import Bench, data
@@ -14,15 +14,13 @@ STRIPS = ((0.001, 0.8), (0.01, 0.5), (0.01, 1.0), (0.1, 0.8), (1.0, 0.5), (1.0, 
 """e and span of the rows that are run"""
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for e, span, sag, _, _ in DATA["elastic"]["rows"]:
         if (e, span) in STRIPS:
             with bench.simulation(hung(bench, int(n), e, span * LENGTH, 0.0)) as trial:
                 low = -float(trial.run().x[int(n) // 2, 2])
             name = f"sag, weight {e:g} of c11, span {span:g} of the length"
-            measured.append(Measured(name, low, sag * LENGTH, "m"))
-    return measured
+            yield Measured(name, low, sag * LENGTH, "m")
 
 
 CASE = Case(

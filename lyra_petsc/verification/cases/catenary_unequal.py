@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 from lyra_petsc.verification.bar_strip import LENGTH, hung
 from lyra_petsc.verification.bench import Bench, data
@@ -24,16 +24,14 @@ def middle(a: float, lowest: float) -> tuple[float, float]:
     return x, a * (math.cosh((x - lowest) / a) - math.cosh(lowest / a))
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for dx, dz, a, lowest, _, _ in DATA["rows"]:
         with bench.simulation(hung(bench, int(n), WEIGHT, dx * LENGTH, dz * LENGTH)) as trial:
             x = trial.run().x[int(n) // 2]
         exact = middle(a, lowest)
         supports = f"right support {dx:g} L away, {dz:g} L up"
-        measured.append(Measured(f"x of the middle, {supports}", float(x[0]), exact[0] * LENGTH, "m"))
-        measured.append(Measured(f"z of the middle, {supports}", float(x[2]), exact[1] * LENGTH, "m"))
-    return measured
+        yield Measured(f"x of the middle, {supports}", float(x[0]), exact[0] * LENGTH, "m")
+        yield Measured(f"z of the middle, {supports}", float(x[2]), exact[1] * LENGTH, "m")
 
 
 CASE = Case(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -43,17 +43,14 @@ def _scene(mesh: dict[str, Any], n: int, nu: float, e: float) -> dict[str, Any]:
     }
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     mesh = bench.mesh(*quarter_disc(int(n), RADIUS))
-    measured = []
     for nu, e, exact in DATA["rows"]:
         if (nu, e) in LOADS:
             with bench.simulation(_scene(mesh, int(n), nu, e)) as trial:
                 sag = -float(trial.run().x[0, 2])
-            measured.append(
-                Measured(f"central deflection, ν = {nu:g}, load {e:g} C/a", sag, exact * RADIUS, "m")
-            )
-    return measured
+            name = f"central deflection, ν = {nu:g}, load {e:g} C/a"
+            yield Measured(name, sag, exact * RADIUS, "m")
 
 
 CASE = Case(

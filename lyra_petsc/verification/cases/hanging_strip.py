@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 from lyra_petsc.verification.bench import Bench, data
@@ -28,15 +28,13 @@ def _scene(n: int, e: float) -> dict[str, Any]:
     }
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for e, exact in DATA["strip"]["rows"]:
         if e in WEIGHTS:
             with bench.simulation(_scene(int(n), e)) as trial:
                 x = trial.run().x
             end = float(x[[int(n), 2 * int(n) + 1], 0].mean()) - LENGTH
-            measured.append(Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m"))
-    return measured
+            yield Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m")
 
 
 CASE = Case(

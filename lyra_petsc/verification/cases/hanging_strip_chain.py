@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -35,15 +35,13 @@ def _scene(n: int, e: float) -> dict[str, Any]:
     }
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for e, bars, exact in DATA["chain"]["rows"]:
         if bars == n:
             with bench.simulation(_scene(int(n), e)) as trial:
                 x = trial.run().x
             end = farthest(x[[int(n), 2 * int(n) + 1], 0] - LENGTH, exact * LENGTH)
-            measured.append(Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m", LENGTH))
-    return measured
+            yield Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m", LENGTH)
 
 
 CASE = Case(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,21 @@ PERIOD = 2.0 * math.pi / DATA["omega"]["11"]
 """s"""
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
-    measured: list[Measured] = []
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     for integrator in INTEGRATORS:
         omega, states = _followed(bench, n, integrator)
         turn, dt = -np.unwrap(np.angle(states)), PERIOD / n
         per_step = float(turn[-1] - turn[0]) / (len(states) - 1)
-        measured.append(Measured(f"ω, {integrator}", per_step / dt, omega, "rad/s"))
+        yield Measured(f"ω, {integrator}", per_step / dt, omega, "rad/s")
         x = omega * dt
         if integrator == "beuler":
             shrunk = float(abs(states[-1] / states[-2]))
-            measured.append(Measured("phase of a step, beuler", per_step, math.atan(x), "rad"))
-            measured.append(Measured("amplification of a step, beuler", shrunk, 1.0 / math.hypot(1.0, x)))
+            yield Measured("phase of a step, beuler", per_step, math.atan(x), "rad")
+            yield Measured("amplification of a step, beuler", shrunk, 1.0 / math.hypot(1.0, x))
         if integrator == "midpoint":
             shrunk = float(abs(states[-1] / states[-2]))
-            measured.append(Measured("phase of a step, midpoint", per_step, 2.0 * math.atan(0.5 * x), "rad"))
-            measured.append(Measured("amplification of a step, midpoint", shrunk, 1.0))
-    return measured
+            yield Measured("phase of a step, midpoint", per_step, 2.0 * math.atan(0.5 * x), "rad")
+            yield Measured("amplification of a step, midpoint", shrunk, 1.0)
 
 
 def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[np.complex128]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -36,10 +36,9 @@ def _scene(mesh: dict[str, Any], material: str, stretch: float) -> dict[str, Any
     }
 
 
-def _measure(bench: Bench, n: float) -> Sequence[Measured]:
+def _measure(bench: Bench, n: float) -> Iterator[Measured]:
     vertices, triangles = irregular_rectangle(int(n), WIDTH, HEIGHT)
     mesh = bench.mesh(vertices, triangles)
-    measured = []
     for material, along, across, pull in DATA["uniaxial"]["rows"]:
         with bench.simulation(_scene(mesh, material, along)) as trial:
             trial.run()
@@ -51,9 +50,8 @@ def _measure(bench: Bench, n: float) -> Sequence[Measured]:
             end = vertices[:, 0] > WIDTH - NEAR
             pulled = float(trial.gather(force)[end, 0].sum()) / HEIGHT
         name = f"{material}, stretched by {along:g}"
-        measured.append(Measured(f"largest displacement off, {name}", off, 0.0, "m", WIDTH))
-        measured.append(Measured(f"force per width, {name}", pulled, pull, "N/m"))
-    return measured
+        yield Measured(f"largest displacement off, {name}", off, 0.0, "m", WIDTH)
+        yield Measured(f"force per width, {name}", pulled, pull, "N/m")
 
 
 CASE = Case(
