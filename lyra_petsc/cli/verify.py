@@ -16,6 +16,7 @@ from rich.text import Text
 from lyra_petsc.cli.progress import duration
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import Interrupted
+from lyra_petsc.solvers.options import unused
 from lyra_petsc.verification.registry import NAMES, load
 from lyra_petsc.verification.report import cells, headings
 from lyra_petsc.verification.results import finish, prepare, write
@@ -63,7 +64,11 @@ def verify(comm: MPI.Comm, names: Sequence[str], *, quick: bool, out: Path | Non
     if comm.rank == 0:
         _print_summary(console, outcomes, out)
         if note:
-            console.print(f"note: {note}")
+            console.print(Text(f"note: {note}"))
+        left = unused([])
+        if left:
+            listed = ", ".join(f"-{name}" for name in left)
+            print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
     return 0 if passed == len(outcomes) else FAILED
 
 
@@ -111,4 +116,4 @@ def _print_summary(console: Console, outcomes: Sequence[Outcome], out: Path | No
     total = sum(outcome.seconds for outcome in outcomes)
     console.print(f"{passed} of {len(outcomes)} cases passed, {duration(total)} in all")
     if out is not None:
-        console.print(f"results: {out}")
+        console.print(Text(f"results: {out}"))

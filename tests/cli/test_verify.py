@@ -1,0 +1,151 @@
+"""``verify`` from the command line: tables, folder, exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from launch import environment, lyra, start
+
+from lyra_petsc.verification.registry import NAMES
+
+
+def test_list_names_every_case(tmp_path: Path) -> None:
+    left = lyra(["verify", "--list"], tmp_path)
+    assert left.code == 0, left.err
+    assert [line.split()[0] for line in left.out.splitlines()] == list(NAMES)
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3])
+def test_a_case_passes(tmp_path: Path, ranks: int) -> None:
+    left = lyra(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, ranks)
+    assert left.code == 0, left.err + left.out
+    assert "2 of 2 cases passed" in left.out
+    assert "order 1.00, as expected 1" in left.out
+    assert "exact [m]" in left.out
+    with open(tmp_path / "out" / "verify.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    fall = [row for row in rows if row["case"] == "free-fall" and row["quantity"].startswith("mean z")]
+    assert [float(row["n"]) for row in fall] == [10, 100]
+    assert float(fall[1]["error"]) == pytest.approx(0.1)
+    assert {row["passed"] for row in rows} == {"True"}
+    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    assert content["passed"] is True
+    assert content["ranks"] == ranks
+    assert [case["name"] for case in content["cases"]] == ["free-fall", "patch-states"]
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "2 of 2 cases passed" in report
+    assert "verify free-fall patch-states --quick" in report
+
+
+def test_the_page_holds_its_plots(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    left = lyra(["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
+    assert left.code == 0, left.err
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/svg+xml;base64,") == 2
+    for name in ("free-fall-convergence", "free-fall-run-time"):
+        assert (tmp_path / "out" / "plots" / f"{name}.png").stat().st_size > 1000
+
+
+def test_tables_without_the_packages_for_plots(tmp_path: Path) -> None:
+    program = (
+        "import sys;"
+        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
+        "import importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
+        "from lyra_petsc.cli.app import run_command_line;"
+        "sys.exit(run_command_line(['lyra-petsc', 'verify', 'free-fall', '--quick', '--out', 'out']))"
+    )
+    left = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert left.returncode == 0, left.stderr
+    assert "1 of 1 cases passed" in left.stdout
+    assert "pip install 'lyra-petsc[study]'" in left.stdout
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "report.md",
+        "verify.csv",
+        "verify.json",
+    ]
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_wrong_answer_is_exit_code_1(tmp_path: Path, ranks: int) -> None:
+    # stopped after two steps the sheet has not fallen as far as it should
+    arguments = ["verify", "free-fall", "patch-states", "--quick", "--out", "out", "-ts_max_steps", "2"]
+    left = lyra(arguments, tmp_path, ranks)
+    assert left.code == 1, left.err
+    assert "1 of 2 cases passed" in left.out
+    assert "FAILED" in left.out
+    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    assert content["passed"] is False
+    assert [case["passed"] for case in content["cases"]] == [False, True]
+
+
+def test_a_solver_that_gives_up_is_a_row_and_exit_code_1(tmp_path: Path) -> None:
+    arguments = ["verify", "oscillator", "patch-states", "--quick", "-snes_max_it", "0"]
+    left = lyra(arguments, tmp_path)
+    assert left.code == 1, left.err
+    assert "could not run" in left.out
+    assert "patch-states  passed" in left.out
+    assert left.ours == []
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path, ranks: int) -> None:
+    left = lyra(["verify", "free-fall", "patch-state", "--out", "out"], tmp_path, ranks)
+    assert left.code == 2
+    assert left.ours == ["lyra-petsc: patch-state: unknown case, did you mean 'patch-states'?"]
+    assert left.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    left = lyra(["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert "--force" in left.ours[0]
+    assert list((tmp_path / "out").iterdir()) == []
+    assert lyra(["verify", "free-fall", "--quick", "--out", "out", "--force"], tmp_path).code == 0
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    left = lyra(["verify", "free-fall", "--quick", "--out", "file/out"], tmp_path)
+    assert left.code == 2
+    assert len(left.ours) == 1
+
+
+def test_unused_petsc_options_are_told(tmp_path: Path) -> None:
+    left = lyra(["verify", "free-fall", "--quick", "-snes_typo", "1"], tmp_path)
+    assert left.code == 0
+    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
+
+
+def test_interrupted_after_a_case(tmp_path: Path) -> None:
+    process = start(["verify", "free-fall", "circular-membrane", "--out", "out"], tmp_path)
+    deadline = time.monotonic() + 60.0
+    while not (tmp_path / "out" / "verify.json").exists():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "stopped by SIGINT" in err
+    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    assert [case["name"] for case in content["cases"]] == ["free-fall"]
