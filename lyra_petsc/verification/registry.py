@@ -25,6 +25,7 @@ NAMES = (
     "hanging-chain",
     "released-mode",
     "hinge-strip",
+    "wide-strip",
     "hinge-sheet",
     "hinge-plate",
     "tip-load",
