@@ -8,7 +8,7 @@ from mpi4py import MPI
 from lyra_petsc.verification.registry import NAMES, load
 from lyra_petsc.verification.runner import run_case
 
-SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration")
+SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
 
