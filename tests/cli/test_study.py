@@ -1,0 +1,331 @@
+"""``study`` as a user starts it: what it leaves, how it stops, resumes and refuses."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import math
+import os
+import re
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from launch import Left, done, finish, lyra, start, write_scene
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+pytest.importorskip("scipy")
+
+HANGING = """\
+title: Hanging square
+mesh: {grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}
+material: {density: 0.15, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}, bending: 2.0e-5, damping: 0.005}
+gravity: [0, 0, -9.81]
+handles: [{group: corners}]
+time: {end: 0.08, step: 0.01}
+output: {every: 0.04, fields: [velocity]}
+probes: {middle: {nodes: [12]}}
+"""
+
+FALLING = """\
+mesh: {grid: {width: 0.6, height: 0.4, nx: 3, ny: 2}}
+material: {density: 0.2, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}}
+gravity: [0, 0, -9.81]
+wind: {velocity: [0, 0, 0], density: 1.0}
+time: {end: 0.1, step: 0.01}
+output: {every: 0.05}
+"""
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    with (folder / "study.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def content(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "study.json").read_text(encoding="utf-8"))
+    return found
+
+
+def results(folder: Path) -> dict[str, float]:
+    """When each finished case was finished."""
+    return {path.parent.name: path.stat().st_mtime for path in folder.glob("cases/*/result.json")}
+
+
+def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    words = ["study", "scene.yaml", "--vary", "integrator=beuler,bdf2", "--vary", "dt=0.02,0.01,0.005",
+             "--repeats", "2", "-ksp_rtol", "1e-3"]  # fmt: skip
+    left = done(words, tmp_path)
+    folder = tmp_path / "studies" / "scene"
+    assert "6 of 6 combinations done, 0 failed" in left.out
+    assert "For 1 % choose" in left.out
+    rows = table(folder)
+    assert [row["combination"] for row in rows][:2] == ["001-beuler-0.02", "002-beuler-0.01"]
+    for row in rows:
+        assert row["status"] == "done"
+        assert float(row["dt"]) == pytest.approx(float(row["dt_mean"]))
+        assert int(row["steps"]) == round(0.08 / float(row["dt"]))
+        assert float(row["run_seconds_min"]) <= float(row["run_seconds"]) <= float(row["run_seconds_max"])
+        assert float(row["total_seconds"]) > float(row["run_seconds"])
+        assert float(row["seconds_solve"]) > 0.0
+        assert int(row["newton_iterations"]) >= int(row["steps"])
+        assert row["repeats"] == "2"
+    euler = [float(row["error_position_max"]) for row in rows[:3]]
+    assert euler == sorted(euler, reverse=True)
+    assert float(rows[2]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.25)
+    assert {row["recommended"] for row in rows} == {"yes", "no"}
+    whole = content(folder)
+    assert whole["references"][0]["kind"] == "finer"
+    assert whole["references"][0]["own_error"]["position_max"]["error"] > 0.0
+    assert len(whole["combinations"][0]["timings"]) == 2
+    assert {one["axis"] for one in whole["orders"]} == {"dt"}
+    assert "probe_middle" in whole["quantities"]
+    names = {path.name for path in folder.iterdir()}
+    assert {"work-precision.png", "work-precision.svg", "report.md", "report.html"} <= names
+    assert "convergence-dt-position-max.png" in names
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://", page)
+    assert str(tmp_path) not in page
+    text = (folder / "report.md").read_text(encoding="utf-8")
+    assert (
+        "python -m lyra_petsc study scene.yaml --vary integrator=beuler,bdf2 --vary dt=0.02,0.01,0.005 "
+        "--reference auto --repeats 2 -ksp_rtol 1e-3"
+    ) in text
+    for word in ("Recommendation", "Observed orders", "Reference", "numpy", "Pareto"):
+        assert word in text
+
+
+def test_exact_answers_on_two_ranks(tmp_path: Path) -> None:
+    write_scene(tmp_path, FALLING)
+    words = ["study", "scene.yaml", "--vary", "integrator=beuler,midpoint", "--vary", "dt=0.025,0.0125"]
+    done([*words, "--repeats", "1", "--out", "two"], tmp_path, ranks=2)
+    rows = table(tmp_path / "two")
+    assert content(tmp_path / "two")["references"][0]["kind"] == "exact"
+    assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
+    assert float(rows[3]["order_dt_position_max"]) == pytest.approx(2.0, abs=0.1)
+    assert rows[0]["ranks"] == "2"
+    assert all(row["not_resolved"] == "" for row in rows)
+    assert float(rows[0]["error_position_max"]) == pytest.approx(backward_euler_error(0.025), rel=1e-6)
+
+
+def backward_euler_error(dt: float) -> float:
+    """Of the sheet that falls flat in still air, at 0.05 and 0.1 s, over its diagonal."""
+    g, terminal = 9.81, math.sqrt(0.2 * 9.81 / 1.0)
+    v = z = worst = 0.0
+    for step in range(1, round(0.1 / dt) + 1):
+        drag = dt * g / terminal**2  # v = v_before + g Δt - drag v²
+        v = (math.sqrt(1.0 + 4.0 * drag * (v + g * dt)) - 1.0) / (2.0 * drag)
+        z += dt * v
+        exact = terminal**2 / g * math.log(math.cosh(g * step * dt / terminal))
+        if step * dt in (0.05, 0.1):
+            worst = max(worst, z - exact)
+    return worst / math.hypot(0.6, 0.4)
+
+
+def test_a_failed_combination_is_a_row_and_the_study_goes_on(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    words = ["study", "scene.yaml", "--vary", "max_iterations=1,50", "--vary", "pc_type=pbjacobi,bogus,lu"]
+    left = done(
+        [*words, "--repeats", "1", "--out", "out", "--quantities", "energy", "-ts_adapt_dt_min", "0.004"],
+        tmp_path,
+    )
+    rows = table(tmp_path / "out")
+    assert [row["status"] for row in rows] == ["failed", "failed", "done", "done", "failed", "done"]
+    assert "did not converge" in rows[0]["reason"]
+    assert "bogus" in rows[4]["reason"]
+    assert rows[0]["error_energy"] == ""
+    assert float(rows[3]["error_energy"]) > 0.0
+    assert "3 of 6 combinations done, 3 failed" in left.out
+    report = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
+    assert "What failed" in report
+
+
+def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    left = lyra(
+        ["study", "scene.yaml", "--vary", "max_iterations=1", "--repeats", "1", "--out", "out"], tmp_path
+    )
+    assert left.code == 3
+    assert len(left.ours) == 1
+    assert "all 1 combinations failed" in left.ours[0]
+    assert table(tmp_path / "out")[0]["status"] == "failed"
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.001", "--repeats", "1", "--out", "out"]
+
+
+def wait_for(path: Path, left: Any, seconds: float = 40.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not path.exists():
+        assert left.poll() is None, left.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, code: int) -> None:
+    write_scene(tmp_path, HANGING)
+    process = start(LONG, tmp_path)
+    wait_for(tmp_path / "out" / "cases" / "001-0.02" / "result.json", process)
+    wait_for(tmp_path / "out" / "cases" / "002-0.001" / "history.csv", process)
+    process.send_signal(number)
+    stopped = finish(process)
+    assert stopped.code == code
+    if code > 0:
+        assert "--resume goes on" in stopped.ours[0]
+    before = results(tmp_path / "out")
+    assert "001-0.02" in before
+    assert not (tmp_path / "out" / "study.csv").exists()
+    left = done(["study", "--out", "out", "--resume"], tmp_path)
+    assert "2 of 2 combinations done" in left.out
+    assert "1/2 Δt 20 ms: finished before" in left.err
+    after = results(tmp_path / "out")
+    assert {name: after[name] for name in before} == before
+    # a second time nothing is left to run, and all is written anew
+    (tmp_path / "out" / "study.csv").unlink()
+    done(["study", "scene.yaml", "--out", "out", "--resume"], tmp_path)
+    assert results(tmp_path / "out") == after
+    assert len(table(tmp_path / "out")) == 2
+    # a wider sweep runs what is new
+    done(["study", "--out", "out", "--resume", "--vary", "dt=0.02,0.001,0.01"], tmp_path)
+    wider = results(tmp_path / "out")
+    assert {name: wider[name] for name in after} == after
+    assert len(table(tmp_path / "out")) == 3
+
+
+@pytest.mark.slow
+def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
+    write_scene(tmp_path, FALLING)
+    words = ["study", "scene.yaml", "--vary", "dt=0.025,0.0125", "--repeats", "1", "--ranks", "2"]
+    done([*words, "--vary", "integrator=beuler", "--out", "two", "-ksp_rtol", "1e-4"], tmp_path)
+    rows = table(tmp_path / "two")
+    assert [row["ranks"] for row in rows] == ["2", "2"]
+    assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
+    assert not list(tmp_path.glob("two/cases/*.json"))
+    inside = lyra([*words, "--out", "inside"], tmp_path, ranks=2)
+    assert inside.code == 2
+    assert len(inside.ours) == 1
+    assert "--ranks: starts one mpirun per case" in inside.ours[0]
+    assert not (tmp_path / "inside").exists()
+
+
+def test_ranks_stop_together(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
+    wait_for(tmp_path / "out" / "cases" / "001-0.0001" / "history.csv", process)
+    process.send_signal(signal.SIGTERM)
+    left = finish(process)
+    assert left.code == 143
+    assert len(left.ours) == 1
+    assert results(tmp_path / "out") == {}
+
+
+def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
+    write_scene(tmp_path, FALLING)
+    words = ["study", "scene.yaml", "--vary", "dt=0.05", "--repeats", "1", "--out", "out"]
+    done(words, tmp_path)
+    with (tmp_path / "out" / "study.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        for more in ("--resume", "--force"):
+            left = lyra([*words, more], tmp_path)
+            assert left.code == 2
+            assert "another study is at work" in left.ours[0]
+    before = results(tmp_path / "out")
+    (tmp_path / "out" / "mine.txt").write_text("kept")
+    done([*words, "--force"], tmp_path)
+    assert results(tmp_path / "out") != before
+    assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
+
+
+def test_a_run_as_reference(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    fine = ["run", "scene.yaml", "--set", "time.step=0.0005", "--out", "fine"]
+    done(fine, tmp_path)
+    words = ["study", "scene.yaml", "--vary", "dt=0.01", "--repeats", "1", "--out", "out"]
+    done([*words, "--reference", "run:fine"], tmp_path)
+    whole = content(tmp_path / "out")
+    assert whole["references"][0]["kind"] == "run"
+    assert float(table(tmp_path / "out")[0]["error_position_max"]) > 1e-4
+    for change, words_of_it in (
+        ("mesh.grid.nx=5", "is a run of another mesh"),
+        ("output.every=0.02", "has no state at t = 0.02 s"),
+        ("time.end=0.12", "has no state at t = 0.12 s"),
+    ):
+        refused(tmp_path, [*words[:-1], "new", "--reference", "run:fine", "--set", change], words_of_it)
+
+
+def refused(folder: Path, words: list[str], because: str, ranks: int = 1) -> Left:
+    before = sorted(path.name for path in folder.iterdir())
+    left = lyra(words, folder, ranks=ranks)
+    assert left.code == 2, left.err
+    assert len(left.ours) == 1
+    assert because in left.ours[0]
+    assert sorted(path.name for path in folder.iterdir()) == before
+    return left
+
+
+@pytest.mark.parametrize(
+    ("words", "because"),
+    [
+        (["--vary", "dt="], "no values"),
+        (["--vary", "dt=0.01,x"], "'x' is no number"),
+        (["--vary", "steps=0.01"], "unknown key"),
+        (["--vary", "integrator=buler"], "did you mean 'beuler'"),
+        (["--vary", "ksp_rtol=1e-3", "-ksp_rtol", "1e-4"], "would fix what varies"),
+        (["--quantities", "positon"], "did you mean 'position'"),
+        (["--reference", "exact:free-fall"], "which has handles"),
+        (["--reference", "run:nowhere"], "no such folder"),
+        (["--repeats", "0"], "must be at least 1"),
+        (["--resume"], "no study of scene"),
+        (["--resume", "--force"], "give one of them"),
+        (["--out", "scene.yaml"], "is a file"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, words: list[str], because: str) -> None:
+    write_scene(tmp_path, HANGING)
+    refused(tmp_path, ["study", "scene.yaml", *words], because)
+
+
+def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    refused(tmp_path, ["study", "scene.yaml", "--vary", "dt=0.01,0.01"], "twice", ranks=2)
+
+
+def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    program = (
+        "import lyra_petsc.report.extras as extras; extras.missing = lambda packages=(): ['matplotlib']; "
+        "from lyra_petsc.__main__ import main; main()"
+    )
+    left = lyra(["study", "scene.yaml"], tmp_path, program=("-c", program))
+    assert left.code == 2
+    assert left.ours == [
+        "lyra-petsc: study: matplotlib is not installed; get the extra: pip install 'lyra-petsc[study]'"
+    ]
+    assert not (tmp_path / "studies").exists()
+
+
+def test_a_run_imports_nothing_of_it(tmp_path: Path) -> None:
+    write_scene(tmp_path, HANGING)
+    program = (
+        "import sys; from lyra_petsc.cli.app import run_command_line; code = run_command_line(sys.argv); "
+        "print(sorted({'matplotlib', 'jinja2', 'lyra_petsc.study', 'lyra_petsc.report', 'lyra_petsc.exact'}"
+        " & set(sys.modules))); sys.exit(code)"
+    )
+    left = done(["run", "scene.yaml"], tmp_path, program=("-c", program))
+    assert left.out.splitlines()[-1] == "[]"
+
+
+def test_help_names_everything(tmp_path: Path) -> None:
+    left = done(["study", "--help"], tmp_path)
+    for word in ("--vary", "--reference", "--quantities", "--repeats", "--ranks", "--resume", "--force"):
+        assert word in left.out
+    assert "--job" not in left.out
+    assert os.listdir(tmp_path) == []
