@@ -108,7 +108,11 @@ def _without_line(row: Row) -> str:
 def _error(row: Row, quantity: str) -> str:
     if quantity in row.unresolved:
         return f"error below {percent(row.at_most(quantity))}"
-    return f"error {percent(row.errors[quantity])}"
+    words = f"error {percent(row.errors[quantity])}"
+    largest = row.shown("position_max")
+    if quantity == "position_l2" and math.isfinite(largest):
+        words += f", at most {percent(largest)} anywhere"
+    return words
 
 
 def choose_recommended(rows: Sequence[Row], advice: Sequence[Advice], quantity: str) -> Row | None:

@@ -69,11 +69,17 @@ def _advise(report: Report, plan: Plan, physics: Physics, known: Known, advice: 
         return
     main = plan.quantities[0]
     report.paragraph(
-        f"Errors are meant as: {main.title}, at any sample time. Run times are medians of the steps alone, "
+        f"Errors are meant as: {main.title}{_over(main)}. Run times are medians of the steps alone, "
         "without set-up and output. Nothing is extrapolated: only what ran is recommended. "
         + _left_out(plan, known)
     )
     report.bullets([one.words for one in advice])
+
+
+def _over(quantity: Quantity) -> str:
+    if quantity.name == "position_l2":
+        return ", root mean square over the area and the sample times"
+    return ", the largest at any sample time"
 
 
 def _left_out(plan: Plan, known: Known) -> str:

@@ -31,9 +31,11 @@ class Quantity:
 
 
 POSITION = (
-    Quantity("position_max", "largest error in position / sheet size"),
     Quantity("position_l2", "L2 error in position / sheet size"),
+    Quantity("position_max", "largest error in position / sheet size"),
 )
+"""Root mean square over area and sample times; and the largest at any vertex and sample time."""
+
 ENERGY = Quantity("energy", "error in energy / largest energy exchanged")
 
 

@@ -17,7 +17,7 @@ from lyra_petsc.report.numbers import seconds
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.study.axes import Value
-from lyra_petsc.study.combination import mesh_overrides, time_overrides
+from lyra_petsc.study.combination import mesh_overrides, overrides, time_overrides
 from lyra_petsc.study.measure import Errors
 from lyra_petsc.study.plan import Plan
 
@@ -29,7 +29,7 @@ TIGHTER = 100.0
 TIGHTEST = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 TIMES = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius")
 
-SAFETY = 3.0
+SAFETY = 2.0
 """An error below so many times the reference's own cannot be told from it."""
 
 SLOWEST = 0.5
@@ -117,6 +117,8 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
         size = min(float(value) for value in mesh.values)
         meshes = [size / 2.0, size, 2.0 * size]
     if smallest is None or plan.static:
+        fixed = [axis for axis in plan.axes if axis.path in TIMES and len(axis.values) == 1]
+        common += overrides(plan.base, fixed, [axis.values[0] for axis in fixed])
         best = _level(plan.base, common, meshes[0], None, "")
         if mesh is None:
             loose = Level(
@@ -143,7 +145,8 @@ def refines_time(plan: Plan) -> bool:
     """Whether the reference integrates time more finely: always, but where meshes alone are compared."""
     if plan.static:
         return False
-    return any(axis.path in TIMES for axis in plan.axes) or plan.axis("mesh") is None
+    varies = any(axis.path in TIMES and len(axis.values) > 1 for axis in plan.axes)
+    return varies or plan.axis("mesh") is None
 
 
 def integrators(plan: Plan) -> list[str]:

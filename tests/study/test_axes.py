@@ -79,9 +79,9 @@ def test_settings_in_words() -> None:
 def test_quantities() -> None:
     names = ["tip", "edge"]
     assert [q.name for q in chosen("", names)] == [
-        "position_max", "position_l2", "energy", "probe_tip", "probe_edge"
+        "position_l2", "position_max", "energy", "probe_tip", "probe_edge"
     ]  # fmt: skip
-    assert [q.name for q in chosen("", [])] == ["position_max", "position_l2", "energy"]
+    assert [q.name for q in chosen("", [])] == ["position_l2", "position_max", "energy"]
     assert [q.name for q in chosen("edge,energy", names)] == ["probe_edge", "energy"]
 
 

@@ -169,6 +169,13 @@ def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> No
     ]  # fmt: skip
 
 
+def test_one_integrator_beside_meshes_is_the_references_too(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "integrator=alpha2", "dt=0.005")
+    assert not refines_time(plan)
+    family = make_family(plan, [], None, "")
+    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(family.best.overrides)
+
+
 def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "dt=0.02,0.01", "ksp_rtol=1e-2,1e-4")
     family = make_family(plan, [], 0.01, "alpha2")
