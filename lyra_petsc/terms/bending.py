@@ -165,21 +165,38 @@ def _angles_from_curvature(rest: RestShape, quad: NDArray[np.int64], triangles: 
 
     Positive curvature raises the sheet towards its normal, which makes the angle negative.
     """
-    curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells])
-    k11, k22, k12 = curved[rest.shell_of[triangles[:, 0]]].T
+    ee, nn, en = _rest_curvature(rest, triangles[:, 0], quad)
     edge, _ = edge_in_material(rest, triangles[:, 0], quad[:, 0], quad[:, 1])
     length = np.linalg.norm(edge, axis=1)
-    t = edge / length[:, None]
-    # κ in the frame (edge, across)
-    ee = k11 * t[:, 0] ** 2 + 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 1] ** 2
-    nn = k11 * t[:, 1] ** 2 - 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 0] ** 2
-    en = (k22 - k11) * t[:, 0] * t[:, 1] + k12 * (t[:, 0] ** 2 - t[:, 1] ** 2)
     angle = np.zeros(len(quad))
     for side, column, sign in ((0, 2, 1.0), (1, 3, -1.0)):
         along, height = _foot_and_height(rest, triangles[:, side], quad[:, [0, 1, column]])
         z = 0.5 * (ee * along**2 + 2 * sign * en * along * height + nn * height**2)
         angle -= (z - 0.5 * ee * along * length) / height
     return angle
+
+
+def _rest_curvature(
+    rest: RestShape, triangle: NDArray[np.int64], edge: NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """The materials' κ in the frame of an edge (tail, head, …): along, across and mixed [1/m], (n,) each."""
+    curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells])
+    k11, k22, k12 = curved[rest.shell_of[triangle]].T
+    vector, _ = edge_in_material(rest, triangle, edge[:, 0], edge[:, 1])
+    t = vector / np.linalg.norm(vector, axis=1)[:, None]
+    ee = k11 * t[:, 0] ** 2 + 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 1] ** 2
+    nn = k11 * t[:, 1] ** 2 - 2 * k12 * t[:, 0] * t[:, 1] + k22 * t[:, 0] ** 2
+    en = (k22 - k11) * t[:, 0] * t[:, 1] + k12 * (t[:, 0] ** 2 - t[:, 1] ** 2)
+    return ee, nn, en
+
+
+def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArray[np.int64]) -> Array:
+    """Half the rest angle [rad] of the hinge of each triangle (tail, head, opposite) and its mirror image."""
+    ee, nn, _ = _rest_curvature(rest, triangle, corners)
+    edge, _ = edge_in_material(rest, triangle, corners[:, 0], corners[:, 1])
+    along, height = _foot_and_height(rest, triangle, corners)
+    half: Array = -0.5 * (ee * along * (along - np.linalg.norm(edge, axis=1)) + nn * height**2) / height
+    return half
 
 
 def elements(rest: RestShape) -> Elements:

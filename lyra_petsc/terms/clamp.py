@@ -2,9 +2,10 @@
 
 Per held boundary edge of rest length l with a triangle of rest area A, φ its rotation about the edge::
 
-    energy = ½ B l² (2φ)² / (2 · 2A) = k φ²,   k = B l² / (2 A)
+    energy = ½ B l² (2φ − 2φ̄)² / (2 · 2A) = k (φ − φ̄)²,   k = B l² / (2 A)
 
-that is, half a hinge against the mirror image of the triangle, which moves with the handle.
+that is, half a hinge against the mirror image of the triangle, which moves with the handle; φ̄ comes from
+the material's rest curvature.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.meshing.topology import boundary_edges
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.bending import edge_in_material
+from lyra_petsc.terms.bending import edge_in_material, mirrored_angles
 from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
@@ -34,25 +35,25 @@ def angles(x, s, mirror, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def add_gradient(x, s, mirror, k, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, s, mirror, k, rest, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
         x0, x1, x2 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
-        moment = 2.0 * k[e] * angle_gradient(x0, x1, x2, point(mirror, e), g)
+        moment = 2.0 * k[e] * (angle_gradient(x0, x1, x2, point(mirror, e), g) - rest[e])
         for a in range(3):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
 
 
 @kernel()
-def hessians(x, s, lo, hi, blend, mirror, k, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, mirror, k, rest, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
     g = np.empty((4, 3))
     h = np.zeros((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
-        phi = angle_gradient(x0, x1, x2, point(mirror, e), g)
+        phi = angle_gradient(x0, x1, x2, point(mirror, e), g) - rest[e]
         phi *= 1.0 - blend
         if blend < 1.0:
             angle_hessian(x0, x1, x2, point(mirror, e), h)
@@ -69,8 +70,8 @@ class Clamp(Elastic):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 3): edge's tail and head, opposite vertex; data ``k`` (E,) [N·m], ``height`` (E,)
-        [m], ``handle`` (E,) number of the handle, ``damping`` (E,) [s].
+        Stencil (E, 3): edge's tail and head, opposite vertex; data ``k`` (E,) [N·m], ``rest_angle`` (E,)
+        [rad], ``height`` (E,) [m], ``handle`` (E,) number of the handle, ``damping`` (E,) [s].
     handles : mapping of handle number → (Motion, Window)
     """
 
@@ -83,6 +84,7 @@ class Clamp(Elastic):
         self._start = np.zeros((self.n_elements, 3))
         self._mirror = np.zeros((self.n_elements, 3))
         self._k = np.zeros(self.n_elements)
+        self._rest = elements.data["rest_angle"]
 
     def begin(self, time: float, x: Array) -> None:
         for number, (_, window) in self._handles.items():
@@ -105,14 +107,15 @@ class Clamp(Elastic):
     def energies(self, x: Array) -> Array:
         out = np.empty(self.n_owned)
         angles(x, self.stencil, self._mirror, out)
-        return np.where(self._k[: self.n_owned] > 0.0, self._k[: self.n_owned] * out**2, 0.0)
+        k, change = self._k[: self.n_owned], out - self._rest[: self.n_owned]
+        return np.where(k > 0.0, k * change * change, 0.0)
 
     def add_gradient(self, x: Array, out: Array) -> None:
         held = self._k > 0.0
-        add_gradient(x, self.stencil[held], self._mirror[held], self._k[held], out)
+        add_gradient(x, self.stencil[held], self._mirror[held], self._k[held], self._rest[held], out)
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, self._mirror, self._k, out)
+        hessians(x, self.stencil, lo, hi, blend, self._mirror, self._k, self._rest, out)
         out[self._k[lo:hi] == 0.0] = 0.0
 
     def force_scale(self, size: float) -> Array:
@@ -138,6 +141,7 @@ def elements(rest: RestShape) -> Elements:
     area = rest.area[faces[row]]
     data = {
         "k": b[row] * squared[row] / (2.0 * area),
+        "rest_angle": mirrored_angles(rest, np.column_stack([edges[row], opposite[row]]), faces[row]),
         "height": 2.0 * area / np.sqrt(squared[row]),
         "handle": np.concatenate(numbers),
         "damping": rest.per_triangle("damping")[faces[row]],

@@ -29,6 +29,7 @@ NAMES = (
     "hinge-sheet",
     "hinge-plate",
     "tip-load",
+    "roll-up",
     "heavy-cantilever",
     "coiling-strip",
     "cloth-overhang",

@@ -83,6 +83,30 @@ def test_curvature_of_a_sheet_that_starts_flat_rolls_it_up() -> None:
         np.testing.assert_allclose(bending.elements.data["rest_angle"][across], -2.0 * 0.1, rtol=1e-12)
 
 
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating"])
+def test_a_clamped_strip_rolls_up_without_energy(pattern: str) -> None:
+    # the chord of the first cell leaves the clamp at half the angle between two chords
+    turn = 0.3
+    material = CLOTH | {"bending": 1e-3, "rest_curvature": [turn / 0.1, 0.0, 0.0]}
+    scene = {
+        "mesh": grid(1, 0.1, 10, 1, pattern),
+        "material": material,
+        "handles": [{"group": "left", "clamp": True}],
+    }
+    with Simulation(scene, MPI.COMM_SELF) as simulation:
+        simulation.system.begin_step(0.0, 1.0)
+        flat = simulation.x
+        assert simulation.energy("clamp") > 1e-6
+        slope = turn * (np.arange(10) + 0.5)
+        along = np.concatenate([[0.0], np.cumsum(0.1 * np.cos(slope))])
+        up = np.concatenate([[0.0], np.cumsum(0.1 * np.sin(slope))])
+        column = np.rint(flat[:, 0] / 0.1).astype(int)
+        simulation.set_state(x=np.column_stack([along[column], flat[:, 1], up[column]]))
+        assert simulation.energy("bending") < 1e-25
+        assert simulation.energy("clamp") < 1e-25
+        assert simulation.energy("membrane") < 1e-25
+
+
 @pytest.mark.parametrize("angle", [-2.5, -0.4, 0.3, 2.0])
 def test_hinge_energy_is_b_l2_theta2_over_twice_the_areas(tmp_path: Path, angle: float) -> None:
     # two right triangles on a common edge of length 0.5 with heights 0.2 and 0.3
