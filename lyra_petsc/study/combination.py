@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 import re
@@ -15,6 +16,8 @@ from lyra_petsc.report.numbers import seconds, short
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.study.axes import Axis, Value
+
+LONGEST_NAME = 80
 
 LEAN = ("output.fields=[]", "output.reactions=false")
 """What no run of a study needs to write."""
@@ -50,9 +53,19 @@ class Combination:
 
     @property
     def name(self) -> str:
-        """The folder: number and values."""
-        words = "-".join(_word(value) for value in self.values)
-        return f"{self.number:03d}-{words}"[:80].rstrip("-.")
+        """The folder: the settings, so that a wider study finds what a smaller one has finished."""
+        words = []
+        for axis, value in zip(self.axes, self.values, strict=True):
+            key = "" if axis.path == "time.integrator" else axis.key
+                        if isinstance(value, str):
+                words.append(f"{key}-{value}" if key else value)
+            else:
+                words.append(f"{key}{value!r}")
+        plain = "-".join(words)
+        tame = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
+        if tame == plain:
+            return tame
+        return f"{tame}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
     @property
     def label(self) -> str:
@@ -80,11 +93,6 @@ def combinations(axes: Sequence[Axis]) -> list[Combination]:
     """All combinations, the last axis varying fastest."""
     values = itertools.product(*(axis.values for axis in axes))
     return [Combination(number, tuple(axes), chosen) for number, chosen in enumerate(values, start=1)]
-
-
-def _word(value: Value) -> str:
-    text = f"{value:g}" if isinstance(value, float) else value
-    return re.sub(r"[^\w.+-]+", "_", text).strip("_") or "x"
 
 
 # -- from values to a scene ----------------------------------------------------------------------------

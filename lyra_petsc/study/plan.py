@@ -119,6 +119,8 @@ def make_plan(request: Request) -> Plan:
     if not axes:
         axes = default_axes(base, notes)
     for axis in axes:
+        if axis.path in ("output.every", "time.end", "time.analysis"):
+            raise InputError("decides when errors are sampled and cannot vary", key=f"--vary {axis.key}")
         _refuse_fixed(axis)
         _check_alone(request, base, axis)
         if axis.path == "mesh":
@@ -177,8 +179,6 @@ def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -
         every = min(end, max(steps)) if steps else end / 10.0
         notes.append(f"the scene writes every step: errors are sampled every {seconds(every)} instead")
     every = min(every, end)
-    if any(axis.path == "output.every" for axis in axes):
-        raise InputError("decides when errors are sampled and cannot vary", key="--vary output.every")
     unfit = [step for step in steps if not _divides(step, every)]
     if unfit:
         listed = ", ".join(seconds(step) for step in unfit)

@@ -156,6 +156,10 @@ def _repeat(
         finally:
             if recorder is not None:
                 recorder.close()
+        if not simulation.control.is_end(simulation.time):
+            raise SolverError(
+                f"stopped at t = {simulation.time:g} s, before the end (-ts_max_steps?)", collective=True
+            )
         result.notes += [note for note in simulation.notes if note not in result.notes]
         if repeat == 0:
             _count(simulation, reports, result)

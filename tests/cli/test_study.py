@@ -65,7 +65,7 @@ def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
     assert "6 of 6 combinations done, 0 failed" in left.out
     assert "For 1 % choose" in left.out
     rows = table(folder)
-    assert [row["combination"] for row in rows][:2] == ["001-beuler-0.02", "002-beuler-0.01"]
+    assert [row["combination"] for row in rows][:2] == ["beuler-dt0.02", "beuler-dt0.01"]
     for row in rows:
         assert row["status"] == "done"
         assert float(row["dt"]) == pytest.approx(float(row["dt_mean"]))
@@ -173,15 +173,15 @@ def wait_for(path: Path, left: Any, seconds: float = 40.0) -> None:
 def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, code: int) -> None:
     write_scene(tmp_path, HANGING)
     process = start(LONG, tmp_path)
-    wait_for(tmp_path / "out" / "cases" / "001-0.02" / "result.json", process)
-    wait_for(tmp_path / "out" / "cases" / "002-0.001" / "history.csv", process)
+    wait_for(tmp_path / "out" / "cases" / "dt0.02" / "result.json", process)
+    wait_for(tmp_path / "out" / "cases" / "dt0.001" / "history.csv", process)
     process.send_signal(number)
     stopped = finish(process)
     assert stopped.code == code
     if code > 0:
         assert "--resume goes on" in stopped.ours[0]
     before = results(tmp_path / "out")
-    assert "001-0.02" in before
+    assert "dt0.02" in before
     assert not (tmp_path / "out" / "study.csv").exists()
     left = done(["study", "--out", "out", "--resume"], tmp_path)
     assert "2 of 2 combinations done" in left.out
@@ -194,7 +194,7 @@ def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, 
     assert results(tmp_path / "out") == after
     assert len(table(tmp_path / "out")) == 2
     # a wider sweep runs what is new
-    done(["study", "--out", "out", "--resume", "--vary", "dt=0.02,0.001,0.01"], tmp_path)
+    done(["study", "--out", "out", "--resume", "--vary", "dt=0.01,0.02,0.001"], tmp_path)
     wider = results(tmp_path / "out")
     assert {name: wider[name] for name in after} == after
     assert len(table(tmp_path / "out")) == 3
@@ -219,7 +219,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
 def test_ranks_stop_together(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
-    wait_for(tmp_path / "out" / "cases" / "001-0.0001" / "history.csv", process)
+    wait_for(tmp_path / "out" / "cases" / "dt0.0001" / "history.csv", process)
     process.send_signal(signal.SIGTERM)
     left = finish(process)
     assert left.code == 143

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from lyra_petsc.errors import InputError
@@ -65,9 +67,17 @@ def test_refusals(texts: list[str], words: str) -> None:
 
 def test_all_combinations_with_the_last_axis_fastest() -> None:
     found = combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
-    assert [c.name for c in found] == ["001-beuler-0.02", "002-beuler-0.01", "003-bdf2-0.02", "004-bdf2-0.01"]
+    assert [c.name for c in found] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
     assert found[3].label == "bdf2, Δt 10 ms"
     assert found[3].settings == {"integrator": "bdf2", "dt": 0.01}
+
+
+def test_names_are_file_names_and_never_the_same() -> None:
+    texts = ["gravity=[0,0,-9.81],[0 0 -9.81]", "dt=0.0166666666,0.0166666667", "pc_type=lu,gamg"]
+    names = [c.name for c in combinations(parse_axes(texts))]
+    assert len(set(names)) == 8
+    assert all(re.fullmatch(r"[\w.+-]{1,120}", name) for name in names)
+    assert names[0].startswith("gravity-_0_0_-9.81_-dt0.0166666666-pc_type-lu")
 
 
 def test_settings_in_words() -> None:

@@ -98,6 +98,7 @@ def test_vertices_by_number_are_told_of_when_meshes_vary(tmp_path: Path) -> None
         ("mesh=-1", "must be > 0"),
         ("max_iterations=0", "max_iterations"),
         ("output.every=0.1,0.2", "cannot vary"),
+        ("time.end=0.1,0.2", "cannot vary"),
         ("handles[3].until=1", "handles"),
     ],
 )
