@@ -57,7 +57,7 @@ class Combination:
         words = []
         for axis, value in zip(self.axes, self.values, strict=True):
             key = "" if axis.path == "time.integrator" else axis.key
-                        if isinstance(value, str):
+            if isinstance(value, str):
                 words.append(f"{key}-{value}" if key else value)
             else:
                 words.append(f"{key}{value!r}")
