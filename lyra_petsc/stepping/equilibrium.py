@@ -60,7 +60,6 @@ class Equilibrium:
         assert isinstance(system.scheme, Static)
         self._system, self._stepper, self._scheme = system, stepper, system.scheme
         self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
-        self._first = True
         self._longest = LONGEST
         self._follows = bool(system.viscous) or any(load.follows for load in system.loads)
         system.load_factor = 0.0
@@ -76,17 +75,15 @@ class Equilibrium:
         x = system.x[:n].copy()
         system.load_factor = factor
         newton = linear = solves = 0
-        anchored, last = 0.0, np.inf
+        anchored, last, arrived = 0.0, np.inf, False
         relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
         while solves < MOST_SOLVES:
-            force = self._out_of_balance(before, factor)
+            force = self._out_of_balance(before, factor, first=solves == 0)
             anchored = anchored if solves else system.anchored
-            if solves and attempt.converged and force <= self._allowed():
+            if arrived and force <= self._allowed():
                 system.anchored = anchored
-                return dataclasses.replace(
-                    attempt, newton_iterations=newton, linear_iterations=linear, residual=force
-                )
+                return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             if force > WORSE * last:
                 self._scheme.pseudo *= SHRINK
             last = force
@@ -97,6 +94,7 @@ class Equilibrium:
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if attempt.converged:
+                arrived = True
                 self._scheme.pseudo = min(
                     self._scheme.pseudo * growth(attempt.newton_iterations), self._longest
                 )
@@ -115,15 +113,14 @@ class Equilibrium:
             advice=attempt.advice or "is the sheet held? Else try time.step smaller, or a damped motion",
         )
 
-    def _out_of_balance(self, before: float, factor: float) -> float:
-        """Norm [N] of the force at the present shape; with it, Δτ for the first solve of all."""
+    def _out_of_balance(self, before: float, factor: float, *, first: bool) -> float:
+        """Norm [N] of the force at the present shape; sets Δτ for the first solve of a load step."""
         system = self._system
         system.begin_step(before, factor)
         force, largest = system.out_of_balance()
         norm = self._norm(force)
         self._scale = max(self._scale, largest)
-        if self._first and norm > 0.0:
-            self._first = False
+        if first and norm > 0.0:
             fastest = float(np.abs(force / system.mass[:, None]).max(initial=0.0))
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
             self._scheme.pseudo = float(np.sqrt(self._spacing / fastest))

@@ -45,7 +45,7 @@ ORDERS = {"beuler": 1.0, "semi-implicit": 1.0, "midpoint": 2.0, "alpha2": 2.0, "
 def at_end(integrator: str, steps: int, comm: MPI.Comm, **time: float) -> Array:
     """Positions of the moving sheet at the end."""
     content = MOVING | {"time": {"end": END, "step": END / steps, "integrator": integrator, **time}}
-    with Simulation(content, comm) as simulation:
+    with Simulation(content, comm, options={}) as simulation:
         return simulation.run(END / steps, steps)
 
 

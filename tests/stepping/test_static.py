@@ -74,7 +74,11 @@ MOVED = {
 SCENES: dict[str, dict[str, Any]] = {
     "hung by corners": {},
     "membrane only": {"material": CLOTH},
-    "hung by one corner": {"handles": [{"nodes": [0]}], "initial": {"noise": 1e-4}},
+    "hung by one corner": {
+        "handles": [{"nodes": [0]}],
+        "initial": {"noise": 1e-3},
+        "material": CLOTH | {"bending": 0.1},
+    },
     "handles that move": MOVED,
     "pressure": {
         "gravity": None,
