@@ -56,6 +56,8 @@ def verify(comm: MPI.Comm, names: Sequence[str], *, quick: bool, out: Path | Non
         outcome = run_case(comm, case, quick=quick, watch=watch)
         outcomes.append(outcome)
         if comm.rank == 0:
+            if sys.stderr.isatty():
+                print("\x1b[2K", file=sys.stderr, end="\r", flush=True)
             _print_case(console, outcome)
         write(comm, out, outcomes)
     command = _command(comm, names, quick)

@@ -85,7 +85,8 @@ def _csv(outcomes: Sequence[Outcome]) -> str:
     for outcome in outcomes:
         for row in outcome.rows:
             passed = outcome.verdicts[row.quantity].passed
-            writer.writerow(dataclasses.asdict(row) | {"case": outcome.case.name, "passed": passed})
+            cells = dataclasses.asdict(row) | {"case": outcome.case.name, "passed": passed}
+            writer.writerow({name: "" if value != value else value for name, value in cells.items()})
     return text.getvalue()
 
 

@@ -97,6 +97,8 @@ def _subspace_iteration(solver: PETSc.KSP, mass: Array, x: Array, count: int) ->
         for k in range(x.shape[1]):
             right.setArray(mx[:, k])
             solver.solve(right, left)
+            if solver.getConvergedReason() < 0:
+                raise SolverError("the stiffness of the state cannot be factored", collective=True)
             y[:, k] = left.getArray(readonly=True)
         stiffness = comm.allreduce(y.T @ mx)
         inertia = comm.allreduce(y.T @ (mass[:, None] * y))
@@ -116,6 +118,12 @@ def _subspace_iteration(solver: PETSc.KSP, mass: Array, x: Array, count: int) ->
 
 def _small_problem(stiffness: Array, inertia: Array) -> tuple[Array, Array]:
     """All eigenpairs of a small symmetric pencil, eigenvalues ascending, vectors of unit inertia."""
-    factor = np.linalg.inv(np.linalg.cholesky(0.5 * (inertia + inertia.T)))
+    try:
+        factor = np.linalg.inv(np.linalg.cholesky(0.5 * (inertia + inertia.T)))
+    except np.linalg.LinAlgError:
+        # the same numbers on all ranks
+        raise SolverError(
+            "subspace iteration lost the independence of its vectors", collective=True
+        ) from None
     squares, vectors = np.linalg.eigh(factor @ (0.5 * (stiffness + stiffness.T)) @ factor.T)
     return squares, factor.T @ vectors
