@@ -27,7 +27,7 @@ class Series:
     ----------
     name : str
     x, y : sequences of float
-        Points that are not finite and positive are left out.
+        Points, joined in this order; those that are not finite and positive are left out.
     low, high : sequences of float
         Spread of x, optional.
     labels : sequence of str
@@ -42,9 +42,8 @@ class Series:
     labels: Sequence[str] = field(default_factory=tuple)
 
     def shown(self) -> list[int]:
-        """Numbers of the points that a logarithmic figure can show, by x."""
-        good = [i for i in range(len(self.x)) if _visible(self.x[i]) and _visible(self.y[i])]
-        return sorted(good, key=lambda i: self.x[i])
+        """Numbers of the points that a logarithmic figure can show."""
+        return [i for i in range(len(self.x)) if _visible(self.x[i]) and _visible(self.y[i])]
 
 
 def convergence(

@@ -83,7 +83,7 @@ def described(key: str, value: Value) -> str:
     if isinstance(value, str):
         return f"{key} {value}"
     if key in ("dt", "time.step"):
-        return f"Δt {seconds(value)}"
+        return f"Δt {seconds(value, 6)}"
     if key == "mesh":
         return f"h {value:g} m"
     return f"{key} {short(value)}"

@@ -145,9 +145,10 @@ def _tables(report: Report, plan: Plan, rows: Sequence[Row]) -> None:
         )  # fmt: skip
         marked.append(row.on_front)
     report.table(head, body, caption="Bold: on the Pareto front. ★: recommended.", marked=marked)
-    report.paragraph(
-        f"“< x” stands where an error is below {SAFETY:g} times the reference's own and hence not resolved."
-    )
+    if any(row.unresolved for row in rows):
+        report.paragraph(
+            f"“< x” stands where an error is below {SAFETY:g} times the reference's own and not resolved."
+        )
     phases = [
         [setting(row), *(row.result.phase_seconds().get(phase, 0.0) for phase in PHASES)]
         for row in rows
@@ -249,6 +250,9 @@ def _work(
     for row in rows:
         if row.result.done:
             groups.setdefault(shared_label(row, axis), []).append(row)
+    if axis is not None:
+        for group in groups.values():
+            group.sort(key=lambda row: -extent(row, axis))
     lines = [
         Series(
             label,

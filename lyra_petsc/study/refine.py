@@ -166,7 +166,7 @@ def _level(base: Scene, common: list[str], h: float | None, step: float | None, 
     if step is not None:
         chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
         further += [f"time.integrator={integrator}", f"time.step={step!r}", *time_overrides(base, chosen)]
-        words.append(f"Δt {seconds(step)}")
+        words.append(f"Δt {seconds(step, 6)}")
         name.append(f"dt{step:.6g}")
     if h is not None:
         further += mesh_overrides(base, h)
