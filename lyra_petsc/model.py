@@ -24,6 +24,7 @@ from lyra_petsc.partition.distribute import Part, Whole, distribute
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.solvers.options import petsc_number
 from lyra_petsc.start import start_positions, start_velocities
 from lyra_petsc.stepping.schemes.registry import scheme_of
 from lyra_petsc.stepping.system import ReducedSystem
@@ -187,7 +188,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         name: registered[name].module().make(part.elements.get(name), scene, mass) for name in outline.terms
     }
     points = part.points
-    scheme = scheme_of(scene.time.scheme, scene.time.spectral_radius)
+    scheme = scheme_of(scene.time.scheme, _spectral_radius(scene))
     coupling = {
         name: term.stencil
         for name, term in terms.items()
@@ -221,6 +222,16 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     points.update_ghosts(system.v)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Model(scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner)
+
+
+def _spectral_radius(scene: Scene) -> float | None:
+    """That of the scene, or PETSc's ``-ts_alpha_radius``."""
+    if scene.time.spectral_radius is None:
+        return None
+    radius = petsc_number("ts_alpha_radius", scene.time.spectral_radius)
+    if not 0.0 <= radius <= 1.0:
+        raise InputError(f"must be from 0 to 1, not {radius:g}", key="-ts_alpha_radius")
+    return radius
 
 
 def _own(part: Part, name: str) -> Ints:

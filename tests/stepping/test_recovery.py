@@ -1,0 +1,82 @@
+"""Steps that fail are repeated with a smaller Δt, under every integrator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import CLOTH, grid, scene_of
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.simulation import Simulation
+
+Array = NDArray[np.float64]
+
+SCENE: dict[str, Any] = {
+    "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
+    "material": CLOTH | {"bending": 1e-4, "damping": 0.01},
+    "gravity": [0, 0, -9.81],
+    "handles": [{"nodes": [0, 5]}],
+    "solver": {"force_tolerance": 1e-6},
+    "output": {"every": 0.12},
+}
+
+
+def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int] = frozenset()) -> Any:
+    """Positions at the end and rejected steps; attempts of these numbers are made to fail."""
+    time = {"end": 0.12, "step": step, "integrator": integrator}
+    simulation = Simulation(comm, scene_of(SCENE | {"time": time}))
+    system, attempts = simulation.model.system, 0
+    residual = system.residual
+
+    def spoiled(v: Array, vdot: Array, out: Array) -> None:
+        residual(v, vdot, out)
+        if attempts in fail:
+            out[:] = np.nan
+
+    system.residual = spoiled  # type: ignore[method-assign]
+    begin = system.begin_step
+
+    def counted(t0: float, t1: float) -> None:
+        nonlocal attempts
+        attempts += 1
+        begin(t0, t1)
+
+    system.begin_step = counted  # type: ignore[method-assign]
+    rejected = 0
+    while not simulation.finished:
+        rejected += simulation.step().rejected
+    points = simulation.model.points
+    x = np.zeros((points.n_global, 3))
+    for original, rows in comm.allgather((points.original, system.x[: points.n_owned])):
+        x[original] = rows
+    simulation.destroy()
+    for name in simulation.stepper.our_options:
+        PETSc.Options().delValue(name)
+    return x, rejected
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"])
+def test_a_failed_step_is_repeated_and_does_no_harm(integrator: str, comm: MPI.Comm) -> None:
+    smooth, none = journey(integrator, 0.004, comm)
+    x, rejected = journey(integrator, 0.004, comm, fail=frozenset({1, 7, 8, 20}))
+    coarse, _ = journey(integrator, 0.008, comm)
+    assert none == 0
+    assert rejected == 4
+    # no further away than the error of the step itself
+    assert np.abs(x - smooth).max() < 0.5 * np.abs(coarse - smooth).max()
+
+
+def test_spectral_radius_by_petsc_option() -> None:
+    PETSc.Options().setValue("ts_alpha_radius", "1.5")
+    try:
+        with pytest.raises(InputError, match="-ts_alpha_radius: must be from 0 to 1"):
+            journey("alpha2", 0.004, MPI.COMM_SELF)
+        journey("bdf2", 0.02, MPI.COMM_SELF)  # not asked for
+    finally:
+        PETSc.Options().delValue("ts_alpha_radius")
