@@ -41,12 +41,15 @@ class StudyFolder:
         What stands there is replaced.
     given : bool
         Named by the user; otherwise another name is found if this one is taken meanwhile.
+    first : Path or None
+        To which that name is added a number.
     """
 
     path: Path
     resume: bool = False
     force: bool = False
     given: bool = False
+    first: Path | None = None
 
 
 def choose_folder(stem: str, out: Path | None, *, force: bool, resume: bool) -> StudyFolder:
@@ -73,7 +76,7 @@ def choose_folder(stem: str, out: Path | None, *, force: bool, resume: bool) -> 
     if out is None and resume:
         return StudyFolder(_newest(stem), resume=True, given=True)
     path = out if out is not None else (first if force else _free(first))
-    choice = StudyFolder(path, resume=resume, force=force, given=out is not None or force)
+    choice = StudyFolder(path, resume=resume, force=force, given=out is not None or force, first=first)
     try:
         _check(choice)
     except OSError as error:
@@ -153,7 +156,7 @@ class Lock:
                 except FileExistsError:
                     if choice.given:
                         raise
-                    path = _free(choice.path)
+                    path = _free(choice.first or choice.path)
             self._file = (path / LOCK_FILE).open("a", encoding="utf-8")
             try:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -216,6 +216,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
     assert not (tmp_path / "inside").exists()
 
 
+@pytest.mark.slow
 def test_ranks_stop_together(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
@@ -227,6 +228,7 @@ def test_ranks_stop_together(tmp_path: Path) -> None:
     assert results(tmp_path / "out") == {}
 
 
+@pytest.mark.slow
 def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
     words = ["study", "scene.yaml", "--vary", "dt=0.05", "--repeats", "1", "--out", "out"]
@@ -244,6 +246,7 @@ def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "mine.txt").read_text() == "kept"
 
 
+@pytest.mark.slow
 def test_a_run_as_reference(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     fine = ["run", "scene.yaml", "--set", "time.step=0.0005", "--out", "fine"]
@@ -275,17 +278,12 @@ def refused(folder: Path, words: list[str], because: str, ranks: int = 1) -> Lef
     ("words", "because"),
     [
         (["--vary", "dt="], "no values"),
-        (["--vary", "dt=0.01,x"], "'x' is no number"),
         (["--vary", "steps=0.01"], "unknown key"),
-        (["--vary", "integrator=buler"], "did you mean 'beuler'"),
         (["--vary", "ksp_rtol=1e-3", "-ksp_rtol", "1e-4"], "would fix what varies"),
         (["--quantities", "positon"], "did you mean 'position'"),
         (["--reference", "exact:free-fall"], "which has handles"),
-        (["--reference", "run:nowhere"], "no such folder"),
-        (["--repeats", "0"], "must be at least 1"),
         (["--resume"], "no study of scene"),
         (["--resume", "--force"], "give one of them"),
-        (["--out", "scene.yaml"], "is a file"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, words: list[str], because: str) -> None:
