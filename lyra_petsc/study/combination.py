@@ -29,14 +29,11 @@ class Combination:
 
     Attributes
     ----------
-    number : int
-        From 1.
     axes : tuple of Axis
     values : tuple of float or str
         One for each axis.
     """
 
-    number: int
     axes: tuple[Axis, ...]
     values: tuple[Value, ...]
 
@@ -92,7 +89,7 @@ def described(key: str, value: Value) -> str:
 def combinations(axes: Sequence[Axis]) -> list[Combination]:
     """All combinations, the last axis varying fastest."""
     values = itertools.product(*(axis.values for axis in axes))
-    return [Combination(number, tuple(axes), chosen) for number, chosen in enumerate(values, start=1)]
+    return [Combination(tuple(axes), chosen) for chosen in values]
 
 
 # -- from values to a scene ----------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shlex
 import shutil
@@ -25,6 +26,9 @@ POLL = 0.05
 
 GRACE = 10.0
 """Seconds [s] that a process gets to leave before it is killed."""
+
+PR_SET_PDEATHSIG = 1
+"""Linux: the signal that a process gets when its parent ends."""
 
 PROGRESS_FILE = "progress"
 OF_A_JOB = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK", "PMIX_RANK", "MPI_LOCALNRANKS")
@@ -124,6 +128,7 @@ class Launcher:
                 stdin=subprocess.DEVNULL,
                 stderr=complaints,
                 start_new_session=True,
+                preexec_fn=_with_parent(),
                 pass_fds=(self._lock,),
             )
         except OSError as error:
@@ -137,6 +142,15 @@ class Launcher:
             _end(process)
             raise
         return int(process.returncode)
+
+
+def _with_parent() -> Callable[[], None] | None:
+    """What a new process calls to be ended when this one is killed; None where the system cannot."""
+    try:
+        control = ctypes.CDLL(None).prctl
+    except (AttributeError, OSError):
+        return None
+    return lambda: control(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def report_progress(folder: Path) -> Callable[[float], None]:

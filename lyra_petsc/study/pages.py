@@ -315,12 +315,3 @@ def _convergence(
 
 def _file(name: str) -> str:
     return "".join(sign if sign.isalnum() or sign in "-." else "-" for sign in name).strip("-")
-
-
-def summary_lines(rows: Sequence[Row], advice: Sequence[Advice]) -> list[str]:
-    """What a terminal shows at the end."""
-    failed = sum(not row.result.done for row in rows)
-    found = [one.words for one in advice]
-    done = f"{len(rows) - failed} of {len(rows)} combinations done"
-    found.append(done + (f", {failed} failed" if failed else ""))
-    return found

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.build import build_mesh
@@ -234,8 +233,3 @@ def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
 def _needs_company(request: Request, axis: Axis) -> bool:
     """Whether a value may be allowed beside those of other axes only."""
     return len(request.vary) > 1 and axis.path == "time.spectral_radius"
-
-
-def as_numbers(values: Sequence[Any]) -> list[float]:
-    """Those that are numbers."""
-    return [float(value) for value in values if isinstance(value, int | float)]
