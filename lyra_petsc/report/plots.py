@@ -71,6 +71,8 @@ def convergence(
     figure, axes = _axes(x_label, y_label)
     for number, line in enumerate(series):
         shown = line.shown()
+        if not shown:
+            continue
         x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
         slope = fitted_slope(x, y)
         words = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
@@ -111,6 +113,8 @@ def work_precision(
     figure, axes = _axes(x_label, y_label)
     for number, line in enumerate(series):
         shown = line.shown()
+        if not shown:
+            continue
         x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
         spread = None
         if line.low and line.high:
