@@ -63,6 +63,7 @@ def conduct(comm: MPI.Comm, work: Work, command: str) -> Outcome:
         On every rank, if something cannot be written.
     """
     plan, folder = work.plan, work.folder
+    plan.notes += busy(plan.request.ranks or comm.size)
     rows = work.rows()
     known = work.compare(rows)
     outcome = Outcome(rows, known, reused=work.reused)
@@ -100,6 +101,21 @@ def all_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def busy(ranks: int) -> list[str]:
+    """A note where other processes leave too few cores of this machine idle for so many ranks."""
+    cores = os.cpu_count() or 1
+    try:
+        load = os.getloadavg()[0]
+    except OSError:
+        return []
+    if load + ranks <= cores + 0.5:
+        return []
+    return [
+        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
+        "run times may be larger and spread more than on an idle one"
+    ]
 
 
 def machine() -> str:

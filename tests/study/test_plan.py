@@ -194,3 +194,12 @@ def test_requests_survive_their_file(tmp_path: Path) -> None:
     (tmp_path / "request.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="is damaged"):
         read_request(tmp_path)
+
+
+def test_a_busy_machine_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    from lyra_petsc.study import conduct
+
+    monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(conduct.os, "getloadavg", lambda: (2.1, 0.0, 0.0))
+    assert conduct.busy(2) == []
+    assert "load 2.1 on 4 cores" in conduct.busy(3)[0]
