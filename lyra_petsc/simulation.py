@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.model import Model, build_model, events
@@ -85,7 +86,7 @@ class Simulation:
     def __init__(self, comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> None:
         self.comm, self.scene = comm, scene
         self.phases = phases or Phases()
-        fill_gaps(scene.petsc)
+        self._filled = fill_gaps(scene.petsc)
         self.model: Model = build_model(comm, scene, self.phases)
         self.notes = list(self.model.outline.notes)
         outline, system = self.model.outline, self.model.system
@@ -255,6 +256,8 @@ class Simulation:
         self.stepper.start(self.time, self.step_number)
 
     def destroy(self) -> None:
-        """Free all PETSc and MPI objects; collective."""
+        """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""
         self.stepper.destroy()
         self.model.points.destroy()
+        for name in self._filled:
+            PETSc.Options().delValue(name)

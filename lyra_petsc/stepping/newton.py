@@ -8,9 +8,12 @@ from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.solvers.options import is_set
 from lyra_petsc.solvers.reasons import NOT_A_NUMBER
 from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.forcing import Forcing
 from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.watchdog import Watchdog
 
 Array = NDArray[np.float64]
 Reason = PETSc.SNES.ConvergedReason
@@ -62,6 +65,8 @@ class Newton:
         self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
         self._shape = (system.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
+        self._watchdog = Watchdog()
+        self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol") or system.scheme.name == "semi-implicit")
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -69,10 +74,15 @@ class Newton:
         self.norm, self.at_roundoff, self.more_linear = 0.0, False, 0
         self._length = self._first_norm = self._at_norm = 0.0
         self._at = (0.0, 0.0)
+        self._slope, self._returns = 0.0, False
+        self._watchdog.begin()
+        self.forcing.begin()
 
     def assemble(self, u: PETSc.Vec) -> None:
         """Jacobian, and preconditioning matrix, at velocities u."""
         v = u.getArray(readonly=True).reshape(self._shape)
+        self._system.new_iterate(v)
+        self.forcing.before_solve(self.norm)
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         if self._preconditioner is not self._matrix:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
@@ -81,6 +91,8 @@ class Newton:
         """Note energy and residual of the present iterate, against which trial points are judged."""
         self._at = self._system.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
+        energy, size = self._at
+        self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
 
     def _taken(self, u: PETSc.Vec) -> float:
         """Fraction of the last Newton step that the line search took; 1 before the first."""
@@ -95,6 +107,11 @@ class Newton:
     def direction(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Solve again with more regularisation while the linear solve meets negative curvature."""
         changed = False
+        self._returns = self._watchdog.lost
+        if self._returns:
+            self._watchdog.go_back(x, y)
+            self._system.new_iterate(None)
+            return True
         residual = self._snes.getFunction()[0]
         while self._useless(residual, y) and self._blend.raise_():
             v = x.getArray(readonly=True).reshape(self._shape)
@@ -109,6 +126,7 @@ class Newton:
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
+        self._slope = residual.dot(y)
         return changed
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
@@ -120,6 +138,8 @@ class Newton:
         v = u.getArray(readonly=True).reshape(self._shape)
         value, size = self._system.objective(v)
         here, here_size = self._at
+        if value != here and np.isfinite(value) and (self._returns or self._watchdog.trusts):
+            return min(value, here - self._slope)
         noise = ENERGY_ROUNDOFF * max(size, here_size)
         if value == here or not abs(value - here) < noise:
             return value

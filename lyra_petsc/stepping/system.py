@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
+from lyra_petsc.stepping.clamped import clamped_energy
 from lyra_petsc.stepping.departures import Departures
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
@@ -109,6 +110,7 @@ class ReducedSystem:
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
         self.given_loads: Array | None = None
+        self._iterate: Array | None = None
 
     def begin(self, time: float) -> None:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
@@ -124,6 +126,7 @@ class ReducedSystem:
     def begin_step(self, t0: float, t1: float) -> None:
         """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
+        self.new_iterate(None)
         after = self.scheme.stage_after(self.dt)
         changed = self._prescribed.begin_step(t0, t1, self.x)
         self._freeze(t0 + after)
@@ -138,7 +141,7 @@ class ReducedSystem:
         self.stage = stage = self.scheme.stage(self.x[:n], self.v[:n], self.dt)
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
-        self.anchored = self._clamped()
+        self.anchored = clamped_energy(self.elastic, self.x)
 
     def _freeze(self, at: float) -> None:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
@@ -199,8 +202,7 @@ class ReducedSystem:
         return self._force[: self.points.n_owned].copy()
 
     def out_of_balance(self) -> tuple[Array, float]:
-        """Force (n_owned, 3) [N] on the free coordinates at the start of the step, and the norm [N] of the
-        largest part of it; collective."""
+        """Force (n_owned, 3) [N] on the free coordinates now, norm [N] of its largest part; collective."""
         parts = self._parts(self.x, self.v, np.zeros_like(self.history))
         squares = self.points.comm.allreduce(np.array([self._norm(part) for part in parts.values()]))
         return np.where(self._prescribed.free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
@@ -218,10 +220,9 @@ class ReducedSystem:
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
-        n = self.points.n_owned
+        n, given, free = self.points.n_owned, self.scheme.given, self._prescribed.free
         self._evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
-        given, free = self.scheme.given, self._prescribed.free
         moved, rate = self.scheme.end(before, rate_before, v, self.dt)
         self.scheme.accepted(before, rate_before, free, self.dt)
         self.x[:n] = np.where(free, moved, self._prescribed.goal) if self.held else moved
@@ -251,18 +252,6 @@ class ReducedSystem:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
         n = self.points.n_owned
         return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self.history))
-
-    def turn_to_end(self) -> float:
-        """Let moving targets stand where the step ends; energy [J] that this gives the rank's clamps."""
-        if self.stage.after == self.dt:
-            return 0.0
-        before = self._clamped()
-        for term in self.elastic:
-            term.prepare(self.t0, self.t1, self.t1)
-        return self._clamped() - before
-
-    def _clamped(self) -> float:
-        return sum(float(term.energies(self.x).sum()) for term in self.elastic if term.name == "clamp")
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
         n = self.points.n_owned
@@ -296,6 +285,17 @@ class ReducedSystem:
     def _norm(self, part: Array) -> float:
         """Square of the norm over this rank's free coordinates."""
         return float(np.sum(part * part, where=self._prescribed.free))
+
+    def new_iterate(self, v: Array | None) -> None:
+        """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
+
+        Its stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
+        """
+        x = None if v is None else self._evaluate_at(v)[0].copy()
+        before = None if x is None else self._iterate
+        self._iterate = x
+        for term in self.elastic:
+            term.linearise_from(before)
 
     def jacobian(self, v: Array, blend: float) -> Array:
         """Block rows (n_blocks, 3, 3) of σ M + c K + D + ∇∇P, prescribed coordinates decoupled.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.stepping.clamped import clamped_energy
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.terms.term import Pulling
 
@@ -96,7 +97,7 @@ class Ledger:
         if not system.scheme.moves:  # the way to an equilibrium has no stage in its middle
             external, self._pull = 0.5 * (external + self._pull), external
         # a clamp's plane turns with its handle, which works on the sheet through it
-        turned = system.anchored - self._anchored + system.turn_to_end()
+        turned = system.anchored - self._anchored + self._turn_to_end()
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         if "damping" in parts:
             local[1] = dt * float(np.vdot(system.stage_velocity, parts["damping"]))
@@ -104,6 +105,16 @@ class Ledger:
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
         return self.measure()
+
+    def _turn_to_end(self) -> float:
+        """Let moving targets stand where the step ends; energy [J] that this gives the rank's clamps."""
+        system = self._system
+        if system.stage.after == system.dt:
+            return 0.0
+        before = clamped_energy(system.elastic, system.x)
+        for term in system.elastic:
+            term.prepare(system.t0, system.t1, system.t1)
+        return clamped_energy(system.elastic, system.x) - before
 
     def handle_forces(self, count: int) -> list[Array]:
         """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""

@@ -4,7 +4,8 @@ Per triangle of rest area A, with F = ∂x/∂u (3×2) and the Green strain E = 
 
     energy = A/2 (c11 E_uu² + 2 c12 E_uu E_vv + c22 E_vv² + c33 (2 E_uv)²)
 
-Source: the Lyra paper, eq. 2-3; Bonet and Wood, Nonlinear Continuum Mechanics for FEA, ch. 8.
+Source: the Lyra paper, eq. 2-3; Bonet and Wood, Nonlinear Continuum Mechanics for FEA, ch. 8. Predicted
+stress in the Hessian: Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. Engng 313 (2017) 986-1005.
 """
 
 from __future__ import annotations
@@ -90,14 +91,31 @@ def _tensile(e0, e1, c11, c12, c22):  # type: ignore[no-untyped-def]
     return max(c11 * t0 + c12 * t1, 0.0), max(c12 * t0 + c22 * t1, 0.0)
 
 
+@kernel(inline="always")
+def _linearised(f, g, c, e):  # type: ignore[no-untyped-def]
+    """Strains and stress as in `_green_and_stress`, linear in the way from deformation gradient g to f."""
+    ux, uy, uz, vx, vy, vz = f
+    ax, ay, az, bx, by, bz = g
+    px, py, pz, qx, qy, qz = ux - ax, uy - ay, uz - az, vx - bx, vy - by, vz - bz
+    e0, e1, e2, _, _, _ = _green_and_stress(f, c, e)
+    e0 -= 0.5 * (px * px + py * py + pz * pz)
+    e1 -= 0.5 * (qx * qx + qy * qy + qz * qz)
+    e2 -= px * qx + py * qy + pz * qz
+    c11, c12, c22, c33 = c[e, 0], c[e, 1], c[e, 2], c[e, 3]
+    return e0, e1, e2, c11 * e0 + c12 * e1, c12 * e0 + c22 * e1, c33 * e2
+
+
 @kernel()
-def hessians(x, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j]."""
+def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-untyped-def]
+    """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j].
+
+    Their geometric part has the stress that the linearised strain predicted at x from y; y = x: exact.
+    """
     g = np.empty((3, 2))
     for e in range(lo, hi):
         f = _deformation(x, s, e, inverse)
         ux, uy, uz, vx, vy, vz = f
-        e0, e1, _, s0, s1, s2 = _green_and_stress(f, c, e)
+        e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, e)
         if blend > 0.0:
             p0, p1 = _tensile(e0, e1, c[e, 0], c[e, 1], c[e, 2])
             s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 - blend * s2
@@ -163,6 +181,7 @@ class Membrane(Elastic):
     def __init__(self, elements: Elements) -> None:
         super().__init__(elements)
         data = elements.data
+        self._before: Array | None = None
         self._inverse, self._area, self._c = data["inverse"], data["area"], data["stiffness"]
 
     def energies(self, x: Array) -> Array:
@@ -173,8 +192,12 @@ class Membrane(Elastic):
     def add_gradient(self, x: Array, out: Array) -> None:
         add_gradient(x, self.stencil, self._inverse, self._area, self._c, out)
 
+    def linearise_from(self, y: Array | None) -> None:
+        self._before = y
+
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
+        y = x if self._before is None else self._before
+        hessians(x, y, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
 
     def force_scale(self, size: float) -> Array:
         stiffest: Array = np.abs(self._c).max(axis=1)

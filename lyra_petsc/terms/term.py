@@ -58,6 +58,12 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate.
         """
 
+    def linearise_from(self, y: Array | None) -> None:
+        """Let exact Hessians at x have the stress that y's linearised strain predicts there; None: x's own.
+
+        ``y`` (n_local, 3) is the Newton iterate before x.
+        """
+
     def begin(self, time: float, x: Array) -> None:
         """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""
 

@@ -1,0 +1,45 @@
+"""How exactly a Newton iteration's linear system is solved: as exactly as pays.
+
+A loose solve is enough where the residual falls from iteration to iteration. In stiff sheets what it leaves
+is stretch, and the residual does not fall: then the next solves are ten times as exact.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+LOOSEST, TIGHTEST = 1e-2, 1e-6
+"""Relative tolerances of the linear solver."""
+
+SLOW = 0.3
+"""Fraction of the residual left by an iteration above which the linear solve was too loose."""
+
+
+class Forcing:
+    """Sets the tolerance of a KSP before each Newton iteration, unless the user gave one.
+
+    Parameters
+    ----------
+    ksp : PETSc.KSP
+    fixed : bool
+        Leave it alone.
+    """
+
+    def __init__(self, ksp: PETSc.KSP, *, fixed: bool) -> None:
+        self._ksp, self._fixed = ksp, fixed
+        self.tolerance = LOOSEST
+        self._norm = 0.0
+
+    def begin(self) -> None:
+        """A new solve: begin a little looser than the last one ended."""
+        self.tolerance = min(LOOSEST, 10.0 * self.tolerance)
+        self._norm = 0.0
+
+    def before_solve(self, norm: float) -> None:
+        """``norm`` [N] is the residual at the present iterate."""
+        if self._fixed:
+            return
+        if self._norm > 0.0 and norm > SLOW * self._norm:
+            self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
+        self._norm = norm
+        self._ksp.setTolerances(rtol=self.tolerance)
