@@ -98,6 +98,16 @@ def test_backward_euler_does_nothing_worse(c11: float) -> None:
     assert strain < 5.0 / c11 + 1e-6
 
 
+@pytest.mark.parametrize("c11", STIFFNESSES)
+@pytest.mark.parametrize("integrator", ["beuler", "bdf2", "alpha2"])
+def test_newton_takes_as_few_iterations_for_stiff_sheets(integrator: str, c11: float) -> None:
+    strip = scene(integrator, c11) | {"mesh": grid(1.0, 1.0 / CELLS, CELLS, 1)}
+    with Simulation(strip, MPI.COMM_SELF) as simulation:
+        iterations = [simulation.step(1.0 / 60.0).newton_iterations for _ in range(24)]
+    assert np.mean(iterations) < 7.5
+    assert max(iterations) <= 12
+
+
 def test_reference_is_consistent() -> None:
     rigid = {row[0]: np.array(row[1:]) for row in ANSWERS["rigid_links"]["continuum"]}
     for t, place in rigid.items():
