@@ -42,12 +42,15 @@ class RunFolder:
         this one is taken meanwhile.
     force : bool
         Results that stand there are replaced.
+    first : Path or None
+        What a name found for it is counted on from.
     """
 
     path: Path
     resume: bool = False
     given: bool = False
     force: bool = False
+    first: Path | None = None
 
 
 def choose(
@@ -105,7 +108,7 @@ def _choose(stem: str, out: str | os.PathLike[str] | None, force: bool, resume: 
         first = RUNS / stem
         if resume:
             return RunFolder(_newest(stem), resume=True, given=True)
-        choice = RunFolder(first if force else _free(first), given=force, force=force)
+        choice = RunFolder(first if force else _free(first), given=force, force=force, first=first)
         key = "output folder"
     else:
         if not os.fspath(out):
@@ -182,6 +185,6 @@ def _create(choice: RunFolder) -> Path:
             except FileExistsError:
                 if choice.given:
                     raise
-                path = _free(choice.path)
+                path = _free(choice.first or choice.path)
     except OSError as error:
         raise InputError(f"cannot be created: {reason(error)}", file=path, key="--out") from error

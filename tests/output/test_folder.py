@@ -42,6 +42,13 @@ def test_a_default_folder_taken_meanwhile_becomes_the_next(comm, here):
     assert create(comm, choice) == Path("runs/flag-2")
 
 
+def test_a_second_folder_taken_meanwhile_becomes_the_third(comm, here):
+    here("runs/flag/other")
+    choice = choose(comm, "flag")
+    here("runs/flag-2/other")
+    assert create(comm, choice) == Path("runs/flag-3")
+
+
 def test_a_given_folder_that_exists_is_refused(comm, here):
     here("out/notes.txt")
     with pytest.raises(InputError, match=r"out: --out: exists.*--resume.*--force"):
