@@ -91,9 +91,8 @@ class Simulation:
         self.notes = list(self.model.outline.notes)
         outline, system = self.model.outline, self.model.system
         with self.phases("solve"):
-            self.stepper = Stepper(
-                scene, system, self.model.pattern, outline.spacing, residual_roundoff(system, outline.reach)
-            )
+            floor = residual_roundoff(system, outline.reach)
+            self.stepper = Stepper(scene, system, self.model.pattern, outline.spacing, floor)
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
@@ -107,7 +106,6 @@ class Simulation:
         self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
-            floor = residual_roundoff(system, outline.reach)
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, floor)
 
     def _control(self, step: float, end: float) -> StepControl:

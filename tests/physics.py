@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.model import Model, build_model
 from lyra_petsc.output.phases import Phases
+from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.rounding import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -72,6 +73,15 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
     return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)
 
 
+def gathered(points: Points, owned: Array) -> Array:
+    """Rows of the owned vertices (n_owned or more, …) in mesh order, on every rank; collective."""
+    pieces = points.comm.allgather((points.original, np.array(owned[: points.n_owned])))
+    out = np.empty((points.n_global, *owned.shape[1:]))
+    for original, rows in pieces:
+        out[original] = rows
+    return out
+
+
 class Simulation:
     """A scene's model and stepper with a direct solver; a context manager, collective.
 
@@ -126,12 +136,7 @@ class Simulation:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices in mesh order, on every rank."""
-        points = self.model.points
-        pieces = self.comm.allgather((points.original, np.array(owned[: points.n_owned])))
-        out = np.empty((points.n_global, *owned.shape[1:]))
-        for original, rows in pieces:
-            out[original] = rows
-        return out
+        return gathered(self.model.points, owned)
 
     @property
     def x(self) -> Array:

@@ -108,7 +108,7 @@ def _choose(stem: str, out: str | os.PathLike[str] | None, force: bool, resume: 
         first = RUNS / stem
         if resume:
             return RunFolder(_newest(stem), resume=True, given=True)
-        choice = RunFolder(first if force else _free(first), given=force, force=force, first=first)
+        choice = RunFolder(first if force else free_name(first), given=force, force=force, first=first)
         key = "output folder"
     else:
         if not os.fspath(out):
@@ -138,6 +138,17 @@ def _check(choice: RunFolder, key: str) -> None:
             file=path,
             key=key,
         )
+    check_creatable(path, key)
+
+
+def check_creatable(path: Path, key: str) -> None:
+    """Refuse a folder that could not be created, or written into; ``key`` is what named it.
+
+    Raises
+    ------
+    InputError
+        What stands in its place or above it, or the permission that is missing.
+    """
     above = next(folder for folder in (path.absolute(), *path.absolute().parents) if os.path.lexists(folder))
     if not above.is_dir():
         raise InputError(f"cannot be created: {above} is a file", file=path, key=key)
@@ -145,7 +156,8 @@ def _check(choice: RunFolder, key: str) -> None:
         raise InputError(f"cannot be created: no permission to write in {above}", file=path, key=key)
 
 
-def _free(first: Path) -> Path:
+def free_name(first: Path) -> Path:
+    """``first``, or the first of ``…-2``, ``…-3``, … that does not exist."""
     path, number = first, 1
     while os.path.lexists(path):
         number += 1
@@ -185,6 +197,6 @@ def _create(choice: RunFolder) -> Path:
             except FileExistsError:
                 if choice.given:
                     raise
-                path = _free(choice.first or choice.path)
+                path = free_name(choice.first or choice.path)
     except OSError as error:
         raise InputError(f"cannot be created: {reason(error)}", file=path, key="--out") from error

@@ -38,6 +38,8 @@ class Newton:
         Mean edge length [m], for the step tolerance.
     floor : float
         Norm [N] of the residual's round-off.
+    iterates : bool
+        There is more than one iteration (not so under ``semi-implicit``).
 
     Attributes
     ----------
@@ -59,14 +61,17 @@ class Newton:
         tolerances: Solver,
         spacing: float,
         floor: float,
+        *,
+        iterates: bool,
     ) -> None:
+        self._iterates = iterates
         self._snes, self._ksp, self._system = snes, snes.getKSP(), system
         self._matrix, self._preconditioner, self._blend = matrix, preconditioner, blend
         self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
         self._shape = (system.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
         self._watchdog = Watchdog()
-        self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol") or system.scheme.name == "semi-implicit")
+        self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol"))
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -81,8 +86,9 @@ class Newton:
     def assemble(self, u: PETSc.Vec) -> None:
         """Jacobian, and preconditioning matrix, at velocities u."""
         v = u.getArray(readonly=True).reshape(self._shape)
-        self._system.new_iterate(v)
-        self.forcing.before_solve(self.norm)
+        if self._iterates:
+            self._system.new_iterate(v)
+            self.forcing.before_solve(self.norm)
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         if self._preconditioner is not self._matrix:
             self._preconditioner.set(self._system.jacobian(v, 1.0))

@@ -18,6 +18,7 @@ from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import Value, fill_gaps, is_set
 from lyra_petsc.solvers.presets import candidates, options_of
 from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
 
@@ -131,6 +132,7 @@ class Stepper:
             scene.solver,
             self._spacing,
             self._floor,
+            iterates=self._iterates,
         )
         ksp.setType(PETSc.KSP.Type.CG)
         if self._iterates:
@@ -141,7 +143,7 @@ class Stepper:
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=1e-2, max_it=5000)
+            ksp.setTolerances(rtol=LOOSEST, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=1e-6, max_it=5000)

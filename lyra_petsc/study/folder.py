@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.folder import check_creatable, free_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.study.request import REQUEST_FILE
 
@@ -75,7 +76,7 @@ def choose_folder(stem: str, out: Path | None, *, force: bool, resume: bool) -> 
     first = STUDIES / stem
     if out is None and resume:
         return StudyFolder(_newest(stem), resume=True, given=True)
-    path = out if out is not None else (first if force else _free(first))
+    path = out if out is not None else (first if force else free_name(first))
     choice = StudyFolder(path, resume=resume, force=force, given=out is not None or force, first=first)
     try:
         _check(choice)
@@ -96,19 +97,7 @@ def _check(choice: StudyFolder) -> None:
             file=path,
             key="--out",
         )
-    above = next(folder for folder in (path.absolute(), *path.absolute().parents) if os.path.lexists(folder))
-    if not above.is_dir():
-        raise InputError(f"cannot be created: {above} is a file", file=path, key="--out")
-    if not os.access(above, os.W_OK | os.X_OK):
-        raise InputError(f"cannot be created: no permission to write in {above}", file=path, key="--out")
-
-
-def _free(first: Path) -> Path:
-    path, number = first, 1
-    while os.path.lexists(path):
-        number += 1
-        path = first.with_name(f"{first.name}-{number}")
-    return path
+    check_creatable(path, "--out")
 
 
 def _newest(stem: str) -> Path:
@@ -156,7 +145,7 @@ class Lock:
                 except FileExistsError:
                     if choice.given:
                         raise
-                    path = _free(choice.first or choice.path)
+                    path = free_name(choice.first or choice.path)
             self._file = (path / LOCK_FILE).open("a", encoding="utf-8")
             try:
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import grid, scene_of
+from physics import gathered, grid, scene_of
 
 from lyra_petsc.simulation import Simulation
 from lyra_petsc.stepping.control import ToleranceControl
@@ -48,13 +48,7 @@ def simulated(comm: MPI.Comm, options: dict[str, str] | None = None, **content: 
 
 
 def positions(simulation: Simulation) -> Array:
-    points = simulation.model.points
-    out = np.zeros((points.n_global, 3))
-    for original, rows in simulation.comm.allgather(
-        (points.original, simulation.model.system.x[: points.n_owned])
-    ):
-        out[original] = rows
-    return out
+    return gathered(simulation.model.points, simulation.model.system.x)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import CLOTH, grid, scene_of
+from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.simulation import Simulation
@@ -50,10 +50,7 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     rejected = 0
     while not simulation.finished:
         rejected += simulation.step().rejected
-    points = simulation.model.points
-    x = np.zeros((points.n_global, 3))
-    for original, rows in comm.allgather((points.original, system.x[: points.n_owned])):
-        x[original] = rows
+    x = gathered(simulation.model.points, system.x)
     simulation.destroy()
     for name in simulation.stepper.our_options:
         PETSc.Options().delValue(name)

@@ -11,7 +11,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import CLOTH, grid, scene_of
+from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.simulation import Simulation
 
@@ -54,13 +54,7 @@ def out_of_balance(simulation: Simulation) -> float:
 
 
 def shape(simulation: Simulation) -> Array:
-    points = simulation.model.points
-    out = np.zeros((points.n_global, 3))
-    for original, rows in simulation.comm.allgather(
-        (points.original, simulation.model.system.x[: points.n_owned])
-    ):
-        out[original] = rows
-    return out
+    return gathered(simulation.model.points, simulation.model.system.x)
 
 
 MOVED = {
