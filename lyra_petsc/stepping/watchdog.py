@@ -18,6 +18,8 @@ from petsc4py import PETSc
 PATIENCE = 5
 """Iterations without less energy than ever before after which trust is lost."""
 
+HALVED = 0.5
+
 PENALTY = 6
 """Iterations with line searches after trust was lost for the first time; doubled each time."""
 
@@ -40,6 +42,7 @@ class Watchdog:
     def begin(self) -> None:
         """A new solve."""
         self._energy = math.inf
+        self._excess = math.inf
         self._left = PATIENCE
         self._searches, self._penalty = 0, PENALTY
         self.lost = False
@@ -57,11 +60,15 @@ class Watchdog:
         if not energy > self._energy + noise:
             if energy < self._energy - noise:
                 self._left = PATIENCE
-            self._energy = energy
+            self._energy, self._excess = energy, math.inf
             self._forget()
             self.best = u.copy()
             return
+        excess = energy - self._energy
         self._left -= 1
+        if excess < HALVED * self._excess:
+            self._excess = excess
+            self._left = PATIENCE
         if self._left <= 0:
             self.lost = True
 
@@ -70,6 +77,7 @@ class Watchdog:
         x.copy(y)
         y.axpy(-1.0, self.best)
         self.lost = False
+        self._excess = math.inf
         self._left = PATIENCE
         # one more, as the best iterate is seen again first
         self._searches, self._penalty = self._penalty + 1, 2 * self._penalty
