@@ -21,6 +21,7 @@ from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.trace import Stuck, Trace
 
 Array = NDArray[np.float64]
 
@@ -36,6 +37,7 @@ class Attempt:
     words: str = ""
     advice: str = ""
     at_roundoff: bool = False
+    stuck: Stuck | None = None
 
 
 FIRST_OF_ALL = 1e-3
@@ -135,7 +137,9 @@ class Stepper:
             iterates=self._iterates,
         )
         ksp.setType(PETSc.KSP.Type.CG)
+        self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
+            snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(newton.objective)
             snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
@@ -229,6 +233,7 @@ class Stepper:
         self.ts.setTime(t0 + system.stage.after - theta * length)
         self.ts.setTimeStep(length)
         self._newton.begin_step()
+        self._trace.begin()
         try:
             self.ts.step()
         except PETSc.Error as error:
@@ -236,10 +241,7 @@ class Stepper:
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
                 "the state before it is kept; check the PETSc options"
             ) from None
-        newton, linear = (
-            self.snes.getIterationNumber(),
-            self.snes.getLinearSolveIterations() + self._newton.more_linear,
-        )
+        newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
         words, advice = "the velocities are not finite", "try a smaller time.step"
         self._linear_failed = False
         if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
@@ -255,11 +257,15 @@ class Stepper:
         else:
             words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
             self._linear_failed = reasons.preconditioner_failed(self.ksp)
+        stuck = self._trace.stuck()
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        return Attempt(False, newton, linear, self._newton.norm, words, advice)
+        return Attempt(False, newton, linear, self._newton.norm, words, advice, stuck=stuck)
+
+    def _linear_iterations(self) -> int:
+        return int(self.snes.getLinearSolveIterations()) + self._newton.more_linear
 
     @property
     def blend(self) -> float:
