@@ -62,6 +62,7 @@ def mesh_geo(
                 ) from None
         try:
             sheet = read_msh(meshed, note_loose=False)  # construction points of the script
+            sheet.tags = None  # those of a file that nobody sees
         except InputError as error:
             raise InputError(error.message, file=path) from None
     if size is not None:
