@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.compression import Compression
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.model import Model, build_model, events
 from lyra_petsc.output.phases import Phases
@@ -49,6 +50,8 @@ class StepReport:
     rejected: int
     residual: float
     wall_seconds: float
+    smallest_stretch: float = 1.0
+    largest_stretch: float = 1.0
 
 
 def _positive(name: str, seconds: float) -> float:
@@ -101,6 +104,7 @@ class Simulation:
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
+        self.compression = Compression(self.model)
         self._told_of_error = False
         self.stepper.start(0.0, 0)
         self.ledger = Ledger(system)
@@ -164,12 +168,21 @@ class Simulation:
         self.step_number += 1
         with self.phases("output"):
             self.ledger.record(x_before[:n])
+            note = self.compression.look(f"step {self.step_number} ({self._now()})")
+        if note:
+            self.notes.append(note)
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
+        stretches = self.compression.smallest, self.compression.largest
         return StepReport(
-            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds
+            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds, *stretches
         )
+
+    def _now(self) -> str:
+        """The present time, or load factor, in words."""
+        moves = self.model.system.scheme.moves
+        return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
     def _accurate(self, v_before: Array, dt: float) -> bool:
         """Whether the step just taken keeps its share of the tolerance."""
@@ -202,8 +215,7 @@ class Simulation:
                 )
                 return
         if not self.control.failed():
-            moves = self.model.system.scheme.moves
-            now = f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
+            now, moves = self._now(), self.model.system.scheme.moves
             last = f"Δt = {end - self.time:.3g} s" if moves else f"an increment of {end - self.time:.3g}"
             raise SolverError(
                 f"step {self.step_number + 1} ({now}) did not converge even with {last}: {attempt.words}; "
