@@ -81,6 +81,11 @@ class Held:
             rate = self._motions[number].velocity(self._start[number], self._windows[number].start, at)
             out[np.ix_(self._vertices[number], self._axes[number])] = rate[:, self._axes[number]]
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the exact handles in the scene."""
+        return list(self._vertices)
+
     def vertices(self, number: int) -> NDArray[np.int64]:
         """Owned vertices of a handle, local numbering."""
         return self._vertices[number]
