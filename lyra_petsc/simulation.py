@@ -18,9 +18,12 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.model import Model, build_model, events
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers.options import fill_gaps, petsc_number
+from lyra_petsc.solvers.options import fill_gaps, is_set, petsc_number
+from lyra_petsc.stepping.advice import Circumstances, advice, trouble
 from lyra_petsc.stepping.control import LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.diagnosis import diagnose
 from lyra_petsc.stepping.equilibrium import Equilibrium
+from lyra_petsc.stepping.failure import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.rounding import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -77,6 +80,8 @@ class Simulation:
     time : float
         [s]
     step_number : int
+    failure : Failure or None
+        Why the last step could not be taken.
     notes : list of str
         What the user should know: mesh repairs, changed linear solver, …
 
@@ -96,6 +101,7 @@ class Simulation:
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
             self.stepper = Stepper(scene, system, self.model.pattern, outline.spacing, floor)
+        self._floor = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
@@ -106,6 +112,8 @@ class Simulation:
         self.estimated_error = 0.0
         self.compression = Compression(self.model)
         self._told_of_error = False
+        self.failure: Failure | None = None
+        self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
         self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
@@ -147,6 +155,7 @@ class Simulation:
         system, n = self.model.system, self.model.points.n_owned
         x_before, v_before = system.x.copy(), system.v.copy()
         newton = linear = rejected = 0
+        self._tried = []
         while True:
             end = self.control.next_end(self.time)
             past = system.scheme.memory()
@@ -205,6 +214,7 @@ class Simulation:
         return stands
 
     def _recover(self, attempt: Attempt, end: float) -> None:
+        self._tried.append(Tried.of(attempt, end - self.time))
         if self.stepper.linear_solver_failed:
             previous = self.stepper.preset
             following = self.stepper.next_preset()
@@ -215,13 +225,40 @@ class Simulation:
                 )
                 return
         if not self.control.failed():
-            now, moves = self._now(), self.model.system.scheme.moves
-            last = f"Δt = {end - self.time:.3g} s" if moves else f"an increment of {end - self.time:.3g}"
-            raise SolverError(
-                f"step {self.step_number + 1} ({now}) did not converge even with {last}: {attempt.words}; "
-                f"last residual {attempt.residual:.3g} N; the state at {now} is kept; {attempt.advice}",
-                collective=True,
-            )
+            self.failure = self._explain(attempt, end)
+            raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
+
+    def _explain(self, attempt: Attempt, end: float) -> Failure:
+        """Why the last attempt at a step failed; collective."""
+        model, scene, stuck = self.model, self.scene, attempt.stuck
+        assert stuck is not None
+        system, outline, stepper = model.system, model.outline, self.stepper
+        diagnosis = diagnose(
+            model.points, model.membrane, system.held, stuck, system.x, system.mass, model.tags
+        )
+        now = Circumstances(
+            dt=end - self.time,
+            nominal=self.control.step,
+            spacing=outline.spacing,
+            floor=self._floor,
+            max_iterations=stepper.snes.getTolerances()[3],
+            iterations_key="-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations",
+            linear_iterations=stepper.ksp.getTolerances()[3],
+            preconditioner=stepper.ksp.getPC().getType(),
+            ranks=self.comm.size,
+        )
+        return Failure(
+            step=self.step_number + 1,
+            time=self.time,
+            dt=now.dt,
+            static=not system.scheme.moves,
+            kind=trouble(diagnosis, stuck),
+            tried=self._tried,
+            diagnosis=diagnosis,
+            advice=advice(diagnosis, stuck, scene, now),
+            sources=outline.sources,
+            stuck=stuck,
+        )
 
     def memory(self) -> dict[str, Any]:
         """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""

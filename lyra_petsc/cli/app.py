@@ -54,7 +54,7 @@ def run_command_line(argv: Sequence[str]) -> int:
     try:
         code = _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
     except LyraError as error:
-        _say(comm, str(error))
+        _say(comm, str(error), error.details)
         return _leave_together(comm, error.exit_code)
     except click.exceptions.Exit as leave:
         return leave.exit_code
@@ -69,9 +69,10 @@ def run_command_line(argv: Sequence[str]) -> int:
     return code if isinstance(code, int) else 0
 
 
-def _say(comm: Any, line: str) -> None:
+def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
     if comm.rank == 0:
-        print(f"lyra-petsc: {' '.join(line.split())}", file=sys.stderr, flush=True)
+        lines = [f"lyra-petsc: {' '.join(line.split())}", *(f"  {detail}" for detail in details)]
+        print("\n".join(lines), file=sys.stderr, flush=True)
 
 
 def _leave_together(comm: Any, code: int) -> int:

@@ -97,6 +97,8 @@ class Diagnosis:
         Norm of the largest of its parts [N], of those that are finite.
     not_finite : int
         Vertices whose residual is not a finite number.
+    iterate_finite : bool
+        Whether the velocities are finite.
     overflowing : list of str
         Parts of the residual that hold such numbers.
     vertex : Vertex
@@ -110,6 +112,7 @@ class Diagnosis:
     norm: float
     scale: float
     not_finite: int
+    iterate_finite: bool
     overflowing: list[str]
     vertex: Vertex
     triangle: Triangle
@@ -147,6 +150,7 @@ def diagnose(
         norm=float(np.sqrt(_square(comm, residual))),
         scale=float(np.sqrt(max(finite, default=0.0))),
         not_finite=int(comm.allreduce(int(wrong.sum()))),
+        iterate_finite=not comm.allreduce(int(not np.isfinite(stuck.velocity).all())),
         overflowing=[name for name, square in squares.items() if not np.isfinite(square)],
         vertex=_vertex(points, stuck, residual, forces, x[:n], mass, tags),
         triangle=_triangle(points, membrane, stuck, residual),
