@@ -14,7 +14,8 @@ from petsc4py import PETSc
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import Interrupted, LyraError, SolverError
-from lyra_petsc.output.folder import choose, create
+from lyra_petsc.output.claim import Claim
+from lyra_petsc.output.folder import choose
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
@@ -61,18 +62,30 @@ def run(
     stem = path.stem
     choice = choose(comm, stem, out, force=force, resume=resume)
     scene = read_scene(comm, path, settings)
-    simulation = Simulation(comm, scene, phases)
-    recorder = Recorder(simulation)
-    folder = create(comm, choice)
-    with phases("output"):
-        if choice.resume:
-            recorder.resume(folder)
-        else:
-            recorder.begin(folder)
-    simulation.model.release()
-    journey = _Journey(comm, simulation, recorder, folder)
-    journey.go(stop)
-    simulation.destroy()
+    with Claim(comm, choice) as claim:  # before the set-up, which may take long
+        simulation = Simulation(comm, scene, phases)
+        recorder = Recorder(simulation)
+        if claim.note:
+            simulation.notes.append(claim.note)
+        _leave_set_up(stop)
+        with phases("output"):
+            claim.clear()
+            if choice.resume:
+                recorder.resume(claim.path)
+            else:
+                recorder.begin(claim.path)
+        simulation.model.release()
+        journey = _Journey(comm, simulation, recorder, claim.path)
+        journey.go(stop)
+        simulation.destroy()
+
+
+def _leave_set_up(stop: StopRequest) -> None:
+    number = stop.signal_number()
+    if number:
+        raise Interrupted(
+            f"stopped by {signal.Signals(number).name} during the set-up; nothing was written", number
+        )
 
 
 class _Journey:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -87,9 +88,13 @@ class History:
         on_root(self.comm, lambda: self._append(values))
 
     def close(self) -> None:
-        """Close the file; nothing can be appended afterwards. Not collective."""
+        """Close the file; nothing can be appended afterwards. Not collective.
+
+        Every row is on its way when ``append`` returns: what a failed one left behind is dropped.
+        """
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()
             self._file = None
 
     def _open(self, resume_after: int | None) -> None:
