@@ -159,7 +159,8 @@ class Simulation:
         while True:
             end = self.control.next_end(self.time)
             past = system.scheme.memory()
-            with self.phases("solve"):
+            # numbers that overflow make the attempt fail, which is told then
+            with self.phases("solve"), np.errstate(over="ignore", invalid="ignore"):
                 attempt = self._seek.attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
@@ -214,7 +215,7 @@ class Simulation:
         return stands
 
     def _recover(self, attempt: Attempt, end: float) -> None:
-        self._tried.append(Tried.of(attempt, end - self.time))
+        self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
             previous = self.stepper.preset
             following = self.stepper.next_preset()

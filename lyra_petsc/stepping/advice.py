@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 from petsc4py import PETSc
 
 from lyra_petsc.scene.schema import Scene
@@ -31,6 +30,7 @@ NEARLY = 1e-3
 
 NEAR_ROUNDOFF = 100.0
 FEW_ITERATIONS = 10
+MANY_LINEAR = 1000
 MANY_CUTS = 100.0
 """Cut of Δt after which a smaller one is not what is missing."""
 
@@ -80,25 +80,28 @@ class Circumstances:
 
 def trouble(diagnosis: Diagnosis, stuck: Stuck) -> str:
     """``overflow``, ``linear trouble`` or ``nonlinear trouble``."""
-    if diagnosis.not_finite:
+    if diagnosis.not_finite or not math.isfinite(diagnosis.norm):
         return "overflow"
     if stuck.snes_reason == SNES.DIVERGED_LINEAR_SOLVE:
         return "linear trouble"
+    if stuck.ksp_reason >= 0:
+        return "nonlinear trouble"
+    # what stopped the solve is the direction that this linear solve failed to give; where the iterations
+    # ran out it may be one failure of many solves
     solved = stuck.iterations[1:]
     failed = sum(each.linear_reason < 0 for each in solved)
-    if stuck.ksp_reason < 0 and 2 * failed >= len(solved):
-        return "linear trouble"
-    return "nonlinear trouble"
+    ran_out = stuck.snes_reason == SNES.DIVERGED_MAX_IT and 2 * failed < len(solved)
+    return "nonlinear trouble" if ran_out else "linear trouble"
 
 
 def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances) -> list[str]:
-    """What to try, most promising first; never empty."""
+    """What to try and why, most promising first; never empty."""
     kind = trouble(diagnosis, stuck)
     if kind == "overflow":
-        return [_overflow(diagnosis, stuck), *_steps(scene, now)]
-    found = [*_place(diagnosis, scene, now)]
+        return [_overflow(diagnosis), *_steps(scene, now)]
+    found = _place(diagnosis, scene, now)
     if kind == "linear trouble":
-        return [_linear(stuck, now), *found]
+        return [*_linear(stuck, scene, now), *found]
     limit = _limit(stuck, now)
     if limit and now.max_iterations < FEW_ITERATIONS:
         return [*limit, *found, *_steps(scene, now)]
@@ -106,83 +109,81 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
     return found or ["more material.damping, or a finer mesh"]
 
 
-def _overflow(diagnosis: Diagnosis, stuck: Stuck) -> str:
-    if not diagnosis.iterate_finite:
-        return (
-            "the velocities are not finite: look for absurd numbers in material, gravity, loads, wind and "
-            "initial, and in the units of the mesh (mesh.transform.scale)"
-        )
-    keys = "; ".join(KEYS.get(name, name) for name in diagnosis.overflowing) or KEYS["internal"]
-    return (
-        f"numbers overflow in the forces ({', '.join(diagnosis.overflowing)}): look for absurd ones in {keys}"
-    )
+def _overflow(diagnosis: Diagnosis) -> str:
+    absurd = "smaller numbers where one is absurd, or lost its unit: in "
+    if not diagnosis.iterate_finite or not diagnosis.overflowing:
+        return absurd + "material, gravity, loads, wind, initial, motions, or mesh.transform.scale"
+    keys = "; ".join(KEYS.get(name, name) for name in diagnosis.overflowing)
+    return f"{absurd}{keys} (what overflows: {', '.join(diagnosis.overflowing)})"
 
 
 def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     """What is odd at the worst vertex and triangle."""
     found = []
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
-    if diagnosis.handle is not None and diagnosis.jump > LONG * now.spacing:
+    sizes = diagnosis.jump / now.spacing
+    if diagnosis.handle is not None and sizes > LONG:
         motion = scene.handles[diagnosis.handle].motion
         found.append(
-            f"handles[{diagnosis.handle}] moves {diagnosis.jump:.3g} m in this step, "
-            f"{diagnosis.jump / now.spacing:.2g} element sizes: give "
-            + (f"motions.{motion} more time" if motion else "it a motion without jumps")
+            (f"more time for motions.{motion}" if motion else "a motion without jumps")
+            + f" (handles[{diagnosis.handle}] moves {diagnosis.jump:.3g} m in this step, "
+            f"{sizes:.2g} element sizes)"
         )
     small, large = triangle.stretches
     if small < SOFTENS:
         found.append(
-            f"triangle {triangle.number} is squeezed to {small:.3g} of its size; below 1/√3 = 0.577 the "
-            "St. Venant-Kirchhoff membrane softens: squeeze it less (motions, loads), or let it fold with "
-            "a finer mesh"
+            f"less squeezing by motions and loads, or a finer mesh that can fold (triangle {triangle.number} "
+            f"is at {small:.3g} of its size; below 1/√3 = 0.577 the St. Venant-Kirchhoff membrane softens)"
         )
     if large > STRETCHED:
         found.append(
-            f"triangle {triangle.number} is stretched to {large:.3g} times its size: "
-            "less load or motion, or more material.membrane"
+            "less motion or load, or more material.membrane "
+            f"(triangle {triangle.number} is stretched to {large:.3g} times its size)"
         )
     if scene.time.scheme != "static":
         for name, keys in (("wind", "wind.velocity"), ("loads", "gravity and loads")):
             way = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
             if way > LONG * now.spacing:
                 found.append(
-                    f"{name} alone would move vertex {vertex.number} by {way:.3g} m in this step, "
-                    f"{way / now.spacing:.2g} element sizes: less {keys}, or a smaller time.step"
+                    f"less {keys}, or a smaller time.step ({name} alone would move vertex {vertex.number} by "
+                    f"{way:.3g} m in this step, {way / now.spacing:.2g} element sizes)"
                 )
     if triangle.aspect > SLIVER:
         found.append(
-            f"triangle {triangle.number} has an aspect ratio of {triangle.aspect:.3g} at rest: mesh it better"
+            f"a better mesh (triangle {triangle.number} has an aspect ratio of {triangle.aspect:.3g} at rest)"
         )
     return found
 
 
-def _linear(stuck: Stuck, now: Circumstances) -> str:
-    direct = "-pc_type lu" if now.ranks == 1 else "-pc_type lu -pc_factor_mat_solver_type mumps"
-    if stuck.ksp_reason == KSP.DIVERGED_MAX_IT:
-        if now.linear_iterations < 1000:
-            return f"-ksp_max_it above {now.linear_iterations}, or a direct solver: {direct}"
-        return f"a direct solver: {direct}"
-    if stuck.ksp_reason == KSP.DIVERGED_NANORINF:
-        return f"look for absurd numbers in material, loads and wind; or a direct solver: {direct}"
+def _linear(stuck: Stuck, scene: Scene, now: Circumstances) -> list[str]:
+    direct = "a direct solver: -pc_type lu"
+    if now.ranks > 1:
+        direct += " -pc_factor_mat_solver_type mumps"
+    if stuck.ksp_reason == KSP.DIVERGED_MAX_IT and now.linear_iterations < MANY_LINEAR:
+        return [f"-ksp_max_it above {now.linear_iterations}", direct]
+    if stuck.ksp_reason == KSP.DIVERGED_INDEFINITE_MAT and scene.solver.hessian != "regularised":
+        return ["solver.hessian: regularised", direct]
     if now.preconditioner in ("lu", "cholesky"):
-        return "-pc_factor_shift_type positive_definite, or less absurd numbers in material"
-    return f"another preconditioner than -pc_type {now.preconditioner}; safest is a direct solver: {direct}"
+        return ["-pc_factor_shift_type positive_definite, or smaller numbers where material has absurd ones"]
+    return [direct, f"another preconditioner than -pc_type {now.preconditioner}"]
 
 
 def _limit(stuck: Stuck, now: Circumstances) -> list[str]:
     """Whether more iterations would help."""
     if stuck.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
-        return ["-snes_max_funcs larger"]
+        return ["a larger -snes_max_funcs"]
     if stuck.snes_reason != SNES.DIVERGED_MAX_IT:
         return []
     norms = [each.residual for each in stuck.iterations]
-    third = 2 * len(norms) // 3
-    falling = third > 0 and min(norms[third:]) < 0.5 * min(norms[:third])
-    if now.max_iterations < FEW_ITERATIONS or falling:
-        why = "; the residual was still falling" if falling else ""
-        return [f"{now.iterations_key} above {now.max_iterations}{why}"]
+    early = 2 * len(norms) // 3
+    falling = early > 0 and min(norms[early:]) < 0.5 * min(norms[1:early] or norms[:1])
+    above = f"{now.iterations_key} above {now.max_iterations}"
+    if falling:
+        return [f"{above} (the residual was still falling)"]
+    if now.max_iterations < FEW_ITERATIONS:
+        return [above]
     return [
-        f"more material.damping: {now.max_iterations} iterations ({now.iterations_key}) did not lessen it"
+        f"more material.damping (the last of {now.max_iterations} iterations did not lessen the residual)"
     ]
 
 
@@ -192,24 +193,21 @@ def _nearly(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]
     if diagnosis.scale == 0.0 or diagnosis.norm > NEARLY * diagnosis.scale:
         return []
     share = diagnosis.norm / diagnosis.scale
-    loose = 10.0 ** math.ceil(math.log10(max(2.0 * share, float(np.finfo(float).tiny))))
+    loose = 10.0 ** math.ceil(math.log10(max(2.0 * share, 10.0 * asked)))
     if diagnosis.norm <= NEAR_ROUNDOFF * now.floor:
         return [
-            f"little more than round-off is left ({now.floor:.2g} N): solver.force_tolerance: "
-            f"{max(loose, 10.0 * asked):.0e}, and solver.step_tolerance likewise"
+            f"solver.force_tolerance: {loose:.0e} and solver.step_tolerance likewise "
+            f"(little more than round-off, {now.floor:.2g} N, is left)"
         ]
+    balance = f"(forces balance to {share:.1e} of the largest)"
     if share <= asked:
-        return [f"forces balance to {share:.1e}: solver.step_tolerance above {scene.solver.step_tolerance:g}"]
-    return [
-        f"forces balance to {share:.1e} of the largest: if that will do, solver.force_tolerance: {loose:.0e}"
-    ]
+        return [f"solver.step_tolerance above {scene.solver.step_tolerance:g} {balance}"]
+    return [f"if that will do, solver.force_tolerance: {loose:.0e} {balance}"]
 
 
 def _steps(scene: Scene, now: Circumstances) -> list[str]:
     if now.nominal > MANY_CUTS * now.dt:
         return []
     if scene.time.scheme == "static":
-        return [
-            "a smaller time.step (first increment of the load), or a damped motion (time.analysis: dynamic)"
-        ]
+        return ["a smaller time.step (first increment of the load), or a damped motion instead"]
     return [f"a smaller time.step, or -ts_adapt_dt_min below {now.dt:.3g}"]

@@ -165,10 +165,12 @@ def _square(comm: MPI.Comm, rows: Array) -> float:
 
 
 def _size(rows: Array) -> Array:
-    """Norms of the rows; infinite where one is not a number."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        sizes = np.sqrt(np.sum(rows * rows, axis=-1))
-    return np.where(np.isnan(sizes), np.inf, sizes)
+    """Norms of the rows, whose squares may overflow; infinite where a number is not finite."""
+    largest = np.abs(rows).max(axis=-1, initial=0.0)
+    usable = np.isfinite(largest) & (largest > 0.0)
+    scale = np.where(usable, largest, 1.0)[..., None]
+    sizes = scale[..., 0] * np.sqrt(np.sum(np.where(np.isfinite(rows), rows / scale, 0.0) ** 2, axis=-1))
+    return np.where(np.isfinite(largest), sizes, np.inf)
 
 
 def worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -20,18 +21,21 @@ FEW = 8
 
 @dataclass(frozen=True)
 class Tried:
-    """One attempt that failed: its Δt [s] (increment of the load factor), and how it ended."""
+    """One attempt that failed: its Δt [s] (increment of the load factor), linear solver, and end."""
 
     dt: float
+    solver: str
     newton_iterations: int
     linear_iterations: int
     residual: float
     words: str
 
     @classmethod
-    def of(cls, attempt: Attempt, dt: float) -> Tried:
+    def of(cls, attempt: Attempt, dt: float, solver: str) -> Tried:
         """From the stepper's outcome."""
-        return cls(dt, attempt.newton_iterations, attempt.linear_iterations, attempt.residual, attempt.words)
+        iterations = attempt.newton_iterations, attempt.linear_iterations
+        norm = attempt.residual if attempt.stuck is None else attempt.stuck.norm
+        return cls(dt, solver, *iterations, norm, attempt.words)
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ class Failure:
     def _attempt(self, tried: Tried) -> str:
         length = f"increment {tried.dt:.3g}" if self.static else f"Δt {tried.dt:.3g} s"
         return (
-            f"{length}: {tried.newton_iterations} Newton, {tried.linear_iterations} linear iterations, "
+            f"{length} ({tried.solver}): {tried.newton_iterations} Newton, {tried.linear_iterations} linear iterations, "
             f"{tried.residual:.3g} N"
         )
 
@@ -149,7 +153,7 @@ class Failure:
     def _places(self) -> list[str]:
         vertex, triangle = self.diagnosis.vertex, self.diagnosis.triangle
         forces = ", ".join(f"{name} {size:.3g}" for name, size in vertex.forces.items())
-        size = float(np.linalg.norm(vertex.residual))
+        size = math.hypot(*vertex.residual)
         many = self.diagnosis.not_finite
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),

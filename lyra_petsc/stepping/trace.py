@@ -46,6 +46,8 @@ class Stuck:
     Attributes
     ----------
     iterations : tuple of Iteration
+    norm : float
+        Of the residual [N], with prescribed coordinates.
     velocity, position : (n_owned, 3)
         Of the stage, [m/s] and [m].
     residual : (n_owned, 3)
@@ -62,6 +64,7 @@ class Stuck:
     """
 
     iterations: tuple[Iteration, ...]
+    norm: float
     velocity: Array
     position: Array
     residual: Array
@@ -123,8 +126,10 @@ class Trace:
             if system.scheme.given:
                 system.held.targets(system.t0, system.t1, system.t0 + stage.after, position)
             system.held.targets(system.t0, system.t1, system.t1, goal)
+        square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
         return Stuck(
             tuple(self._iterations),
+            float(np.sqrt(square)),
             velocity,
             position,
             residual,
