@@ -7,7 +7,7 @@ from petsc4py import PETSc
 NOT_A_NUMBER = -4
 """SNES reason of a residual that is not a number; its name changed in PETSc 3.25."""
 
-_NOT_A_NUMBER = "the residual is not a number (a triangle collapsed?)"
+_NOT_A_NUMBER = "the residual is not a finite number"
 _SNES = {
     PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "Newton did not converge within its iterations",
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "the line search found no smaller energy",

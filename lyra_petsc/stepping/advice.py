@@ -120,6 +120,9 @@ def _overflow(diagnosis: Diagnosis) -> str:
 def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     """What is odd at the worst vertex and triangle."""
     found = []
+    static = scene.time.scheme == "static"
+    if static and not scene.handles:
+        found.append("handles (nothing holds the sheet)")
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
     sizes = diagnosis.jump / now.spacing
     if diagnosis.handle is not None and sizes > LONG:
@@ -140,7 +143,7 @@ def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
             "less motion or load, or more material.membrane "
             f"(triangle {triangle.number} is stretched to {large:.3g} times its size)"
         )
-    if scene.time.scheme != "static":
+    if not static:
         for name, keys in (("wind", "wind.velocity"), ("loads", "gravity and loads")):
             way = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
             if way > LONG * now.spacing:

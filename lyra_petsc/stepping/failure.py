@@ -91,14 +91,9 @@ class Failure:
     @property
     def lines(self) -> tuple[str, ...]:
         """The rest, short."""
-        history = _shortened([_iterate(each) for each in self.stuck.iterations])
-        found = [f"residual [N] by iteration (linear iterations): {', '.join(history)}"] if history else []
-        if linear := self._linear():
-            found.append(linear)
-        if earlier := self.tried[:-1]:
-            found.append(
-                f"attempts before: {'; '.join(_shortened([self._attempt(each) for each in earlier]))}"
-            )
+        history = ", ".join(_shortened([_iterate(each) for each in self.stuck.iterations]))
+        found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
+        found += [line for line in (self._linear(), self._earlier()) if line]
         found += self._places()
         return (*found, *(f"or try {words}" for words in self.advice[1:4]))
 
@@ -139,9 +134,18 @@ class Failure:
     def _attempt(self, tried: Tried) -> str:
         length = f"increment {tried.dt:.3g}" if self.static else f"Δt {tried.dt:.3g} s"
         return (
-            f"{length} ({tried.solver}): {tried.newton_iterations} Newton, {tried.linear_iterations} linear iterations, "
-            f"{tried.residual:.3g} N"
+            f"{length} ({tried.solver}): {tried.newton_iterations} Newton and {tried.linear_iterations} "
+            f"linear iterations, residual {tried.residual:.3g} N"
         )
+
+    def _earlier(self) -> str:
+        """The attempts before the last one."""
+        each = [
+            f"{tried.dt:.3g}: {tried.residual:.3g} ({tried.newton_iterations})" for tried in self.tried[:-1]
+        ]
+        step = "increment" if self.static else "Δt [s]"
+        shown = ", ".join(_shortened(each))
+        return f"attempts before, {step}: residual [N] (Newton iterations): {shown}" if each else ""
 
     def _linear(self) -> str:
         """The linear solve, where it is what failed."""
