@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.meshing.capacity import check_capacity
 from lyra_petsc.meshing.files import culprits
-from lyra_petsc.meshing.grids import GridSource, grid_sheet
+from lyra_petsc.meshing.grids import GridSource, grid_sheet, grid_vertices
 from lyra_petsc.meshing.groups import GroupTable
 from lyra_petsc.meshing.layout import lay_out
 from lyra_petsc.meshing.mesh import Mesh, Source
@@ -85,6 +86,8 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
         if source.name is not None and source.name in names:
             raise InputError(f"'{source.name}' names an earlier source too", file=file, key=f"{key}.name")
         names |= {source.name} if source.name is not None else set()
+        if source.grid is not None:
+            check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
             sheet = _read(source, key, file)
             piece = _prepare(sheet, source, key, file)
