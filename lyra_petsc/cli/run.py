@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.errors import Interrupted, LyraError, SolverError
+from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.output.claim import Claim
 from lyra_petsc.output.folder import choose
 from lyra_petsc.output.phases import Phases
@@ -132,6 +132,7 @@ class _Journey:
                 recorder.write_state()
                 recorder.write_checkpoint()
                 self._summarise(outcome)
+                error.details += self._look_at_failure()
             raise
         except LyraError as error:
             outcome = str(error)
@@ -143,6 +144,16 @@ class _Journey:
         simulation.stepper.ts.viewFromOptions("-ts_view")
         closing_table(self._comm, simulation.phases.seconds(), self._folder, outcome)
         self._warn_of_unused()
+
+    def _look_at_failure(self) -> tuple[str, ...]:
+        """Write the step that failed; where it can be looked at."""
+        if self._simulation.failure is None:
+            return ()
+        try:
+            self._recorder.write_failure()
+        except OutputError as error:
+            return (str(error),)
+        return (f"look at {self._folder / 'failure.xdmf'} (ParaView) and {self._folder / 'failure.txt'}",)
 
     def _obey(self, stop: StopRequest) -> None:
         number = stop.signal_number()
@@ -183,6 +194,7 @@ class _Journey:
             **self._totals,
             "wall_seconds": simulation.phases.seconds(),
             "notes": simulation.notes,
+            **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)
 

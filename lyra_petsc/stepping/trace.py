@@ -48,6 +48,8 @@ class Stuck:
     iterations : tuple of Iteration
     norm : float
         Of the residual [N], with prescribed coordinates.
+    time : float
+        Of the stage [s], or the load factor.
     velocity, position : (n_owned, 3)
         Of the stage, [m/s] and [m].
     residual : (n_owned, 3)
@@ -65,6 +67,7 @@ class Stuck:
 
     iterations: tuple[Iteration, ...]
     norm: float
+    time: float
     velocity: Array
     position: Array
     residual: Array
@@ -130,6 +133,7 @@ class Trace:
         return Stuck(
             tuple(self._iterations),
             float(np.sqrt(square)),
+            system.t0 + stage.after,
             velocity,
             position,
             residual,
