@@ -21,7 +21,6 @@ BUG = 70
 """Exit code of what should never happen."""
 
 LATER = {
-    "stress": "stability on stiff and extreme cases",
     "render": "pictures and films",
     "view": "a live page",
     "export": "other formats",
@@ -260,6 +259,29 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
         run_job(comm, job)
     else:
         study_scene(comm, Asked(**asked))
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@_scene
+@_set
+@click.option("--only", multiple=True, metavar="NAME,NAME,…", help="Only these cases or families.")
+@click.option("--quick", is_flag=True, help="Fewer cases, on a coarser sheet: less than a minute.")
+@click.option("--full", is_flag=True, help="All values, and their products.")
+@click.option("--list", "listed", is_flag=True, help="Name the cases; runs nothing.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
+@click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
+@click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
+@click.pass_obj
+def stress(comm: Any, /, listed: bool, **asked: Any) -> int:
+    """Run stiff and extreme cases, on a hanging sheet or on SCENE; exit code 1 if a verdict fails."""
+    from lyra_petsc.cli.stress import Asked, list_cases
+    from lyra_petsc.cli.stress import stress as stress_cases
+
+    if listed:
+        list_cases(comm, Asked(**asked))
+        return 0
+    return stress_cases(comm, Asked(**asked))
 
 
 @_verbs.command(context_settings=_SETTINGS)

@@ -1,4 +1,4 @@
-"""Where cases run their simulations: counted steps, and for exact answers a direct solver, tight tolerances."""
+"""Where cases run their simulations: counted steps; for exact answers a direct solver, tight tolerances."""
 
 from __future__ import annotations
 

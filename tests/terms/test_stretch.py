@@ -29,9 +29,7 @@ def test_as_numpys_singular_values(seed: int) -> None:
 def test_a_nearly_collapsed_triangle_keeps_its_digits() -> None:
     x = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0], [0.0, 0.0, 1e-9]])
     stencil = np.array([[0, 1, 2]], dtype=np.int32)
-    np.testing.assert_allclose(
-        principal_stretches(x, stencil, np.eye(2)[None], 1), [[1e-9, 1e3]], rtol=1e-14
-    )
+    np.testing.assert_allclose(principal_stretches(x, stencil, np.eye(2)[None], 1), [[1e-9, 1e3]], rtol=1e-14)
 
 
 def test_a_triangle_without_any_extent() -> None:
