@@ -100,13 +100,21 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
     if kind == "overflow":
         return [_overflow(diagnosis), *_steps(scene, now)]
     found = _place(diagnosis, scene, now)
+    static = scene.time.scheme == "static"
+    if static and not scene.handles:
+        found.insert(0, "handles (nothing holds the sheet)")
+        return [*found, *_linear(stuck, scene, now)]
     if kind == "linear trouble":
         return [*_linear(stuck, scene, now), *found]
     limit = _limit(stuck, now)
     if limit and now.max_iterations < FEW_ITERATIONS:
         return [*limit, *found, *_steps(scene, now)]
     found += [*_nearly(diagnosis, scene, now), *limit, *_steps(scene, now)]
-    return found or ["more material.damping, or a finer mesh"]
+    if not found:
+        found = [
+            "more handles, or a damped motion instead" if static else "more material.damping, or a finer mesh"
+        ]
+    return found
 
 
 def _overflow(diagnosis: Diagnosis) -> str:
@@ -120,9 +128,6 @@ def _overflow(diagnosis: Diagnosis) -> str:
 def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     """What is odd at the worst vertex and triangle."""
     found = []
-    static = scene.time.scheme == "static"
-    if static and not scene.handles:
-        found.append("handles (nothing holds the sheet)")
     triangle, vertex = diagnosis.triangle, diagnosis.vertex
     sizes = diagnosis.jump / now.spacing
     if diagnosis.handle is not None and sizes > LONG:
@@ -143,7 +148,7 @@ def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
             "less motion or load, or more material.membrane "
             f"(triangle {triangle.number} is stretched to {large:.3g} times its size)"
         )
-    if not static:
+    if scene.time.scheme != "static":
         for name, keys in (("wind", "wind.velocity"), ("loads", "gravity and loads")):
             way = vertex.forces.get(name, 0.0) / vertex.mass * now.dt**2
             if way > LONG * now.spacing:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lyra_petsc.meshing.mesh import Source
 from lyra_petsc.stepping.diagnosis import Diagnosis
@@ -84,7 +83,8 @@ class Failure:
         return (
             f"step {self.step} ({self.now}) did not converge even with {last}: "
             f"{self.tried[-1].words} ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
-            f"worst at {self._vertex()} and {self._triangle()}; "
+            f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
+            f"and {self._triangle()}; "
             f"the state at {self.now} is kept; try {self.advice[0]}"
         )
 
@@ -108,13 +108,13 @@ class Failure:
             part = "" if each.taken is None else f"{each.taken:.3g}"
             linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
             rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
-        residuals = self.stuck.linear_residuals
-        if len(residuals):
-            rows += ["", "The last linear solve, residual norm by iteration:"]
-            rows += [f"  {number:9d}  {norm:12.5e}" for number, norm in enumerate(residuals)]
         rows += ["", "Where (vertices and triangles are counted from 0, in file order):"]
         rows += [f"  {line}" for line in self._places()]
         rows += ["", "What to try:", *(f"  {words}" for words in self.advice)]
+        if self._linear():
+            rows += ["", "The last linear solve, residual norm by iteration:"]
+            norms = self.stuck.linear_residuals
+            rows += [f"  {number:4d}  {norm:12.5e}" for number, norm in enumerate(norms)]
         return "\n".join(rows) + "\n"
 
     def content(self) -> dict[str, Any]:
@@ -198,5 +198,5 @@ def _shortened(entries: list[str]) -> list[str]:
     return entries if len(entries) <= FEW else [*entries[:3], "…", *entries[-4:]]
 
 
-def _point(position: NDArray[np.float64] | Sequence[float]) -> str:
-    return "(" + ", ".join(f"{value:.6g}" for value in position) + ")"
+def _point(position: Sequence[float], digits: int = 6) -> str:
+    return "(" + ", ".join(f"{value:.{digits}g}" for value in position) + ")"
