@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.fields import Field, chosen
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
+from lyra_petsc.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from lyra_petsc.output.failure import Moment, remove_failure, write_failure
-from lyra_petsc.output.history import HISTORY_COLUMNS, History, vector_columns
-from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
+from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
 from lyra_petsc.parallel import on_root
@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 MOST_CHANGES = 12
 """Changes of a resumed scene that are told one by one."""
+
+CHEAP = 100.0
+"""Time since the last checkpoint, over the time it took to write, from which on another is written."""
 
 
 class Recorder:
@@ -64,6 +67,7 @@ class Recorder:
         self._comm = points.comm
         self._last_checkpoint = clock.monotonic()
         self._last_state = -1
+        self._checkpoint_seconds = 0.0
         self.changes: list[Change] = []
 
     # -- opening -------------------------------------------------------------------------------------
@@ -104,10 +108,9 @@ class Recorder:
             simulation.notes.append(checkpoint.note)
         self._note_changes(folder / "scene.yaml")
         self._open(folder, simulation.step_number)
-        if self._history.kept_until != simulation.step_number:
-            simulation.notes.append(
-                f"{self._history.path}: rows {self._history.kept_until + 1} to {simulation.step_number} are lost"
-            )
+        kept, last = self._history.kept_until, simulation.step_number
+        if kept != last:
+            simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._last_state = int(memory["last_state"])
 
@@ -136,7 +139,9 @@ class Recorder:
             if change.key == "time.end":
                 notes.append(str(change))
             elif change.key == "time.integrator":
-                notes.append(f"changed since the run was begun: {change} (begins without memory of earlier steps)")
+                notes.append(
+                    f"changed since the run was begun: {change} (begins without memory of earlier steps)"
+                )
             else:
                 notes.append(f"changed since the run was begun: {change}")
         if len(self.changes) > MOST_CHANGES:
@@ -145,7 +150,7 @@ class Recorder:
     def _tables(self) -> dict[str, tuple[str, ...]]:
         """Names and columns of the tables that the scene asks for."""
         scene = self._simulation.scene
-        tables = {"history.csv": HISTORY_COLUMNS}
+        tables: dict[str, tuple[str, ...]] = {"history.csv": HISTORY_COLUMNS}
         if scene.probes:
             tables["probes.csv"] = vector_columns(list(scene.probes))
         if scene.output.reactions and scene.handles:
@@ -154,6 +159,7 @@ class Recorder:
 
     def _open(self, folder: Path, resume_after: int | None) -> None:
         self._folder = folder
+        on_root(self._comm, lambda: remove_failure(folder))
         self._states = StateWriter(
             folder,
             self._vertices,
@@ -181,9 +187,14 @@ class Recorder:
             self.write_checkpoint()
 
     def _due(self) -> bool:
-        """Whether a checkpoint is due by wall time: rank 0's clock decides."""
+        """Whether a checkpoint is due by wall time: rank 0's clock decides.
+
+        Also where it costs next to nothing beside the steps since the last one: a step of minutes is
+        then not lost to a launcher that leaves a second to finish.
+        """
         seconds = self._simulation.scene.output.checkpoint.seconds
-        due = clock.monotonic() - self._last_checkpoint >= seconds
+        elapsed = clock.monotonic() - self._last_checkpoint
+        due = elapsed >= seconds or elapsed >= CHEAP * self._checkpoint_seconds
         return bool(self._simulation.comm.bcast(due, root=0))
 
     def _write_row(self, report: StepReport) -> None:
@@ -256,10 +267,14 @@ class Recorder:
         arrays = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.departures.late)):
             arrays[f"start_{number}"] = system.departures.late[start]
-        write_checkpoint(
-            self._folder, self._vertices, arrays, {**simulation.memory(), "last_state": self._last_state}
-        )
+        scalars = simulation.memory() | {
+            "last_state": self._last_state,
+            "scheme": simulation.scene.time.scheme,
+        }
+        began = clock.monotonic()
+        write_checkpoint(self._folder, self._vertices, arrays, scalars)
         self._last_checkpoint = clock.monotonic()
+        self._checkpoint_seconds = self._last_checkpoint - began
 
     def write_failure(self) -> None:
         """Write why the last step could not be taken: the state before it and the failing iterate."""
@@ -288,5 +303,6 @@ class Recorder:
 
 def _groups(scene: Scene) -> set[str]:
     """Names of the mesh's groups that a scene uses."""
-    users = [*scene.material, *scene.handles, *scene.loads, *scene.probes.values()]
-    return {user.group for user in users if user.group is not None}
+    selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
+    names = {block.group for block in scene.material} | {selector.group for selector in selectors}
+    return {name for name in names if name is not None}

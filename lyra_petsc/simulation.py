@@ -301,6 +301,8 @@ class Simulation:
         while memory["preset"] in self.stepper.presets[1:]:
             self.stepper.next_preset()
         self.stepper.blend = float(memory["blend"])
+        # what a changed scene lets begin before now sets out from here; else all has begun already
+        system.begin(self.time)
         self.stepper.start(self.time, self.step_number)
 
     def destroy(self) -> None:

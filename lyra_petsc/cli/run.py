@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.output.claim import Claim
 from lyra_petsc.output.folder import choose
 from lyra_petsc.output.phases import Phases
-from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.default import default_scene
@@ -75,7 +76,7 @@ def run(
             else:
                 recorder.begin(claim.path)
         simulation.model.release()
-        journey = _Journey(comm, simulation, recorder, claim.path)
+        journey = _Journey(comm, simulation, recorder, claim.path, resumed=choice.resume)
         journey.go(stop)
         simulation.destroy()
 
@@ -91,12 +92,18 @@ def _leave_set_up(stop: StopRequest) -> None:
 class _Journey:
     """The loop over the steps with its progress, summary and ways of ending."""
 
-    def __init__(self, comm: MPI.Comm, simulation: Simulation, recorder: Recorder, folder: Path) -> None:
+    def __init__(
+        self, comm: MPI.Comm, simulation: Simulation, recorder: Recorder, folder: Path, *, resumed: bool
+    ) -> None:
         self._comm, self._simulation, self._recorder, self._folder = comm, simulation, recorder, folder
         self._totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
         self._versions = versions()
         self._told = 0
         self._first_step = simulation.step_number
+        self._resumed: list[dict[str, Any]] = []
+        if resumed:
+            earlier = on_root(comm, lambda: read_summary(folder / "summary.json")) or {}
+            self._resumed = [*earlier.get("resumed", []), self._resumption()]
 
     def go(self, stop: StopRequest) -> None:
         simulation, recorder = self._simulation, self._recorder
@@ -127,16 +134,13 @@ class _Journey:
                     )
                     self._obey(stop)
         except SolverError as error:
-            outcome = str(error)
             if error.collective:
-                recorder.write_state()
-                recorder.write_checkpoint()
-                self._summarise(outcome)
-                error.details += self._look_at_failure()
+                error.details += self._keep(str(error))
             raise
         except LyraError as error:
-            outcome = str(error)
-            self._summarise(outcome)
+            # the first thing that went wrong is what counts: on a full disk this fails as well
+            with suppress(OutputError):
+                self._summarise(str(error))
             raise
         finally:
             recorder.close()
@@ -145,11 +149,25 @@ class _Journey:
         closing_table(self._comm, simulation.phases.seconds(), self._folder, outcome)
         self._warn_of_unused()
 
-    def _look_at_failure(self) -> tuple[str, ...]:
-        """Write the step that failed; where it can be looked at."""
-        if self._simulation.failure is None:
-            return ()
+    def _resumption(self) -> dict[str, Any]:
+        """Where this run takes over, and what is different from then on."""
+        changes = [{"key": c.key, "old": c.old, "new": c.new} for c in self._recorder.changes]
+        simulation = self._simulation
+        return {
+            "step": simulation.step_number,
+            "time": simulation.time,
+            "ranks": self._comm.size,
+            "changes": changes,
+        }
+
+    def _keep(self, outcome: str) -> tuple[str, ...]:
+        """Write the last good state and the step that failed; where it can be looked at."""
         try:
+            self._recorder.write_state()
+            self._recorder.write_checkpoint()
+            self._summarise(outcome)
+            if self._simulation.failure is None:
+                return ()
             self._recorder.write_failure()
         except OutputError as error:
             return (str(error),)
@@ -192,6 +210,7 @@ class _Journey:
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
             **self._totals,
+            "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
             "notes": simulation.notes,
             **({"failure": simulation.failure.content()} if simulation.failure else {}),
