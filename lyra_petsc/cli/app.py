@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,9 +27,6 @@ LATER = {
     "new": "a starter scene",
 }
 """Verbs that are announced and not there yet."""
-
-GRACE_SECONDS = 5.0
-"""How long a failing rank waits for the others to fail alike before it ends the job."""
 
 
 def run_command_line(argv: Sequence[str]) -> int:
@@ -76,13 +72,10 @@ def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
 
 def _leave_together(comm: Any, code: int) -> int:
     """Exit if all ranks failed alike; end the whole job if some are still at work."""
-    if comm.size > 1:
-        request = comm.Ibarrier()
-        deadline = time.monotonic() + GRACE_SECONDS
-        while not request.Test():
-            if time.monotonic() > deadline:
-                comm.Abort(code)
-            time.sleep(0.01)
+    from lyra_petsc.parallel import all_here
+
+    if not all_here(comm):
+        comm.Abort(code)
     return code
 
 

@@ -12,10 +12,11 @@ from petsc4py import PETSc
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.parallel import all_here
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
-from lyra_petsc.solvers.options import Value, fill_gaps, is_set
+from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.solvers.presets import candidates, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import LOOSEST
@@ -154,9 +155,7 @@ class Stepper:
         try:
             ts.setFromOptions()
         except PETSc.Error as error:
-            raise InputError(
-                f"PETSc refuses the options: {reasons.last_words(error)}", key="PETSc options"
-            ) from None
+            raise refused(error) from None
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
@@ -239,7 +238,8 @@ class Stepper:
         except PETSc.Error as error:
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
-                "the state before it is kept; check the PETSc options"
+                f"the state before it is kept; check {culprits(error)}",
+                collective=all_here(system.points.comm),
             ) from None
         newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
         words, advice = "the velocities are not finite", "try a smaller time.step"
