@@ -66,6 +66,7 @@ class Recorder:
             self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
         self._comm = points.comm
         self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
         self._last_state = -1
         self._checkpoint_seconds = 0.0
         self.changes: list[Change] = []
@@ -179,6 +180,7 @@ class Recorder:
     def record(self, report: StepReport) -> None:
         """Everything that the step just accepted has to leave on disk."""
         self._write_row(report)
+        self._steps_since += 1
         control = self._simulation.control
         if control.writes_at(report.time) or self._simulation.finished:
             self.write_state()
@@ -187,14 +189,16 @@ class Recorder:
             self.write_checkpoint()
 
     def _due(self) -> bool:
-        """Whether a checkpoint is due by wall time: rank 0's clock decides.
+        """Whether a checkpoint is due, by steps or by wall time: rank 0's clock decides.
 
         Also where it costs next to nothing beside the steps since the last one: a step of minutes is
         then not lost to a launcher that leaves a second to finish.
         """
-        seconds = self._simulation.scene.output.checkpoint.seconds
+        asked = self._simulation.scene.output.checkpoint
+        if asked.steps is not None and self._steps_since >= asked.steps:
+            return True
         elapsed = clock.monotonic() - self._last_checkpoint
-        due = elapsed >= seconds or elapsed >= CHEAP * self._checkpoint_seconds
+        due = elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
         return bool(self._simulation.comm.bcast(due, root=0))
 
     def _write_row(self, report: StepReport) -> None:
@@ -274,6 +278,7 @@ class Recorder:
         began = clock.monotonic()
         write_checkpoint(self._folder, self._vertices, arrays, scalars)
         self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
         self._checkpoint_seconds = self._last_checkpoint - began
 
     def write_failure(self) -> None:

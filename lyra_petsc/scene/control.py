@@ -126,9 +126,12 @@ class Checkpoint(Block):
     ----------
     seconds : float [s]
         Wall time.
+    steps : int or None
+        Accepted steps; None: only by wall time.
     """
 
     seconds: Positive = 60.0
+    steps: Count | None = None
 
 
 class Output(Block):
