@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
@@ -92,6 +92,7 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
 
     # a base scene that does not run is refused before anything is written
     clock = BaseClock(comm, setting, watch)
+    setting = replace(setting, size=clock.size)
     prepare(comm, folder, force=asked.force)
     show = Show(comm, len(cases))
     outcomes: list[Outcome] = []

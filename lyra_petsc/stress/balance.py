@@ -7,7 +7,8 @@ The energy identity, with the masses M, the elastic energy E and x' − x = Δt 
 
 The left side is made of energies and the right of forces, so that forces which are not the gradient of
 their energy break it as surely as a step that was not solved. The integral of the membrane is exact (its
-energy is a quartic along a line); that of the hinges is refined until it stands.
+energy is a quartic along a line); that of the hinges is refined until it stands, and where hinges jump, which
+their model does beyond 180°, it is replaced by their energies' difference.
 
 Every step leaves a residual r on the free coordinates, of which the solver promises ‖r‖ ≤ force tolerance ×
 forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may be
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.simulation import Simulation, StepReport
 from lyra_petsc.stepping.rounding import residual_roundoff
+from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
@@ -33,8 +35,12 @@ Array = NDArray[np.float64]
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
 
-MOST_PANELS = 64
+MOST_PANELS = 16
 """Of the integral along the hinges' way."""
+
+SAMPLES, WIDEST_TURN = 9, 1.0
+"""Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
+passes 180°, or whose triangle is turned over in its plane, changes its energy without a force."""
 
 CHUNK = 4096
 """Elements whose Hessians are held at once."""
@@ -62,7 +68,7 @@ class Balance:
     spin, spin_tolerance : float
         Of Σ (x' − centre) × (m Δv) − Δt Σ torques.
     jumped : bool
-        The hinges' integral did not settle (a hinge went past 180°); their bracket is from their energies.
+        Hinges turned too far to follow; their part of the bracket is from their energies.
     """
 
     energy: float
@@ -164,7 +170,7 @@ class Accountant:
         # positions are rounded, too: x' − x is Δt v' only to their last digit
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
-        along, jumped = self._along(x0, dx, elastic, 0.1 * tolerance)
+        along, jumped = self._along(x0, dx, 0.1 * tolerance)
         bracket = along - inner
         change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
         work = outer + turn
@@ -259,23 +265,36 @@ class Accountant:
             amount += EPSILON * float(np.sum(scale))
         return amount
 
-    def _along(self, x0: Array, dx: Array, change: float, enough: float) -> tuple[float, bool]:
-        """∫ ∇E(x + s Δx)·Δx ds over the shell's terms [J]; whether it had to be taken from energies."""
+    def _along(self, x0: Array, dx: Array, enough: float) -> tuple[float, bool]:
+        """∫ ∇E(x + s Δx)·Δx ds over the shell's terms [J]; whether hinges had it taken from energies."""
         comm = self._system.points.comm
         smooth = [term for term in self._shell if term.name == "membrane"]
         bent = [term for term in self._shell if term.name != "membrane"]
         exact = float(comm.allreduce(self._panels(smooth, x0, dx, 1, 2)))
         if not comm.allreduce(len(bent)):
             return exact, False
-        panels, before = 1, float(comm.allreduce(self._panels(bent, x0, dx, 1, 3)))
-        while panels < MOST_PANELS:
-            panels *= 2
-            now = float(comm.allreduce(self._panels(bent, x0, dx, panels, 3)))
-            if abs(now - before) <= max(enough, EPSILON * abs(now)):
-                return exact + now, False
-            before = now
+        if self._widest_turn(x0, dx) < WIDEST_TURN:
+            panels, before = 1, float(comm.allreduce(self._panels(bent, x0, dx, 1, 5)))
+            while panels < MOST_PANELS:
+                panels *= 2
+                now = float(comm.allreduce(self._panels(bent, x0, dx, panels, 5)))
+                if abs(now - before) <= max(enough, EPSILON * abs(now)):
+                    return exact + now, False
+                before = now
         end = _energy(bent, x0 + dx) - _energy(bent, x0)
         return exact + float(comm.allreduce(end)), True
+
+    def _widest_turn(self, x0: Array, dx: Array) -> float:
+        """Largest change [rad] of a hinge's angle between two of `SAMPLES` points of the way."""
+        widest = 0.0
+        for term in self._shell:
+            if isinstance(term, Bending):
+                before = term.angles(x0)
+                for s in np.linspace(0.0, 1.0, SAMPLES)[1:]:
+                    now = term.angles(x0 + s * dx)
+                    widest = max(widest, float(np.abs(now - before).max(initial=0.0)))
+                    before = now
+        return float(self._system.points.comm.allreduce(widest, op=MPI.MAX))
 
     def _panels(self, terms: Sequence[Elastic], x0: Array, dx: Array, panels: int, points: int) -> float:
         """This rank's part of the integral by Gauss's rule on equal panels."""

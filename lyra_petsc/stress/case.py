@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -40,11 +41,14 @@ class Setting:
     given : bool
         It is the user's; else the hanging sheet of `lyra_petsc.stress.base`.
     level : Level
+    size : float
+        Diagonal of the rest shape's bounding box [m].
     """
 
     base: Content
     given: bool
     level: Level
+    size: float = math.sqrt(2.0)
 
     def content(self) -> Content:
         """A copy of the base scene, to be changed."""
@@ -62,6 +66,7 @@ class NotHere(Exception):
 
 Maker = Callable[[Setting, Bench], Content]
 Shaper = Callable[[Array, float], Array]
+Judge = Callable[[Setting, Bench, "Record"], Mapping[str, Verdict]]
 
 
 @dataclass(frozen=True)
@@ -104,7 +109,7 @@ class Case:
     own: bool = False
     swift: bool = False
     observe: Callable[[Trial], Any] | None = None
-    judge: Callable[[Setting, Bench, Record], Mapping[str, Verdict]] | None = None
+    judge: Judge | None = None
 
     def content(self, setting: Setting, bench: Bench) -> Content:
         """The scene, with its time block."""

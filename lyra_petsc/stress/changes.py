@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from lyra_petsc.materials.library import resolve
 from lyra_petsc.scene.schema import Material
-from lyra_petsc.stress.case import Content, NotHere
+from lyra_petsc.stress.case import Content, Maker, NotHere, Setting
+from lyra_petsc.verification.bench import Bench
 
 KEPT = ("group", "damping", "warp_degrees", "rest_curvature")
 """Keys of a material that are no stiffness."""
+
+
+def changed(change: Callable[..., Content], **numbers: float) -> Maker:
+    """The scene of a case that is the base scene with one of the changes below."""
+
+    def scene(setting: Setting, bench: Bench) -> Content:
+        return change(setting.content(), **numbers)
+
+    return scene
+
+
+def as_it_is(setting: Setting, bench: Bench) -> Content:
+    """The base scene."""
+    return setting.content()
 
 
 def materials(content: Content) -> list[dict[str, Any]]:

@@ -9,7 +9,26 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
 from lyra_petsc.stress.case import Case, Family, Level
 
-NAMES = ("stiff-steps",)
+NAMES = (
+    "stiff-steps",
+    "membrane",
+    "bending",
+    "time-step",
+    "density",
+    "anisotropy",
+    "damping",
+    "wind",
+    "gravity",
+    "handles",
+    "start",
+    "elements",
+    "free",
+    "compression",
+    "rigid-plate",
+    "chain",
+    "paper",
+    "products",
+)
 
 
 def families() -> list[Family]:

@@ -78,11 +78,18 @@ class BaseClock:
     setting : Setting
     watch : callable, optional
         Called before every step.
+
+    Attributes
+    ----------
+    latest : float
+        What was measured last [s].
+    size : float
+        Diagonal of the base scene's bounding box [m].
     """
 
     def __init__(self, comm: MPI.Comm, setting: Setting, watch: Watch | None = None) -> None:
         self._comm, self._setting, self._watch = comm, setting, watch
-        self._steps = BASE_STEPS
+        self.size = math.nan
         self.measure()  # kernels are compiled or loaded
         self.latest = self.measure()
 
@@ -95,9 +102,10 @@ class BaseClock:
             If not even the base scene runs.
         """
         content = self._setting.content()
-        content["time"] = {**content["time"], "end": self._steps * self._setting.step}
+        content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
         seconds = []
         with Bench(self._comm, self._watch, exact=False) as bench, bench.simulation(content) as trial:
+            self.size = trial.simulation.model.outline.size
             while not trial.simulation.finished:
                 seconds.append(trial.step().wall_seconds)
         self.latest = float(self._comm.bcast(float(np.median(seconds)) if seconds else math.nan, root=0))

@@ -53,7 +53,7 @@ def identity(record: Record) -> Verdict:
     )
     jumped = sum(balance.jumped for balance in record.balances)
     if jumped:
-        words += f"; in {jumped} steps hinges went past 180° or folded too far to follow"
+        words += f"; in {jumped} steps hinges turned too far or jumped, and count by their energies"
     return Verdict(abs(worst.defect) <= worst.tolerance, words)
 
 

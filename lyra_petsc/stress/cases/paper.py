@@ -1,0 +1,91 @@
+"""The paper scene: at the same Δt its kinetic energy errs by no more than that of soft cloth.
+
+The scene is chaotic; its converged value and what single correct calculations are apart are those of an
+ensemble of 18 explicit fourth-order calculations (scripts/references/paper.py). Soft cloth is the same sheet
+with a thousandth of the stiffness, its converged value one with an eighth of the Δt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.text import parse_yaml
+from lyra_petsc.stress.case import Case, Content, Family, Level, Setting
+from lyra_petsc.stress.changes import scale
+from lyra_petsc.stress.record import Record
+from lyra_petsc.verification.bench import Bench, Trial
+from lyra_petsc.verification.claims import Verdict
+
+KINETIC, SPREAD = 0.4646114, 0.0030549
+"""Mean and standard deviation of the ensemble at the end, J."""
+
+END = 0.48
+"""s"""
+
+SOFTER, FINER = 1e-3, 8
+
+
+def _paper(bench: Bench, integrator: str) -> Content:
+    def read() -> Content:
+        settings = (f"time.integrator={integrator}",)
+        return parse_yaml(
+            dump_scene(load_scene(default_scene().with_name("paper.yaml"), settings)), file=None
+        )
+
+    content = on_root(bench.comm, read)
+    assert content is not None
+    content.pop("output")
+    return content
+
+
+def _kinetic(trial: Trial) -> float:
+    return trial.simulation.budget.kinetic
+
+
+def _soft(bench: Bench, integrator: str, step: float) -> float:
+    """Kinetic energy [J] of the soft sheet at the end."""
+    content = scale(_paper(bench, integrator), stretching=SOFTER)
+    content["time"] |= {"step": step, "end": END}
+    with bench.simulation(content) as trial:
+        return _kinetic(trial.run())
+
+
+def _case(integrator: str, step: float, level: Level) -> Case:
+    def judge(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
+        error = abs(record.observed[-1] / KINETIC - 1.0)
+        converged = _soft(bench, integrator, step / FINER)
+        soft = abs(_soft(bench, integrator, step) / converged - 1.0)
+        allowed = soft + 2.0 * SPREAD / KINETIC
+        words = (
+            f"kinetic energy off by {100 * error:.2g} %, that of soft cloth by {100 * soft:.2g} %, two "
+            f"standard deviations of correct calculations are {200 * SPREAD / KINETIC:.2g} %"
+        )
+        return {"kinetic energy": Verdict(error <= allowed, words)}
+
+    return Case(
+        f"paper-{integrator}-{step * 1e3:g}ms",
+        f"the paper scene, {integrator}, Δt {step * 1e3:g} ms",
+        lambda setting, bench: _paper(bench, integrator),
+        steps=round(END / step),
+        step=step,
+        level=level,
+        own=True,
+        observe=_kinetic,
+        judge=judge,
+    )
+
+
+FAMILY = Family(
+    "paper",
+    "the paper scene against its converged kinetic energy, as soft cloth against its own",
+    [
+        _case("bdf2", 0.005, Level.USUAL),
+        _case("beuler", 0.005, Level.USUAL),
+        _case("beuler", 0.0025, Level.FULL),
+        _case("alpha2", 0.005, Level.FULL),
+    ],
+)
