@@ -6,6 +6,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import click
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.arguments import split
+from lyra_petsc.cli.signals import take_back_from_petsc
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.nearest import nearest
 
@@ -36,6 +38,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         import petsc4py
 
         petsc4py.init([argv[0], *petsc])
+        take_back_from_petsc()
         from mpi4py import MPI
     except ImportError as error:
         print(
@@ -67,7 +70,8 @@ def run_command_line(argv: Sequence[str]) -> int:
 def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
     if comm.rank == 0:
         lines = [f"lyra-petsc: {' '.join(line.split())}", *(f"  {detail}" for detail in details)]
-        print("\n".join(lines), file=sys.stderr, flush=True)
+        with suppress(OSError):
+            print("\n".join(lines), file=sys.stderr, flush=True)
 
 
 def _leave_together(comm: Any, code: int) -> int:
@@ -83,12 +87,12 @@ def _report_bug(comm: Any, error: BaseException) -> None:
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
     text = " ".join(str(error).split()) or "no message"
-    print(
+    line = (
         f"lyra-petsc: internal error on rank {comm.rank}: {type(error).__name__}: {text} ({where}); "
-        "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened",
-        file=sys.stderr,
-        flush=True,
+        "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
     )
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
     if os.environ.get("LYRA_TRACEBACK"):
         traceback.print_exception(error)
 
