@@ -31,7 +31,7 @@ REFUSED: dict[str, str] = {
 }
 """Commands, keywords and groups of options that no script needs to describe a surface."""
 
-_INCLUDES = {"Include": (".geo",)}
+_INCLUDES: dict[str, tuple[str, ...]] = {"Include": (".geo",)}
 _MERGED = (".geo", ".msh", ".step", ".stp", ".brep", ".iges", ".igs", ".stl")
 _INCLUDES |= dict.fromkeys(("Merge", "MergeWithBoundingBox"), _MERGED)
 

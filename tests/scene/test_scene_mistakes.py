@@ -219,13 +219,42 @@ def test_unreadable_files(tmp_path: Path, content: bytes, words: str, overrides:
     assert "\n" not in str(caught.value)
 
 
-def test_anchors_within_anchors(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("first", "line"),
+    [
+        ("[1]", "a{0}: &a{0} [{1}]"),
+        ("{k: 1}", "a{0}: &a{0} {{b: [{1}]}}"),
+        ("{k: 1}", "a{0}: &a{0} {{<<: [{1}], k{0}: 1}}"),
+    ],
+    ids=["lists", "blocks", "merged keys"],
+)
+def test_anchors_within_anchors(tmp_path: Path, first: str, line: str) -> None:
     path = tmp_path / "bad.yaml"
-    lines = ["a0: &a0 [1]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    lines = [f"a0: &a0 {first}"] + [line.format(i, ", ".join([f"*a{i - 1}"] * 9)) for i in range(1, 12)]
     path.write_text("\n".join(["title: x", *lines]) + "\n")
-    with pytest.raises(InputError, match="anchors") as caught:
+    with pytest.raises(InputError, match="more than 2000000 entries once its anchors") as caught:
         load_scene(path)
     assert caught.value.file == str(path)
+
+
+def test_merged_keys_and_anchors_of_a_usual_size_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "good.yaml"
+    path.write_text(
+        "mesh: {grid: &g {width: 1, height: 1, nx: 2, ny: 2}}\nmaterial: {cloth: paper}\n"
+        "time: {end: 1, step: 0.1}\n"
+        "handles: [&h {nodes: [0]}, {<<: *h, stiffness: 10}, {box: [&a [0, 0, 0], *a]}]\n"
+    )
+    scene = load_scene(path)
+    assert scene.handles[1].nodes == [0]
+    assert scene.handles[1].stiffness == 10
+
+
+def test_a_file_beyond_any_scene(tmp_path: Path) -> None:
+    path = tmp_path / "bad.yaml"
+    with path.open("wb") as file:
+        file.truncate(10**12)  # a hole: no bytes on disk
+    with pytest.raises(InputError, match="holds 1000000000000 bytes; at most 33554432 are read"):
+        load_scene(path)
 
 
 def test_missing_file_and_directory(tmp_path: Path) -> None:
