@@ -269,6 +269,7 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
 @click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
+@click.option("--job", type=click.Path(path_type=Path), hidden=True)
 @click.pass_obj
 def stress(comm: Any, /, listed: bool, **asked: Any) -> int:
     """Run stiff and extreme cases, on a hanging sheet or on SCENE; exit code 1 if a verdict fails."""

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.progress import duration
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.cli.verify import FAILED, WIDTH
@@ -23,10 +24,13 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.solvers.options import unused
 from lyra_petsc.stress.base import setting_of
 from lyra_petsc.stress.case import Case, Family, Level
+from lyra_petsc.stress.exchange import save
+from lyra_petsc.stress.launch import Launcher
 from lyra_petsc.stress.registry import selected
 from lyra_petsc.stress.results import finish, write
 from lyra_petsc.stress.runner import BaseClock, Outcome, run_case
 from lyra_petsc.stress.table import cells, headings
+from lyra_petsc.study.launch import find_launcher
 from lyra_petsc.verification.results import prepare
 
 FOLDER = Path("stress")
@@ -45,6 +49,7 @@ class Asked:
     out: Path | None = None
     force: bool = False
     ranks: int | None = None
+    job: Path | None = None
 
     @property
     def level(self) -> Level:
@@ -78,6 +83,7 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
     cases = selected(asked.names, asked.level)
     setting = on_root(comm, lambda: setting_of(asked.scene, asked.settings, asked.level))
     assert setting is not None
+    launcher = _launcher(comm, asked)
     first = FOLDER / (asked.scene.stem if asked.scene is not None else "sheet")
     folder = asked.out or on_root(comm, lambda: first if asked.force else free_name(first))
     assert folder is not None
@@ -90,23 +96,32 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
                 f"stopped by {signal.Signals(number).name}; the cases that had ended are in {folder}", number
             )
 
-    # a base scene that does not run is refused before anything is written
-    clock = BaseClock(comm, setting, watch)
-    setting = replace(setting, size=clock.size)
+    if launcher is None:
+        # a base scene that does not run is refused before anything is written
+        clock = BaseClock(comm, setting, watch)
+        setting = replace(setting, size=clock.size)
+    if asked.job is not None:
+        (family, case), folder = cases[0], asked.job
+        outcome = run_case(comm, case, family.name, setting, clock, watch)
+        on_root(comm, lambda: save(outcome, folder))
+        return 0 if outcome.passed else FAILED
     prepare(comm, folder, force=asked.force)
     show = Show(comm, len(cases))
     outcomes: list[Outcome] = []
-    command = _command(comm, asked)
+    command, ranks = _command(comm, asked), asked.ranks or comm.size
     try:
         for family, case in cases:
             show.begin(case)
-            outcomes.append(run_case(comm, case, family.name, setting, clock, watch))
+            if launcher is not None:
+                outcomes.append(launcher(case, family.name, watch))
+            else:
+                outcomes.append(run_case(comm, case, family.name, setting, clock, watch))
             show.case(outcomes[-1])
-            write(comm, folder, outcomes, clock.latest, complete=len(outcomes) == len(cases))
+            write(comm, folder, outcomes, ranks, complete=len(outcomes) == len(cases))
     except Interrupted:
-        finish(comm, folder, outcomes, setting, command)
+        finish(comm, folder, outcomes, setting, ranks, command)
         raise
-    note = finish(comm, folder, outcomes, setting, command)
+    note = finish(comm, folder, outcomes, setting, ranks, command)
     show.summary(outcomes, folder, note)
     return 0 if all(outcome.passed for outcome in outcomes) else FAILED
 
@@ -114,13 +129,32 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
 def _command(comm: MPI.Comm, asked: Asked) -> list[str]:
     """The command line that repeats it."""
     words = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
-    words += ["python", "-m", "lyra_petsc", "stress"]
-    words += [str(asked.scene)] if asked.scene is not None else []
+    words += ["python", "-m", "lyra_petsc", "stress", *_what(asked)]
+    words += ["--only", ",".join(asked.names)] if asked.names else []
+    words += ["--ranks", str(asked.ranks)] if asked.ranks is not None else []
+    return [*words, *split(sys.argv[1:])[1]]
+
+
+def _what(asked: Asked) -> list[str]:
+    """Scene and options that say what each case is."""
+    words = [str(asked.scene)] if asked.scene is not None else []
     for text in asked.settings:
         words += ["--set", text]
-    words += ["--only", ",".join(asked.names)] if asked.names else []
-    words += [f"--{asked.level.name.lower()}"] if asked.level != Level.USUAL else []
-    return words
+    return words + ([f"--{asked.level.name.lower()}"] if asked.level != Level.USUAL else [])
+
+
+def _launcher(comm: MPI.Comm, asked: Asked) -> Launcher | None:
+    """What starts the cases with ``--ranks``.
+
+    Raises
+    ------
+    InputError
+        Under an mpirun, or without one to start.
+    """
+    if asked.ranks is None:
+        return None
+    command = on_root(comm, lambda: find_launcher(asked.ranks or 0))
+    return Launcher(command or [], _what(asked), split(sys.argv[1:])[1])
 
 
 def list_cases(comm: MPI.Comm, asked: Asked) -> None:

@@ -41,6 +41,8 @@ class Record:
     stopped : str
         Why it did not reach its end; empty if it did.
     integrator : str
+    busy : list of float
+        CPU time of each step [s], of the rank that took most.
     start, last : (V, 3) arrays or None
         Positions [m] at the start and after the last step, on rank 0; None if none were gathered.
     triangles : (F, 3) array or None
@@ -58,6 +60,7 @@ class Record:
     notes: list[str] = field(default_factory=list)
     stopped: str = ""
     integrator: str = "beuler"
+    busy: list[float] = field(default_factory=list)
     start: NDArray[np.float64] | None = None
     last: NDArray[np.float64] | None = None
     triangles: NDArray[np.int64] | None = None
@@ -96,6 +99,11 @@ class Record:
     def median_seconds(self) -> float:
         """Median wall time of a step; NaN without any."""
         return statistics.median(r.wall_seconds for r in self.reports) if self.reports else math.nan
+
+    @property
+    def median_busy(self) -> float:
+        """Median CPU time of a step; NaN without any."""
+        return statistics.median(self.busy) if self.busy else math.nan
 
     @property
     def median_newton(self) -> float:

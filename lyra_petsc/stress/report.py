@@ -49,7 +49,7 @@ def write_report(
         "stand first. Newton iterations of a step: median, worst. Energy off: how far the worst step misses "
         "the energy identity of backward Euler, and what its residual allows. Stretch: smallest and largest "
         "principal stretch of any triangle. Step: median wall time, and how many times that of the base "
-        "scene, measured before and after the case."
+        "scene, measured before and after the case; CPU: the same of CPU time."
     )
     names = [name for name, _ in headings()]
     report.table(names, [cells(outcome) for outcome in run], marked=[not outcome.passed for outcome in run])

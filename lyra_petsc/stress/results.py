@@ -20,10 +20,8 @@ from lyra_petsc.stress.runner import Outcome
 from lyra_petsc.stress.table import COLUMNS, row_of
 
 
-def write(
-    comm: MPI.Comm, folder: Path, outcomes: Sequence[Outcome], base_seconds: float, *, complete: bool
-) -> None:
-    """Write what came of the cases so far; collective.
+def write(comm: MPI.Comm, folder: Path, outcomes: Sequence[Outcome], ranks: int, *, complete: bool) -> None:
+    """Write what came of the cases so far, each run on so many ranks; collective.
 
     Raises
     ------
@@ -31,14 +29,19 @@ def write(
         On every rank, if it could not be written.
     """
     on_root(comm, lambda: replace_text(folder / "stress.csv", _csv(outcomes)))
-    write_summary(folder / "stress.json", _content(comm, outcomes, base_seconds, complete), comm)
+    write_summary(folder / "stress.json", _content(outcomes, ranks, complete), comm)
 
 
 def finish(
-    comm: MPI.Comm, folder: Path, outcomes: Sequence[Outcome], setting: Setting, command: Sequence[str]
+    comm: MPI.Comm,
+    folder: Path,
+    outcomes: Sequence[Outcome],
+    setting: Setting,
+    ranks: int,
+    command: Sequence[str],
 ) -> str:
     """Write the page; what is missing for its pictures, in words; collective."""
-    work = lambda: write_report(folder, outcomes, setting, versions(), comm.size, command)  # noqa: E731
+    work = lambda: write_report(folder, outcomes, setting, versions(), ranks, command)  # noqa: E731
     return on_root(comm, work) or ""
 
 
@@ -53,15 +56,12 @@ def _csv(outcomes: Sequence[Outcome]) -> str:
     return text.getvalue()
 
 
-def _content(
-    comm: MPI.Comm, outcomes: Sequence[Outcome], base_seconds: float, complete: bool
-) -> dict[str, Any]:
+def _content(outcomes: Sequence[Outcome], ranks: int, complete: bool) -> dict[str, Any]:
     run = [outcome for outcome in outcomes if not outcome.left_out]
     return {
         "complete": complete,
         "passed": all(outcome.passed for outcome in run),
-        "ranks": comm.size,
-        "base_step_wall_seconds": base_seconds,
+        "ranks": ranks,
         "versions": versions(),
         "cases": [
             {

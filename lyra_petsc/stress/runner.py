@@ -20,6 +20,7 @@ from lyra_petsc.stress.verdicts import of_physics, speed
 from lyra_petsc.verification.bench import Bench, Trial
 from lyra_petsc.verification.claims import Verdict
 
+Array = NDArray[np.float64]
 Watch = Callable[[], None]
 
 LONGEST = {Level.QUICK: 20.0, Level.USUAL: 60.0, Level.FULL: 600.0}
@@ -44,6 +45,8 @@ class Outcome:
         Wall time of the whole case.
     ratio : float
         Median wall time of a step over that of the base scene, measured before and after the case.
+    busy_ratio : float
+        The same of CPU time.
     left_out : str
         Why the case makes no sense here; empty if it was run.
     """
@@ -54,6 +57,7 @@ class Outcome:
     verdicts: dict[str, Verdict] = field(default_factory=dict)
     seconds: float = 0.0
     ratio: float = math.nan
+    busy_ratio: float = math.nan
     left_out: str = ""
 
     @property
@@ -81,7 +85,7 @@ class BaseClock:
 
     Attributes
     ----------
-    latest : float
+    latest : (2,) array
         What was measured last [s].
     size : float
         Diagonal of the base scene's bounding box [m].
@@ -93,8 +97,8 @@ class BaseClock:
         self.measure()  # kernels are compiled or loaded
         self.latest = self.measure()
 
-    def measure(self) -> float:
-        """Median wall time [s] of the base scene's first steps.
+    def measure(self) -> Array:
+        """Median wall time and CPU time [s] of the base scene's first steps, (2,).
 
         Raises
         ------
@@ -103,12 +107,14 @@ class BaseClock:
         """
         content = self._setting.content()
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
-        seconds = []
+        seconds: list[tuple[float, float]] = []
         with Bench(self._comm, self._watch, exact=False) as bench, bench.simulation(content) as trial:
             self.size = trial.simulation.model.outline.size
             while not trial.simulation.finished:
-                seconds.append(trial.step().wall_seconds)
-        self.latest = float(self._comm.bcast(float(np.median(seconds)) if seconds else math.nan, root=0))
+                began = time.process_time()
+                seconds.append((trial.step().wall_seconds, time.process_time() - began))
+        mine = np.median(seconds, axis=0) if seconds else np.full(2, np.nan)
+        self.latest = np.max(self._comm.allgather(mine), axis=0)
         return self.latest
 
 
@@ -139,7 +145,7 @@ def run_case(
         What one rank alone met, so that the others cannot go on.
     """
     began = time.perf_counter()
-    before = clock.latest if clock is not None else math.nan
+    before = clock.latest if clock is not None else None
     outcome = Outcome(case, family, Record(case.steps, math.nan, math.nan))
     with Bench(comm, watch, exact=False) as bench:
         try:
@@ -159,12 +165,12 @@ def run_case(
                 raise
             record.stopped = " ".join(str(error).split())
         outcome.verdicts = of_physics(record)
-        if clock is not None:
-            base = 0.5 * (before + clock.measure())
-            outcome.ratio = record.median_seconds / base
-        outcome.ratio = comm.bcast(outcome.ratio, root=0)
-        if case.swift and clock is not None:
-            outcome.verdicts["speed"] = speed(record, outcome.ratio)
+        if clock is not None and before is not None:
+            wall, busy = 0.5 * (before + clock.measure())
+            ratios = record.median_seconds / wall, record.median_busy / busy
+            outcome.ratio, outcome.busy_ratio = comm.bcast(tuple(map(float, ratios)), root=0)
+            if case.swift:
+                outcome.verdicts["speed"] = speed(record, outcome.ratio, outcome.busy_ratio)
         if case.judge is not None and not record.stopped:
             outcome.verdicts |= case.judge(setting, bench, record)
     outcome.seconds = comm.bcast(time.perf_counter() - began, root=0)
@@ -195,7 +201,9 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
                     f"given up at t = {simulation.time:g} s of {record.end:g} s: the case has had its time"
                 )
                 break
+            busy = time.process_time()
             report = trial.step()
+            record.busy.append(comm.allreduce(time.process_time() - busy, op=MPI.MAX))
             record.reports.append(report)
             record.energies.append(_energy(trial))
             if accountant is not None:
@@ -208,7 +216,7 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
     record.last = _on_root(trial, simulation.model.points)
 
 
-def _on_root(trial: Trial, points: Points) -> NDArray[np.float64] | None:
+def _on_root(trial: Trial, points: Points) -> Array | None:
     """Positions (V, 3) [m] on rank 0."""
     pieces = points.comm.gather((points.original, trial.simulation.model.system.x[: points.n_owned].copy()))
     if pieces is None:

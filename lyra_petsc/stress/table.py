@@ -31,6 +31,7 @@ COLUMNS = (
     "largest_stretch",
     "step_wall_seconds",
     "step_over_base",
+    "step_over_base_cpu",
     "wall_seconds",
     "failures",
 )
@@ -71,6 +72,7 @@ def row_of(outcome: Outcome) -> dict[str, Any]:
         "largest_stretch": record.stretches[1],
         "step_wall_seconds": record.median_seconds,
         "step_over_base": outcome.ratio,
+        "step_over_base_cpu": outcome.busy_ratio,
         "wall_seconds": outcome.seconds,
         "failures": "; ".join(f"{name}: {verdict.words}" for name, verdict in outcome.failures.items()),
     }
@@ -95,6 +97,7 @@ def headings() -> list[tuple[str, int]]:
         ("stretch", 13),
         ("step", 8),
         ("over base", 0),
+        ("CPU", 5),
     ]
 
 
@@ -115,4 +118,5 @@ def cells(outcome: Outcome) -> list[str]:
         f"{short(row['smallest_stretch'])} – {short(row['largest_stretch'])}",
         seconds(row["step_wall_seconds"]),
         short(row["step_over_base"]),
+        short(row["step_over_base_cpu"]),
     ]

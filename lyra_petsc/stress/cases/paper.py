@@ -31,10 +31,9 @@ SOFTER, FINER = 1e-3, 8
 
 def _paper(bench: Bench, integrator: str) -> Content:
     def read() -> Content:
-        settings = (f"time.integrator={integrator}",)
-        return parse_yaml(
-            dump_scene(load_scene(default_scene().with_name("paper.yaml"), settings)), file=None
-        )
+        scene = load_scene(default_scene().with_name("paper.yaml"), (f"time.integrator={integrator}",))
+        understood: Content = parse_yaml(dump_scene(scene), file=None)
+        return understood
 
     content = on_root(bench.comm, read)
     assert content is not None
