@@ -141,6 +141,8 @@ class _Journey:
             # the first thing that went wrong is what counts: on a full disk this fails as well
             with suppress(OutputError):
                 self._summarise(str(error))
+            if isinstance(error, OutputError):
+                error.details += self._remedy()
             raise
         finally:
             recorder.close()
@@ -159,6 +161,12 @@ class _Journey:
             "ranks": self._comm.size,
             "changes": changes,
         }
+
+    def _remedy(self) -> tuple[str, ...]:
+        """What to do when a file cannot be written."""
+        if not self._folder.is_dir():
+            return (f"the folder {self._folder} is gone; nothing can be resumed",)
+        return ("what was announced before stands; once it can be written again, --resume goes on",)
 
     def _keep(self, outcome: str) -> tuple[str, ...]:
         """Write the last good state and the step that failed; where it can be looked at."""
