@@ -100,6 +100,12 @@ class Simulation:
         outline, system = self.model.outline, self.model.system
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
+            if not math.isfinite(floor):
+                raise InputError(
+                    "stiffness times size overflows; give smaller numbers or another unit of length",
+                    file=scene.source,
+                    key="material",
+                )
             self.stepper = Stepper(scene, system, self.model.pattern, outline.spacing, floor)
         self._floor = floor
         ts = self.stepper.ts
@@ -159,8 +165,7 @@ class Simulation:
         while True:
             end = self.control.next_end(self.time)
             past = system.scheme.memory()
-            # numbers that overflow make the attempt fail, which is told then
-            with self.phases("solve"), np.errstate(over="ignore", invalid="ignore"):
+            with self.phases("solve"):
                 attempt = self._seek.attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations

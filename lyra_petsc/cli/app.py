@@ -39,6 +39,7 @@ def run_command_line(argv: Sequence[str]) -> int:
 
         petsc4py.init([argv[0], *petsc])
         take_back_from_petsc()
+        import numpy as np
         from mpi4py import MPI
     except ImportError as error:
         print(
@@ -49,6 +50,8 @@ def run_command_line(argv: Sequence[str]) -> int:
         return InputError.exit_code
 
     comm = MPI.COMM_WORLD
+    # a number that overflows makes a step fail, which is told once and in words
+    np.seterr(over="ignore", invalid="ignore")
     try:
         code = _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
     except LyraError as error:

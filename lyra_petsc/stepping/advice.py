@@ -23,6 +23,9 @@ SOFTENS = 1.0 / math.sqrt(3.0)
 LONG = 0.5
 """Element sizes that something may move in one step and be harmless."""
 
+FAR = 1e6
+"""Element sizes that nothing moves in one step but by mistake."""
+
 STRETCHED = 1.5
 SLIVER = 50.0
 NEARLY = 1e-3
@@ -98,7 +101,7 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
     """What to try and why, most promising first; never empty."""
     kind = trouble(diagnosis, stuck)
     if kind == "overflow":
-        return [_overflow(diagnosis), *_steps(scene, now)]
+        return [_overflow(diagnosis, now), *_steps(scene, now)]
     found = _place(diagnosis, scene, now)
     static = scene.time.scheme == "static"
     if static and not scene.handles:
@@ -107,7 +110,7 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
     if kind == "linear trouble":
         return [*_linear(stuck, scene, now), *found]
     limit = _limit(stuck, now)
-    if limit and now.max_iterations < FEW_ITERATIONS:
+    if limit and (now.max_iterations < FEW_ITERATIONS or stuck.snes_reason == SNES.DIVERGED_FUNCTION_COUNT):
         return [*limit, *found, *_steps(scene, now)]
     found += [*_nearly(diagnosis, scene, now), *limit, *_steps(scene, now)]
     if not found:
@@ -117,10 +120,15 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
     return found
 
 
-def _overflow(diagnosis: Diagnosis) -> str:
+def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:
     absurd = "smaller numbers where one is absurd, or lost its unit: in "
     if not diagnosis.iterate_finite or not diagnosis.overflowing:
         return absurd + "material, gravity, loads, wind, initial, motions, or mesh.transform.scale"
+    if diagnosis.vertex.moved > FAR * now.spacing:
+        return (
+            f"{absurd}initial.velocity, motions, gravity and loads (vertex {diagnosis.vertex.number} moves "
+            f"{diagnosis.vertex.moved:.3g} m in this step)"
+        )
     keys = "; ".join(KEYS.get(name, name) for name in diagnosis.overflowing)
     return f"{absurd}{keys} (what overflows: {', '.join(diagnosis.overflowing)})"
 
@@ -210,7 +218,7 @@ def _nearly(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]
     balance = f"(forces balance to {share:.1e} of the largest)"
     if share <= asked:
         return [f"solver.step_tolerance above {scene.solver.step_tolerance:g} {balance}"]
-    return [f"if that will do, solver.force_tolerance: {loose:.0e} {balance}"]
+    return [f"solver.force_tolerance: {loose:.0e}, if that will do {balance}"]
 
 
 def _steps(scene: Scene, now: Circumstances) -> list[str]:

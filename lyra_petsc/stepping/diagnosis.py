@@ -160,8 +160,7 @@ def diagnose(
 
 
 def _square(comm: MPI.Comm, rows: Array) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(comm.allreduce(float(np.sum(rows * rows))))
+    return float(comm.allreduce(float(np.sum(rows * rows))))
 
 
 def _size(rows: Array) -> Array:

@@ -115,7 +115,6 @@ class Equilibrium:
             linear_iterations=linear,
             words=attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps",
             stuck=stuck,
-            advice=attempt.advice or "is the sheet held? Else try time.step smaller, or a damped motion",
         )
 
     def _off_balance(self, before: float, factor: float, history: list[Iteration], x: Array) -> Stuck:

@@ -36,7 +36,6 @@ class Attempt:
     linear_iterations: int
     residual: float
     words: str = ""
-    advice: str = ""
     at_roundoff: bool = False
     stuck: Stuck | None = None
 
@@ -242,7 +241,7 @@ class Stepper:
                 collective=all_here(system.points.comm),
             ) from None
         newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
-        words, advice = "the velocities are not finite", "try a smaller time.step"
+        words = "the velocities are not finite"
         self._linear_failed = False
         if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
@@ -255,14 +254,14 @@ class Stepper:
                 self.ts.setTimeStep(t1 - t0)
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
         else:
-            words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
+            words = reasons.in_words(self.snes, self.ksp)
             self._linear_failed = reasons.preconditioner_failed(self.ksp)
         stuck = self._trace.stuck()
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        return Attempt(False, newton, linear, self._newton.norm, words, advice, stuck=stuck)
+        return Attempt(False, newton, linear, self._newton.norm, words, stuck=stuck)
 
     def _linear_iterations(self) -> int:
         return int(self.snes.getLinearSolveIterations()) + self._newton.more_linear
