@@ -111,7 +111,8 @@ class Simulation:
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
-            _positive("-ts_dt", ts.getTimeStep()), _positive("-ts_max_time", ts.getMaxTime())
+            _positive("-ts_dt", petsc_number("ts_dt", ts.getTimeStep())),
+            _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
         )
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None

@@ -46,10 +46,12 @@ def petsc_number(name: str, default: float) -> float:
     InputError
         If something else stands there.
     """
+    value = PETSc.Options().getString(name, "")
+    if is_set(name) and not value:
+        raise InputError("needs a number after it", key=f"-{name}")
     try:
         return float(PETSc.Options().getReal(name, default))
     except PETSc.Error:
-        value = PETSc.Options().getString(name, "")
         raise InputError(f"must be a number, not '{value}'", key=f"-{name}") from None
 
 

@@ -77,6 +77,7 @@ def test_times_follow_the_options(tmp_path: Path, options: list[str], times: lis
     ("options", "words"),
     [
         (["-ts_dt", "abc"], "-ts_dt: "),
+        (["-ts_max_time", "-ts_dt"], "-ts_dt: needs a number after it"),
         (["-ts_adapt_dt_min", "q"], "-ts_adapt_dt_min: "),
         (["-snes_max_it", "1.5"], "-snes_max_it: "),
         (["-ksp_type", "nonsense"], "-ksp_type: "),

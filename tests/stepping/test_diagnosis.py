@@ -111,6 +111,7 @@ def test_numbers_that_overflow_on_one_rank_are_met_by_all(comm: MPI.Comm) -> Non
         assert "overflow" in str(error)
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
 def test_what_overflows_is_told_by_its_key(comm: MPI.Comm) -> None:
     with failing(comm, {"gravity": [0, 0, -1e200]}) as (_, error, failure):
         assert failure.kind == "overflow"
