@@ -21,6 +21,9 @@ from lyra_petsc.nearest import nearest
 BUG = 70
 """Exit code of what should never happen."""
 
+PETSC_OUT_OF_MEMORY = 55
+"""PETSc's error code PETSC_ERR_MEM."""
+
 LATER = {
     "render": "pictures and films",
     "view": "a live page",
@@ -64,6 +67,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         return _leave_together(comm, InputError.exit_code)
     except (Exception, KeyboardInterrupt) as error:
         _report_bug(comm, error)
+        traceback.clear_frames(error.__traceback__)  # without any memory left MPI could not even end the job
         if comm.size > 1:
             comm.Abort(BUG)
         return BUG
@@ -90,10 +94,17 @@ def _report_bug(comm: Any, error: BaseException) -> None:
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
     text = " ".join(str(error).split()) or "no message"
-    line = (
-        f"lyra-petsc: internal error on rank {comm.rank}: {type(error).__name__}: {text} ({where}); "
-        "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
-    )
+    name = type(error).__name__
+    if isinstance(error, MemoryError) or getattr(error, "ierr", 0) == PETSC_OUT_OF_MEMORY:
+        line = (
+            f"lyra-petsc: out of memory on rank {comm.rank}: {name}: {text} ({where}); "
+            "take more memory, more machines or a coarser mesh"
+        )
+    else:
+        line = (
+            f"lyra-petsc: internal error on rank {comm.rank}: {name}: {text} ({where}); "
+            "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
+        )
     with suppress(OSError):
         print(line, file=sys.stderr, flush=True)
     if os.environ.get("LYRA_TRACEBACK"):
