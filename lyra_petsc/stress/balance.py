@@ -27,20 +27,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.simulation import Simulation, StepReport
 from lyra_petsc.stepping.rounding import residual_roundoff
-from lyra_petsc.terms.bending import Bending
+from lyra_petsc.stress.path import EPSILON, energy, force_along, gradient
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
-
-EPSILON = 10.0 * float(np.finfo(np.float64).eps)
-"""Relative round-off of a sum, as in `residual_roundoff`."""
-
-MOST_PANELS = 16
-"""Of the integral along the hinges' way."""
-
-SAMPLES, WIDEST_TURN = 9, 1.0
-"""Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
-passes 180°, or whose triangle is turned over in its plane, changes its energy without a force."""
 
 CHUNK = 4096
 """Elements whose Hessians are held at once."""
@@ -114,7 +104,7 @@ class Accountant:
         """Note the state, and the energy with which its clamps end the step before."""
         system = self._system
         self._x, self._v = system.x.copy(), system.v.copy()
-        self._energy = _energy(self._shell, system.x)
+        self._energy = energy(self._shell, system.x)
 
     def balance(self, report: StepReport) -> Balance:
         """The balance of the step just accepted, which set out from the state looked at last."""
@@ -131,7 +121,11 @@ class Accountant:
         outside = -parts["loads"] + reaction
         for name in ("springs", "wind"):
             outside = outside - parts[name]
-        energy_now, energy_then = _energy(self._shell, x1), _energy(self._shell, x0)
+        # the planes of clamps stand in space: their energy is stored, but they push from outside
+        planes = [term for term in self._shell if term.name == "clamp"]
+        pushed = gradient(planes, x1)[:n]
+        slowed = self._damping(planes, v1)[:n]
+        energy_now, energy_then = energy(self._shell, x1), energy(self._shell, x0)
         turned = energy_then - self._energy
         mass = system.mass[:, None]
         sums = comm.allreduce(
@@ -170,14 +164,14 @@ class Accountant:
         # positions are rounded, too: x' − x is Δt v' only to their last digit
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
-        along, jumped = self._along(x0, dx, 0.1 * tolerance)
+        along, jumped = force_along(comm, n, self._shell, x0, dx, enough=0.1 * tolerance)
         bracket = along - inner
         change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
         work = outer + turn
         defect = change - (-numerical - viscous + bracket + work)
-        gap = mass * dv - dt * outside
+        gap = mass * dv - dt * (outside - pushed - slowed)
         p, p_tol, spin, spin_tol = self._momenta(
-            gap, gap + dt * parts["damping"], dt, residual + floor, forces, reach
+            gap, gap + dt * (parts["damping"] - slowed), dt, residual + floor, forces, reach
         )
         return Balance(
             energy=kinetic1 + stored + fallen1,
@@ -213,17 +207,17 @@ class Accountant:
             term.add_gradient(v1, wind)
         return {
             "inertia": system.mass[:, None] * rate,
-            "internal": _gradient(self._shell, x1)[:n],
-            "springs": _gradient(self._springs, x1)[:n],
-            "damping": self._damping(v1)[:n],
+            "internal": gradient(self._shell, x1)[:n],
+            "springs": gradient(self._springs, x1)[:n],
+            "damping": self._damping(self._shell, v1)[:n],
             "wind": wind[:n],
             "loads": -force[:n],
         }
 
-    def _damping(self, v: Array) -> Array:
+    def _damping(self, terms: Sequence[Elastic], v: Array) -> Array:
         """D v (n_local, 3) [N], element by element with the stiffness of the start of the step."""
         out = np.zeros_like(v)
-        for term in self._shell:
+        for term in terms:
             gamma = term.elements.data.get("damping")
             if not term.damped or gamma is None or not np.any(gamma):
                 continue
@@ -265,50 +259,6 @@ class Accountant:
             amount += EPSILON * float(np.sum(scale))
         return amount
 
-    def _along(self, x0: Array, dx: Array, enough: float) -> tuple[float, bool]:
-        """∫ ∇E(x + s Δx)·Δx ds over the shell's terms [J]; whether hinges had it taken from energies."""
-        comm = self._system.points.comm
-        smooth = [term for term in self._shell if term.name == "membrane"]
-        bent = [term for term in self._shell if term.name != "membrane"]
-        exact = float(comm.allreduce(self._panels(smooth, x0, dx, 1, 2)))
-        if not comm.allreduce(len(bent)):
-            return exact, False
-        if self._widest_turn(x0, dx) < WIDEST_TURN:
-            panels, before = 1, float(comm.allreduce(self._panels(bent, x0, dx, 1, 5)))
-            while panels < MOST_PANELS:
-                panels *= 2
-                now = float(comm.allreduce(self._panels(bent, x0, dx, panels, 5)))
-                if abs(now - before) <= max(enough, EPSILON * abs(now)):
-                    return exact + now, False
-                before = now
-        end = _energy(bent, x0 + dx) - _energy(bent, x0)
-        return exact + float(comm.allreduce(end)), True
-
-    def _widest_turn(self, x0: Array, dx: Array) -> float:
-        """Largest change [rad] of a hinge's angle between two of `SAMPLES` points of the way."""
-        widest = 0.0
-        for term in self._shell:
-            if isinstance(term, Bending):
-                before = term.angles(x0)
-                for s in np.linspace(0.0, 1.0, SAMPLES)[1:]:
-                    now = term.angles(x0 + s * dx)
-                    widest = max(widest, float(np.abs(now - before).max(initial=0.0)))
-                    before = now
-        return float(self._system.points.comm.allreduce(widest, op=MPI.MAX))
-
-    def _panels(self, terms: Sequence[Elastic], x0: Array, dx: Array, panels: int, points: int) -> float:
-        """This rank's part of the integral by Gauss's rule on equal panels."""
-        if not terms:
-            return 0.0
-        n = self._system.points.n_owned
-        nodes, weights = np.polynomial.legendre.leggauss(points)  # type: ignore[no-untyped-call]
-        value = 0.0
-        for panel in range(panels):
-            for node, weight in zip(nodes, weights, strict=True):
-                s = (panel + 0.5 * (1.0 + node)) / panels
-                value += 0.5 * weight * float(np.vdot(_gradient(terms, x0 + s * dx)[:n], dx[:n]))
-        return value / panels
-
     def _momenta(
         self, gap: Array, damped: Array, dt: float, left: float, forces: float, reach: float
     ) -> tuple[float, float, float, float]:
@@ -333,15 +283,3 @@ class Accountant:
             float(np.abs(sums[3:]).max()),
             float(angular),
         )
-
-
-def _gradient(terms: Sequence[Elastic], x: Array) -> Array:
-    out = np.zeros_like(x)
-    for term in terms:
-        term.add_gradient(x, out)
-    return out
-
-
-def _energy(terms: Sequence[Elastic], x: Array) -> float:
-    """Of this rank's elements [J]."""
-    return sum(float(term.energies(x).sum()) for term in terms)

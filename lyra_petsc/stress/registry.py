@@ -56,8 +56,12 @@ def selected(only: Sequence[str], level: Level) -> list[tuple[Family, Case]]:
         if name not in known:
             raise InputError(f"unknown case or family, {nearest(name, known)}; --list names all", key=name)
     # a family brings those of its cases that the level has; a case that is named is run at any level
-    return [
+    found = [
         (family, case)
         for family, case in everything
         if case.name in only or (family.name in only and case.level <= level)
     ]
+    for name in only:
+        if not any(name in (family.name, case.name) for family, case in found):
+            raise InputError("has cases only with --full", key=name)
+    return found

@@ -2,7 +2,8 @@
 
 The scene is chaotic; its converged value and what single correct calculations are apart are those of an
 ensemble of 18 explicit fourth-order calculations (scripts/references/paper.py). Soft cloth is the same sheet
-with a thousandth of the stiffness, its converged value one with an eighth of the Δt.
+with a thousandth of the stiffness, its converged value that of a second-order integrator with a quarter of
+the Δt. Both are stepped by backward Euler, whose error stands clear of the scatter of single calculations.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ KINETIC, SPREAD = 0.4646114, 0.0030549
 END = 0.48
 """s"""
 
-SOFTER, FINER = 1e-3, 8
+SOFTER, FINER, SHARPER = 1e-3, 4, "bdf2"
 
 
 def _paper(bench: Bench, integrator: str) -> Content:
@@ -53,11 +54,11 @@ def _soft(bench: Bench, integrator: str, step: float) -> float:
         return _kinetic(trial.run())
 
 
-def _case(integrator: str, step: float, level: Level) -> Case:
+def _case(step: float, level: Level) -> Case:
     def judge(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
         error = abs(record.observed[-1] / KINETIC - 1.0)
-        converged = _soft(bench, integrator, step / FINER)
-        soft = abs(_soft(bench, integrator, step) / converged - 1.0)
+        converged = _soft(bench, SHARPER, step / FINER)
+        soft = abs(_soft(bench, "beuler", step) / converged - 1.0)
         allowed = soft + 2.0 * SPREAD / KINETIC
         words = (
             f"kinetic energy off by {100 * error:.2g} %, that of soft cloth by {100 * soft:.2g} %, two "
@@ -66,9 +67,9 @@ def _case(integrator: str, step: float, level: Level) -> Case:
         return {"kinetic energy": Verdict(error <= allowed, words)}
 
     return Case(
-        f"paper-{integrator}-{step * 1e3:g}ms",
-        f"the paper scene, {integrator}, Δt {step * 1e3:g} ms",
-        lambda setting, bench: _paper(bench, integrator),
+        f"paper-{step * 1e3:g}ms",
+        f"the paper scene, Δt {step * 1e3:g} ms",
+        lambda setting, bench: _paper(bench, "beuler"),
         steps=round(END / step),
         step=step,
         level=level,
@@ -82,9 +83,8 @@ FAMILY = Family(
     "paper",
     "the paper scene against its converged kinetic energy, as soft cloth against its own",
     [
-        _case("bdf2", 0.005, Level.USUAL),
-        _case("beuler", 0.005, Level.USUAL),
-        _case("beuler", 0.0025, Level.FULL),
-        _case("alpha2", 0.005, Level.FULL),
+        _case(0.01, Level.FULL),
+        _case(0.005, Level.USUAL),
+        _case(0.0025, Level.FULL),
     ],
 )
