@@ -59,12 +59,13 @@ def run_command_line(argv: Sequence[str]) -> int:
         code = _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
     except LyraError as error:
         _say(comm, str(error), error.details)
-        return _leave_together(comm, error.exit_code)
+        return _leave_together(comm, error.exit_code, str(error))
     except click.exceptions.Exit as leave:
         return leave.exit_code
     except click.ClickException as error:
-        _say(comm, _in_one_line(error))
-        return _leave_together(comm, InputError.exit_code)
+        line = _in_one_line(error)
+        _say(comm, line)
+        return _leave_together(comm, InputError.exit_code, line)
     except (Exception, KeyboardInterrupt) as error:
         _report_bug(comm, error)
         traceback.clear_frames(error.__traceback__)  # without any memory left MPI could not even end the job
@@ -81,11 +82,14 @@ def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
             print("\n".join(lines), file=sys.stderr, flush=True)
 
 
-def _leave_together(comm: Any, code: int) -> int:
+def _leave_together(comm: Any, code: int, line: str) -> int:
     """Exit if all ranks failed alike; end the whole job if some are still at work."""
     from lyra_petsc.parallel import all_here
 
     if not all_here(comm):
+        if comm.rank > 0:  # rank 0, which speaks for all, has not heard of it
+            with suppress(OSError):
+                print(f"lyra-petsc: rank {comm.rank}: {' '.join(line.split())}", file=sys.stderr, flush=True)
         comm.Abort(code)
     return code
 
