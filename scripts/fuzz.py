@@ -40,18 +40,18 @@ def main() -> int:
     started = time.monotonic()
     with tempfile.TemporaryDirectory() as scratch:
         warm(Path(scratch))
-        for number, (name, strategy) in enumerate(kinds.items()):
+        for number, (name, (share, strategy)) in enumerate(kinds.items()):
 
             @seeded(asked.seed * len(KINDS) + number)
             @settings(
-                max_examples=max(1, asked.cases // len(kinds)),
+                max_examples=asked.cases if asked.only else max(1, asked.cases * share // 100),
                 deadline=None,
                 database=None,
                 phases=[Phase.generate],
                 suppress_health_check=list(HealthCheck),
             )
             @given(case=strategy)
-            def run(case: Case) -> None:
+            def run(case: Case, name: str = name) -> None:
                 folder = Path(tempfile.mkdtemp(dir=scratch))
                 outcome = judge(case, folder)
                 codes[f"{case.kind}: {outcome.code}"] += 1

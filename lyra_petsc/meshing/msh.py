@@ -179,5 +179,9 @@ def _entities(content: _File) -> dict[tuple[int, int], list[int]]:
 
 
 def _names(content: _File) -> dict[tuple[int, int], str]:
-    text = content.sections.get("PhysicalNames", b"").decode("utf-8", errors="replace")
-    return {(int(dim), abs(int(tag))): name for dim, tag, name in _NAME.findall(text.replace("\r", ""))}
+    text = content.sections.get("PhysicalNames", b"").decode("utf-8", errors="replace").replace("\r", "")
+    # HDF5 takes no null characters, nor does a terminal take the others
+    return {
+        (int(dim), abs(int(tag))): "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
+        for dim, tag, name in _NAME.findall(text)
+    }

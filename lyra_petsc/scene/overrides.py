@@ -93,7 +93,8 @@ def _step(
 ) -> Any:
     """One part of the path: descend, or set ``value`` if no ``rest`` follows; ``walked`` grows by it."""
     if isinstance(target, list):
-        if not part.isdecimal() or int(part) > len(target):
+        # Python converts no number of thousands of digits
+        if not part.isdecimal() or len(part) > 9 or int(part) > len(target):
             many = f"[0] to [{len(target)}]" if target else "[0]"
             raise InputError(f"{dotted(walked)} is a list; give an index, {many}", key=option)
         index = int(part)

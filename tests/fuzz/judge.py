@@ -100,8 +100,12 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        lines = [line for line in self.err.splitlines() if line.startswith("lyra-petsc: ")]
-        return lines[0] if lines else ""
+        return "".join(_said(self.err.splitlines())[:1])
+
+
+def _said(lines: list[str]) -> list[str]:
+    """Lines by which the program says how it ended; a warning of unused options is none."""
+    return [line for line in lines if line.startswith("lyra-petsc: ") and ": warning: " not in line]
 
 
 def warm(folder: Path) -> None:
@@ -119,8 +123,6 @@ def warm(folder: Path) -> None:
             out = str(folder / f"warm-{integrator}")
             arguments = ["run", str(scene), "--set", f"time.integrator={integrator}", "--out", out]
             assert run_command_line(["lyra-petsc", *arguments]) == 0
-        arguments = ["run", str(scene), "--set", "time={analysis: static}", "--set", "material.damping=0"]
-        run_command_line(["lyra-petsc", *arguments, "--set", "wind=", "--out", str(folder / "warm-static")])
 
 
 def judge(case: Case, folder: Path) -> Outcome:
@@ -128,7 +130,7 @@ def judge(case: Case, folder: Path) -> Outcome:
     inside = folder / "case"
     inside.mkdir()
     case.write(inside)
-    before = _listing(inside)
+    before = listing(inside)
     started = time.monotonic()
     pid = os.fork()
     if pid == 0:
@@ -197,7 +199,7 @@ def _run(case: Case) -> int:
     from lyra_petsc.meshing import geo
 
     os.environ["LYRA_TRACEBACK"] = "1"
-    geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 4, 8
+    geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 2, 3
     PETSc.Options().setValue("ts_max_steps", STEPS)
     code = run_command_line(["lyra-petsc", *case.arguments])
     if code == 0:
@@ -217,10 +219,10 @@ def complaint(outcome: Outcome, inside: Path, before: Mapping[str, float]) -> st
     inside : Path
         The folder of the case, as the program left it.
     before : mapping
-        `_listing` of it before.
+        `listing` of it before.
     """
     lines = outcome.err.splitlines()
-    ours = [line for line in lines if line.startswith("lyra-petsc: ")]
+    ours = _said(lines)
     if outcome.code < 0:
         return f"ended by {signal.Signals(-outcome.code).name}"
     if outcome.code not in (0, 2, 3):
@@ -229,9 +231,9 @@ def complaint(outcome: Outcome, inside: Path, before: Mapping[str, float]) -> st
         if mark in outcome.err:
             return f"{mark} on stderr"
     for name, changed in before.items():
-        if _listing(inside).get(name) != changed:
+        if listing(inside).get(name) != changed:
             return f"{name} was changed"
-    left = sorted(set(_listing(inside)) - set(before))
+    left = sorted(set(listing(inside)) - set(before))
     if outcome.code == 2:
         if len(lines) != 1 or ours != lines:
             return f"{len(lines)} lines on stderr instead of one of ours"
@@ -271,7 +273,8 @@ def _unreadable(out: Path) -> str:
     return "" if states else "no states"
 
 
-def _listing(folder: Path) -> dict[str, float]:
+def listing(folder: Path) -> dict[str, float]:
+    """When each file of a folder was changed."""
     return {
         str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()
     }

@@ -192,6 +192,7 @@ BAD_OVERRIDES = [
     ("time.end.x=3", "--set time.end.x=3", "time.end holds a single value"),
     ("handles.until=3", "--set handles.until=3", "give an index, [0] to [2]"),
     ("handles[7].until=3", "--set handles[7].until=3", "give an index, [0] to [2]"),
+    (f"handles.{'9' * 5000}=3", f"--set handles.{'9' * 49}...", "give an index, [0] to [2]"),
     ("tiem.end=3", "tiem", "did you mean 'time'"),
     ("time.end=-3", "time.end", "must be > 0, not -3 (from --set)"),
     ("material.cloth=papre", "material.cloth", "did you mean 'paper'? (from --set)"),

@@ -96,6 +96,9 @@ CASES = [
     ("mesh: [{grid: {width: 1, height: 1, nx: 1, ny: 1}, name: a}, "
      "{grid: {width: 1, height: 1, nx: 1, ny: 1}, name: a}]", "mesh[1].name", "earlier sheet"),
     ("time: {end: 1}", "time.step", "missing"),
+    ("time: {end: 1, step: 1e-16}", "time.step", "is too small, 1e-16: times near 1 s"),
+    ("time: {end: 1e300, step: 1e-300}", "time.step", "is too small"),
+    ("output: {every: 1e-320}", "output.every", "is too small"),
     ("time: {end: 1, step: automatic}", "time.step", "must be a number or auto, not 'automatic'"),
     ("time: {end: 1, step: auto, tolerance: 0}", "time.tolerance", "must be > 0"),
     ("time: {end: 1, step: auto, tolerance: 2}", "time.tolerance", "fraction of the sheet's size, below 1"),
