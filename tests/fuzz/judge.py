@@ -7,6 +7,7 @@ a signal, a warning of numpy's, CPU time or memory without end, more than one li
 
 from __future__ import annotations
 
+import importlib
 import os
 import resource
 import signal
@@ -114,6 +115,8 @@ def warm(folder: Path) -> None:
     scene.write_text(WARM)
     from lyra_petsc.cli.app import run_command_line
 
+    for module in ("scene.original", "meshing.obj", "meshing.msh", "meshing.geo"):
+        importlib.import_module(f"lyra_petsc.{module}")
     with (
         (folder / "warm.txt").open("w") as words,
         redirect_stdout(words),
