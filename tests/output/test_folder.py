@@ -154,7 +154,7 @@ def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
 def test_a_second_run_into_a_folder_is_refused(comm, here, way):
     here("out/checkpoint.h5")
     with Claim(comm, choose(comm, "flag", "out", force=True)):
-        with pytest.raises(InputError, match="another run is at work|exists; name another") as caught:
+        with pytest.raises(InputError, match=r"another run is at work|exists; name another") as caught:
             Claim(comm, choose(comm, "flag", "out", **way))
         assert "\n" not in str(caught.value)
     comm.Barrier()
