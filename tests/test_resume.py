@@ -121,9 +121,10 @@ def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("way", ["beuler", "bdf2", "alpha2, adaptive", "static"])
+@pytest.mark.parametrize("way", ["bdf2", "alpha2, adaptive", "static"])
 def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
-    scene = SCENE | {"time": WAYS[way]}
+    time = WAYS[way] if way == "static" else WAYS[way] | {"end": 0.06}
+    scene = SCENE | {"time": time}
     straight, halted, alone = (shared_tmp / name for name in ("straight", "halted", "alone"))
     end = journey(comm, scene, straight, None)
     journey(comm, scene, halted, 2 if way == "static" else 9)
