@@ -53,6 +53,8 @@ class Balance:
         Left minus right side of the energy identity, and what it may be.
     residual, promised, floor : float
         Norm of the forces left on free coordinates, what the solver promised, and its round-off.
+    driving : float
+        Norm of the largest of the other forces there, those within the sheet left out.
     momentum, momentum_tolerance : float
         Largest component of Δ(Σ m v) − Δt Σ forces from outside.
     spin, spin_tolerance : float
@@ -72,6 +74,7 @@ class Balance:
     residual: float
     promised: float
     floor: float
+    driving: float
     momentum: float
     momentum_tolerance: float
     spin: float
@@ -185,6 +188,9 @@ class Accountant:
             residual=residual,
             promised=promised,
             floor=floor,
+            driving=float(
+                np.sqrt(max(s for s, name in zip(squares, parts, strict=True) if name != "internal"))
+            ),
             momentum=p,
             momentum_tolerance=p_tol,
             spin=spin,

@@ -11,6 +11,9 @@ from lyra_petsc.stress.record import Record
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 from lyra_petsc.verification.claims import Verdict
 
+RESOLVED = 0.1
+"""Part of the forces that move a sheet that may be left unbalanced before its motion means nothing."""
+
 MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
 """Newton iterations a step of a stiff sheet may take, in the median and at worst."""
 
@@ -42,6 +45,15 @@ def solved(record: Record) -> Verdict:
     if at_floor:
         words += f"; in {at_floor} steps that is the floor of round-off"
     return Verdict(worst.residual <= worst.promised + worst.floor, words)
+
+
+def resolved(record: Record) -> Verdict:
+    """The forces left are far below those that move the sheet: at the floor of round-off they may not be."""
+    number, worst = _worst(record, lambda b: _over(b.residual, RESOLVED * b.driving))
+    words = f"worst in step {number}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
+    if worst.promised <= worst.floor:
+        words += "; round-off at this stiffness allows no better"
+    return Verdict(worst.residual <= RESOLVED * worst.driving, words)
 
 
 def identity(record: Record) -> Verdict:
@@ -125,6 +137,7 @@ def of_physics(record: Record) -> dict[str, Verdict]:
     if record.balances:
         verdicts |= {
             "equations": solved(record),
+            "resolved": resolved(record),
             "energy": identity(record),
             "no gain": no_gain(record),
             "momentum": momentum(record),

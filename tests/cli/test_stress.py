@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from launch import SCENE, environment, lyra, start, write_scene
+from launch import environment, lyra, start, write_scene
 
 from lyra_petsc.stress.registry import families
 from lyra_petsc.stress.table import COLUMNS
@@ -47,7 +47,7 @@ def test_cases_pass_and_leave_table_and_page(tmp_path: Path, ranks: int) -> None
     assert content["passed"] is content["complete"] is True
     assert content["ranks"] == ranks
     assert set(content["cases"][1]["verdicts"]) == {
-        "converged", "equations", "energy", "no gain", "momentum", "softening", "stiff limit"
+        "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit"
     }  # fmt: skip
     report = (tmp_path / "out" / "report.md").read_text()
     assert "2 of 2 cases passed" in report

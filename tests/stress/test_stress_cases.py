@@ -164,6 +164,11 @@ def test_a_folded_sheet_lies_on_itself_with_its_crease_on_vertices() -> None:
     np.testing.assert_allclose(np.linalg.norm(np.diff(y, axis=1), axis=2), 0.025)
 
 
+def test_a_fold_spares_an_odd_number_of_cells() -> None:
+    y = start._folded(flat(15), 1 / 15).reshape(16, 16, 3)
+    assert np.linalg.norm(np.diff(y, axis=1), axis=2).min() == pytest.approx(1 / 15)
+
+
 def test_noise_has_its_size_and_is_always_the_same() -> None:
     x = flat()
     shift = start._noisy(x, 0.025) - x

@@ -57,6 +57,14 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
+def test_a_sheet_that_round_off_holds_up_does_not_pass(comm: MPI.Comm) -> None:
+    content = sheet(6)
+    content["material"]["stretching_scale"] = 1e16
+    outcome = run_case(comm, Case("a", "b", as_it_is), "c", Setting(content, False, Level.QUICK))
+    assert "round-off at this stiffness" in outcome.failures["resolved"].words
+
+
+@pytest.mark.parallel
 def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
     content = sheet(6)
     content["handles"] = [{"group": "nowhere"}]

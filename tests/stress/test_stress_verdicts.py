@@ -14,8 +14,8 @@ from lyra_petsc.stress.verdicts import of_physics, speed
 
 GOOD = Balance(
     energy=1.0, change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
-    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, momentum=1e-8, momentum_tolerance=1e-7,
-    spin=1e-8, spin_tolerance=1e-7,
+    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, momentum=1e-8,
+    momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
 )  # fmt: skip
 STEP = StepReport(1, 0.01, 0.01, 5, 100, 0, 1e-6, 0.1, 0.9, 1.1)
 NOTE = "step 1: triangle 3 …; below 0.577 the St. Venant-Kirchhoff model softens"
@@ -35,6 +35,7 @@ def test_a_good_record_passes() -> None:
     assert set(of_physics(record())) == {
         "converged",
         "equations",
+        "resolved",
         "energy",
         "no gain",
         "momentum",
@@ -53,6 +54,8 @@ def test_a_good_record_passes() -> None:
         ({"tolerance": 0.0}, "energy"),
         ({"residual": 2.1e-6}, "equations"),
         ({"residual": math.nan}, "equations"),
+        ({"driving": 0.9e-5}, "resolved"),
+        ({"driving": math.nan}, "resolved"),
         ({"change": 0.1 + 1.1e-9}, "no gain"),
         ({"viscous": -1e-6}, "no gain"),
         ({"momentum": 1.1e-7}, "momentum"),
@@ -63,7 +66,7 @@ def test_a_good_record_passes() -> None:
 def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: str) -> None:
     broken = failures(record(replace(GOOD, **change)))  # type: ignore[arg-type]
     assert name in broken
-    assert set(broken) <= {name, "no gain"}
+    assert set(broken) <= {name, "no gain", "resolved" if name == "equations" else name}
     if name != "no gain":
         assert "step 2" in broken[name]
 

@@ -39,9 +39,11 @@ def _crumpled(x: Array, spacing: float) -> Array:
 
 
 def _folded(x: Array, spacing: float) -> Array:
-    """Flat on itself: what is beyond the middle of the longest side, mirrored there."""
+    """Flat on itself: what is beyond the vertex nearest to the middle of the longest side, mirrored there."""
     axis = int(np.argmax(np.ptp(x, axis=0)))
-    crease = 0.5 * (x[:, axis].min() + x[:, axis].max())
+    middle = 0.5 * (x[:, axis].min() + x[:, axis].max())
+    # through a vertex: cells cut in their middle would lose all their area
+    crease = x[np.argmin(np.abs(x[:, axis] - middle)), axis]
     y = x.copy()
     y[:, axis] = crease - np.abs(x[:, axis] - crease)
     return y
