@@ -15,8 +15,9 @@ from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.control import Output, PetscValue, Solver, Time, petsc_options
+from lyra_petsc.scene.control import Output, Solver, Time
 from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
+from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
 from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
 

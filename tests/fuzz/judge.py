@@ -58,12 +58,15 @@ class Case:
         Name of the scene file.
     settings : tuple of str
         ``--set`` arguments.
+    verb : str
+        ``run`` or ``check``.
     """
 
     kind: str
     files: Mapping[str, bytes]
     scene: str = "scene.yaml"
     settings: tuple[str, ...] = ()
+    verb: str = "run"
 
     def write(self, folder: Path) -> None:
         """Put the files into an empty folder."""
@@ -75,7 +78,8 @@ class Case:
     def arguments(self) -> list[str]:
         """Those of the command line."""
         chosen = [word for setting in self.settings for word in ("--set", setting)]
-        return ["run", self.scene, *chosen, "--out", "out"]
+        folder = ["--out", "out"] if self.verb == "run" else []
+        return [self.verb, self.scene, *chosen, *folder]
 
 
 @dataclass
@@ -205,7 +209,7 @@ def _run(case: Case) -> int:
     geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 2, 3
     PETSc.Options().setValue("ts_max_steps", STEPS)
     code = run_command_line(["lyra-petsc", *case.arguments])
-    if code == 0:
+    if code == 0 and case.verb == "run":
         from lyra_petsc.scene.load import load_scene
 
         if load_scene(case.scene, case.settings) != load_scene("out/scene.yaml"):
@@ -256,6 +260,8 @@ def complaint(outcome: Outcome, inside: Path, before: Mapping[str, float]) -> st
     strange = [name for name in left if name.split("/")[0] != "out"]
     if strange:
         return f"{strange[0]} is left"
+    if outcome.code == 0 and not left:
+        return "" if "linear solver" in outcome.out else "neither a plan nor results"
     return "" if outcome.code == 2 else _unreadable(inside / "out")
 
 

@@ -254,7 +254,14 @@ def _petsc(draw: Draw) -> dict[str, Any]:
         "ksp_max_it",
         "mat_type",
     ]
-    names += ["snes_max_it", "ts_max_time", "snes_linesearch_type", "pc_factor_levels", "no_such_option"]
+    names += [
+        "snes_max_it",
+        "ts_max_time",
+        "snes_linesearch_type",
+        "pc_factor_levels",
+        "no_such_option",
+        "ksp_view",
+    ]
     words = [
         "cg",
         "gmres",
@@ -364,7 +371,8 @@ def scene_cases(draw: Draw) -> Case:
     if kind in ("damaged", "shipped"):
         text = draw(damaged(text))
     settings = _settings(draw) if draw(st.integers(0, 4)) == 0 else ()
-    return Case(f"scene-{kind}", {"scene.yaml": text, "sheet.obj": SHEET}, settings=settings)
+    verb = draw(st.sampled_from(["run", "run", "run", "check"]))
+    return Case(f"scene-{kind}", {"scene.yaml": text, "sheet.obj": SHEET}, settings=settings, verb=verb)
 
 
 def bomb(kind: str, depth: int = 12, width: int = 9) -> bytes:
@@ -401,7 +409,7 @@ def text_bombs(draw: Draw) -> Case:
         form = draw(st.sampled_from(["list", "block", "indented"]))
         text = nested(draw(st.sampled_from([10, 100, 500, 1000, 3000])), form)
     elif which == 2:
-        long = draw(st.sampled_from([1000, 20_000]))
+        long = draw(st.sampled_from([1000, 4000]))
         entry = draw(st.sampled_from(["0", "{nodes: [0]}", "a", "[0, 0, 0]"]))
         key = draw(st.sampled_from(["handles", "mesh", "loads", "gravity", "material", "title"]))
         text = f"{key}: [{', '.join([entry] * long)}]\n".encode()

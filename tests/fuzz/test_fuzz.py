@@ -139,6 +139,7 @@ def test_what_is_wrong_is_seen(fresh: Path) -> None:
     assert complaint(Outcome(70, "", line), fresh, before) == "exit code 70"
     assert complaint(Outcome(-11, "", ""), fresh, before) == "ended by SIGSEGV"
     assert complaint(Outcome(0, "", "x.py:1: RuntimeWarning: overflow\n"), fresh, before) != ""
-    assert complaint(Outcome(0, "", ""), fresh, before) == "no states.xdmf"
+    assert complaint(Outcome(0, "", ""), fresh, before) == "neither a plan nor results"
+    assert complaint(Outcome(3, "", line), fresh, before) == "no states.xdmf"
     (fresh / "mark").touch()
     assert complaint(Outcome(2, "", line), fresh, before) == "bad input, and mark is left"
