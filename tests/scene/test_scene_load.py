@@ -83,7 +83,8 @@ def test_values_and_defaults(full: Path, small: Path) -> None:
     assert scene.handles[2].axis_numbers == (0, 2)
     assert scene.output.every is None
     assert scene.petsc == {
-        "ksp_type": "cg", "ksp_rtol": 1e-9, "ksp_monitor": None, "mat_view": "::ascii_info", "flag": True, "n": 3
+        "ksp_type": "cg", "ksp_rtol": 1e-9, "ksp_monitor": None, "mat_view": "::ascii_info", "flag": True,
+        "n": 3,
     }  # fmt: skip
     plain = load_scene(small)
     assert plain.gravity is None
