@@ -27,6 +27,7 @@ from lyra_petsc.stress.case import Case, Family, Level
 from lyra_petsc.stress.exchange import save
 from lyra_petsc.stress.launch import Launcher
 from lyra_petsc.stress.registry import selected
+from lyra_petsc.stress.report import release_shapes
 from lyra_petsc.stress.results import finish, write
 from lyra_petsc.stress.runner import BaseClock, Outcome, run_case
 from lyra_petsc.stress.table import cells, headings
@@ -88,13 +89,14 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
     folder = asked.out or on_root(comm, lambda: first if asked.force else free_name(first))
     assert folder is not None
     stop = StopRequest(comm)
+    outcomes: list[Outcome] = []
 
     def watch() -> None:
         number = stop.signal_number()
         if number:
-            raise Interrupted(
-                f"stopped by {signal.Signals(number).name}; the cases that had ended are in {folder}", number
-            )
+            name = signal.Signals(number).name
+            kept = f"the cases that had ended are in {folder}" if outcomes else "no case had ended"
+            raise Interrupted(f"stopped by {name}; {kept}", number)
 
     if launcher is None:
         # a base scene that does not run is refused before anything is written
@@ -107,7 +109,6 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
         return 0 if outcome.passed else FAILED
     prepare(comm, folder, force=asked.force)
     show = Show(comm, len(cases))
-    outcomes: list[Outcome] = []
     command, ranks = _command(comm, asked), asked.ranks or comm.size
     try:
         for family, case in cases:
@@ -117,6 +118,7 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
             else:
                 outcomes.append(run_case(comm, case, family.name, setting, clock, watch))
             show.case(outcomes[-1])
+            release_shapes(outcomes)
             write(comm, folder, outcomes, ranks, complete=len(outcomes) == len(cases))
     except Interrupted:
         finish(comm, folder, outcomes, setting, ranks, command)

@@ -18,7 +18,7 @@ from lyra_petsc.stress.runner import Outcome
 from lyra_petsc.verification.claims import Verdict
 
 OUTCOME_FILE, SHAPES_FILE = "outcome.json", "shapes.npz"
-ARRAYS = ("start", "last", "triangles")
+ARRAYS = ("last", "triangles")
 """Of a record, that go into the second file."""
 
 NOT_KEPT = (*ARRAYS, "observed", "reports", "balances")

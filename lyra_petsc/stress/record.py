@@ -43,8 +43,8 @@ class Record:
     integrator : str
     busy : list of float
         CPU time of each step [s], of the rank that took most.
-    start, last : (V, 3) arrays or None
-        Positions [m] at the start and after the last step, on rank 0; None if none were gathered.
+    last : (V, 3) array or None
+        Positions [m] after the last step, on rank 0; None if none were gathered, or they are let go of.
     triangles : (F, 3) array or None
         On rank 0.
     """
@@ -61,7 +61,6 @@ class Record:
     stopped: str = ""
     integrator: str = "beuler"
     busy: list[float] = field(default_factory=list)
-    start: NDArray[np.float64] | None = None
     last: NDArray[np.float64] | None = None
     triangles: NDArray[np.int64] | None = None
 

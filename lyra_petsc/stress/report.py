@@ -102,6 +102,12 @@ def badness(outcome: Outcome) -> tuple[float, ...]:
     )
 
 
+def release_shapes(outcomes: Sequence[Outcome]) -> None:
+    """Let go of the shapes that the page will not show, since worse cases are there."""
+    for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
+        outcome.record.last = outcome.record.triangles = None
+
+
 def _case(report: Report, outcome: Outcome, *, pictures: bool) -> None:
     case, record = outcome.case, outcome.record
     report.paragraph(f"{case.name}: {case.title}.")

@@ -187,9 +187,6 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
         shape = case.shape(trial.x, simulation.model.outline.spacing)
         trial.set_state(x=shape)
         simulation.ledger.measure()
-    # the whole shape is gathered to be drawn and saved with the case: cases are small, a given scene
-    # is gathered twice
-    record.start = _on_root(trial, simulation.model.points)
     record.start_energy = _energy(trial)
     if case.observe is not None:
         record.observed.append(case.observe(trial))
@@ -213,6 +210,7 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
                 record.observed.append(case.observe(trial))
     finally:
         record.notes = list(simulation.notes)
+    # gathered to be drawn: once in a case, which other cases then let go of
     record.last = _on_root(trial, simulation.model.points)
 
 

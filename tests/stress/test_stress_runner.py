@@ -14,6 +14,7 @@ from lyra_petsc.stress.case import Case, Level, Setting
 from lyra_petsc.stress.changes import as_it_is
 from lyra_petsc.stress.exchange import restore, save
 from lyra_petsc.stress.registry import selected
+from lyra_petsc.stress.report import PICTURES, release_shapes
 from lyra_petsc.stress.runner import BaseClock, Outcome, run_case
 from lyra_petsc.stress.table import COLUMNS, row_of
 
@@ -38,12 +39,19 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
 
 @pytest.mark.parallel
 def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
-    record = run(comm, "folded").record
-    if comm.rank == 0:
-        assert record.start is not None
-        assert record.start[:, 0].max() == pytest.approx(0.5)
-    else:
-        assert record.start is None
+    case = Case("a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x)
+    record = run_case(comm, case, "c", SMALL).record
+    assert record.observed[0].min() == pytest.approx(record.observed[0][0, 0])
+    assert np.ptp(record.observed[0], axis=0) == pytest.approx([0.5, 0.5, 0.0])
+    assert (record.last is not None) is (comm.rank == 0)
+
+
+def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
+    outcomes = [run_case(comm, Case("a", "b", as_it_is, steps=1), "c", SMALL) for _ in range(PICTURES + 2)]
+    outcomes[-1].record.stopped = "at once"
+    release_shapes(outcomes)
+    assert outcomes[-1].record.last is not None
+    assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
 
 
 @pytest.mark.parallel
