@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +59,9 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
     yaml = YAML(typ="safe", pure=True)
     try:
         # nodes first: there a block that many anchors refer to stands once
-        node = yaml.compose(io.StringIO(text))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an anchor may be set anew
+            node = yaml.compose(io.StringIO(text))
         if (entries := _entries(node, {})) > MOST_ENTRIES:
             grown = f"holds more than {MOST_ENTRIES} entries once its anchors are expanded"
             raise InputError("refers to itself" if entries == math.inf else grown, file=file, key=key)

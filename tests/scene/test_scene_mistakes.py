@@ -265,6 +265,13 @@ def test_merged_keys_and_anchors_of_a_usual_size_are_read(tmp_path: Path) -> Non
     assert scene.handles[1].stiffness == 10
 
 
+def test_an_anchor_set_anew_is_no_warning(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    path = tmp_path / "good.yaml"
+    path.write_text(scene_text("handles: [{nodes: &n [0]}, {nodes: &n [1]}, {nodes: *n}]"))
+    assert load_scene(path).handles[2].nodes == [1]
+    assert len(recwarn) == 0
+
+
 def test_a_file_beyond_any_scene(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     with path.open("wb") as file:
