@@ -132,9 +132,11 @@ def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, sh
         shutil.copytree(halted, alone)
     assert journey(comm, scene, halted, None, resume=True) == end
     if comm.rank == 0:
-        same_files(halted, straight, 1e-11)
+        # MUMPS adds up in the order in which messages arrive: two runs that nobody stops differ as much,
+        # and where that decides on one Newton iteration more, by the solver's tolerance
+        same_files(halted, straight, 1e-11 if comm.size == 1 else 1e-7)
         journey(MPI.COMM_SELF, scene, alone, None, resume=True)
-        same_files(alone, straight, 1e-5 if "adaptive" in way else 1e-8)
+        same_files(alone, straight, 1e-5 if "adaptive" in way else 1e-7)
 
 
 def test_resuming_twice_at_every_step(tmp_path: Path) -> None:
