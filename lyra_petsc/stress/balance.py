@@ -18,7 +18,7 @@ these are the tolerances, none is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,11 +157,8 @@ class Accountant:
         )
         (kinetic0, kinetic1, elastic, turn, stored, fallen0, fallen1, numerical, viscous, inner, outer,
          left, free_way, way, energy_noise, forces, powers, heights) = map(float, sums)  # fmt: skip
-        squares = comm.allreduce(np.array([float(np.sum(part**2, where=free)) for part in parts.values()]))
         reach = float(comm.allreduce(float(np.abs(x1).max(initial=0.0)), op=MPI.MAX))
-        floor = residual_roundoff(system, max(reach, self._simulation.model.outline.reach))
-        scene = self._simulation.scene
-        promised = max(scene.solver.force_tolerance * float(np.sqrt(squares.max())), floor)
+        promised, floor, driving = self._promise(parts, reach)
         residual = float(np.sqrt(left))
         solved = residual * np.sqrt(free_way) + floor * np.sqrt(way)
         # positions are rounded, too: x' − x is Δt v' only to their last digit
@@ -188,15 +185,23 @@ class Accountant:
             residual=residual,
             promised=promised,
             floor=floor,
-            driving=float(
-                np.sqrt(max(s for s, name in zip(squares, parts, strict=True) if name != "internal"))
-            ),
+            driving=driving,
             momentum=p,
             momentum_tolerance=p_tol,
             spin=spin,
             spin_tolerance=spin_tol,
             jumped=jumped,
         )
+
+    def _promise(self, parts: Mapping[str, Array], reach: float) -> tuple[float, float, float]:
+        """What the solver promised for the residual, its floor of round-off, and the driving forces [N]."""
+        system, simulation = self._system, self._simulation
+        free = ~system.mask[: system.points.n_owned]
+        squares = np.array([float(np.sum(part**2, where=free)) for part in parts.values()])
+        norms = dict(zip(parts, np.sqrt(system.points.comm.allreduce(squares)).tolist(), strict=True))
+        floor = residual_roundoff(system, max(reach, simulation.model.outline.reach))
+        promised = max(simulation.scene.solver.force_tolerance * max(norms.values()), floor)
+        return promised, floor, max(norm for name, norm in norms.items() if name != "internal")
 
     # -- parts ---------------------------------------------------------------------------------------
 

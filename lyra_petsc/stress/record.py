@@ -31,7 +31,7 @@ class Record:
     reports : list of StepReport
         One for each accepted step.
     balances : list of Balance
-        One for each, of a scene stepped by backward Euler; else empty.
+        One for each; empty for the semi-implicit method, which solves no step.
     energies : list of float
         Kinetic + potential after each [J].
     observed : list

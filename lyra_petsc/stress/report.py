@@ -125,7 +125,7 @@ def _case(report: Report, outcome: Outcome, *, pictures: bool) -> None:
     if len(record.times) > 1:
         times = [0.0, *record.times]
         curves = [Curve("kinetic + potential", times, [record.start_energy, *record.energies])]
-        if record.balances:
+        if record.balances and record.integrator == "beuler":
             work, total = [record.start_energy], record.start_energy
             for balance in record.balances:
                 total += balance.work

@@ -16,6 +16,7 @@ from lyra_petsc.partition.points import Points
 from lyra_petsc.stress.balance import Accountant
 from lyra_petsc.stress.case import Case, Level, NotHere, Setting
 from lyra_petsc.stress.record import Record
+from lyra_petsc.stress.stage import StageAccountant
 from lyra_petsc.stress.verdicts import of_physics, speed
 from lyra_petsc.verification.bench import Bench, Trial
 from lyra_petsc.verification.claims import Verdict
@@ -190,7 +191,10 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
     record.start_energy = _energy(trial)
     if case.observe is not None:
         record.observed.append(case.observe(trial))
-    accountant = Accountant(simulation) if record.integrator == "beuler" else None
+    accountant = None
+    if record.integrator != "semi-implicit":  # which promises no balance
+        kind = Accountant if record.integrator == "beuler" else StageAccountant
+        accountant = kind(simulation)
     try:
         while not simulation.finished:
             if comm.bcast(time.perf_counter() > deadline, root=0):

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.stress.base import sheet
 from lyra_petsc.stress.case import Case, Level, Setting
-from lyra_petsc.stress.changes import as_it_is, blow, changed, damp
+from lyra_petsc.stress.changes import as_it_is, blow, damp
 from lyra_petsc.stress.record import Record
 from lyra_petsc.stress.registry import selected
 from lyra_petsc.stress.runner import Outcome, run_case
@@ -142,11 +142,45 @@ def test_negative_damping_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatc
     assert "no gain" in outcome.failures
 
 
-def test_other_integrators_have_no_such_identity(comm: MPI.Comm) -> None:
-    content = sheet(CELLS)
-    content["time"]["integrator"] = "bdf2"
-    case = Case("try", "a try", changed(lambda content: content), steps=3)
-    outcome = run_case(comm, case, "try", Setting(content, True, Level.QUICK))
+def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> Outcome:
+    content = blow(sheet(CELLS), 3.0) | changes
+    content["time"]["integrator"] = integrator
+    return run_case(comm, Case("a", "b", as_it_is, steps=4), "c", Setting(content, True, Level.QUICK))
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
+def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: str) -> None:
+    outcome = stepped_by(comm, integrator, **handled(0.02))
+    assert outcome.failures == {}
+    assert {"equations", "resolved", "energy", "momentum"} < set(outcome.verdicts)
+    assert "no gain" not in outcome.verdicts
+    assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
+
+
+@pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])
+def test_a_broken_kernel_shows_in_other_integrators(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, term: type, factor: float
+) -> None:
+    monkeypatch.setattr(term, "add_gradient", broken(term, factor))
+    assert "energy" in stepped_by(comm, "bdf2", initial={"noise": 0.01}).failures
+
+
+def test_an_unbalanced_force_shows_in_other_integrators(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Membrane.add_gradient
+
+    def add_gradient(self: Membrane, x: Array, out: Array) -> None:
+        real(self, x, out)
+        out[20, 0] += 1e-3
+
+    monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
+    assert "momentum" in stepped_by(comm, "midpoint").failures
+
+
+def test_the_semi_implicit_method_promises_no_balance(comm: MPI.Comm) -> None:
+    outcome = stepped_by(comm, "semi-implicit")
     assert outcome.passed
     assert outcome.record.balances == []
     assert set(outcome.verdicts) == {"converged", "softening"}
