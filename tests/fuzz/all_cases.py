@@ -9,9 +9,9 @@ from original_cases import original_cases
 from scene_cases import scene_cases, text_bombs
 
 KINDS: dict[str, tuple[int, st.SearchStrategy[Case]]] = {
-    "scenes": (45, scene_cases()),
+    "scenes": (48, scene_cases()),
     "bombs": (3, text_bombs()),
     "originals": (15, original_cases()),
     "meshes": (30, mesh_cases()),
-    "scripts": (7, geo_cases()),
+    "scripts": (4, geo_cases()),
 }

@@ -24,7 +24,7 @@ from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
 from scene_cases import bomb, nested
 
 CASES = 240
-IN_THE_PROGRAM = 10
+IN_THE_PROGRAM = 8
 ON_TWO_RANKS = 3
 
 
@@ -75,7 +75,7 @@ def test_each_case_ends_in_a_run_or_in_one_line(kind: str, tmp_path: Path) -> No
     assert not wrong, "\n".join(wrong)
     assert codes.total() >= number // 2
     assert codes[2] > 0
-    assert kind == "bombs" or codes[0] > 0, "no case ran: the drawing of sound ones is broken"
+    assert kind in ("bombs", "scripts") or codes[0] > 0, "no case ran: the drawing of sound ones is broken"
 
 
 @pytest.mark.slow
