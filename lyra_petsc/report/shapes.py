@@ -62,6 +62,7 @@ def surface(x: Array, triangles: NDArray[np.int64], *, name: str, caption: str) 
     for axis, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{axis}lim")(middle - half, middle + half)
         getattr(axes, f"set_{axis}label")(f"{axis} [m]")
+        axes.locator_params(axis=axis, nbins=4)
     axes.set_box_aspect((1, 1, 1))
     axes.view_init(elev=18, azim=-65)
     return drawn(figure, name, caption)

@@ -27,8 +27,8 @@ Watch = Callable[[], None]
 LONGEST = {Level.QUICK: 20.0, Level.USUAL: 60.0, Level.FULL: 600.0}
 """Wall seconds [s] after which a case is ended between two steps."""
 
-BASE_STEPS = 10
-"""Steps of the base scene that are timed."""
+BASE_STEPS = 20
+"""Steps of the base scene that are timed: as many as most cases take, since later ones cost more."""
 
 
 @dataclass
@@ -212,6 +212,10 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
                 accountant.look()
             if case.observe is not None:
                 record.observed.append(case.observe(trial))
+    except SolverError as error:
+        if error.collective or comm.size == 1:
+            record.last = _on_root(trial, simulation.model.points)
+        raise
     finally:
         record.notes = list(simulation.notes)
     # gathered to be drawn: once in a case, which other cases then let go of

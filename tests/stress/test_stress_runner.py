@@ -62,6 +62,8 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
     assert "did not converge" in outcome.failures["converged"].words
     row = row_of(outcome)
     assert (row["steps"], row["converged"]) == (0, False)
+    # where it stood is kept to be drawn
+    assert (outcome.record.last is not None) is (comm.rank == 0)
 
 
 @pytest.mark.parallel
