@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
 def main() -> None:
     """Run the command line and leave with its exit code."""
+    from lyra_petsc.cli.signals import leave_at_once
+
+    leave_at_once()  # the imports that follow take a second
     from lyra_petsc.cli.app import run_command_line
 
-    sys.exit(run_command_line(sys.argv))
+    code = run_command_line(sys.argv)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:  # nobody reads it; Python would try again and complain
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    sys.exit(code)
 
 
 if __name__ == "__main__":

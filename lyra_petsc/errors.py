@@ -11,6 +11,8 @@ class LyraError(Exception):
     """Base of everything a user may see as one line."""
 
     exit_code = 1
+    details: tuple[str, ...] = ()
+    """Further lines for the user, below the one that says it."""
 
 
 class InputError(LyraError):
@@ -55,9 +57,10 @@ class SolverError(LyraError):
 
     exit_code = 3
 
-    def __init__(self, message: str, *, collective: bool = False) -> None:
+    def __init__(self, message: str, *, collective: bool = False, details: tuple[str, ...] = ()) -> None:
         super().__init__(message)
         self.collective = collective
+        self.details = details
 
 
 class OutputError(LyraError):

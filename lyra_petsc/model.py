@@ -16,7 +16,7 @@ from lyra_petsc.handles.held import Held, is_exact, select_held
 from lyra_petsc.handles.motion import Window
 from lyra_petsc.meshing.build import build_mesh
 from lyra_petsc.meshing.measure import mean_edge_length
-from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.meshing.mesh import Mesh, Source
 from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.parallel import on_root
@@ -53,6 +53,7 @@ class Outline:
     reach: float
     """Largest coordinate [m] of the start and rest shape."""
     terms: list[str]
+    sources: list[Source]
     notes: list[str] = field(default_factory=list)
 
 
@@ -73,6 +74,8 @@ class Model:
     mesh : Mesh or None
         The whole mesh, on rank 0, until ``release``.
     partitioner : str
+    tags : (n_owned,) or None
+        Node tags that a .msh file gives the owned vertices, 0 for others, as float64.
     """
 
     scene: Scene
@@ -84,6 +87,7 @@ class Model:
     probes: dict[str, Ints]
     mesh: Mesh | None
     partitioner: str
+    tags: Array | None
 
     def release(self) -> None:
         """Let go of the whole mesh; from here on no rank holds a global array."""
@@ -169,6 +173,8 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     data = {"position": mesh.positions, "mass": rest.mass}
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held) | start_velocities(scene.initial, mesh, rest.mass)
+    if mesh.tags is not None:
+        data["tag"] = mesh.tags.astype(np.float64)
     outline = Outline(
         n_vertices=mesh.n_vertices,
         n_triangles=mesh.n_triangles,
@@ -176,6 +182,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         size=float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
         reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
         terms=names,
+        sources=mesh.sources,
         notes=[*mesh.notes, *rest.notes],
     )
     return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data)
@@ -221,7 +228,9 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     points.update_ghosts(system.x)
     points.update_ghosts(system.v)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
-    return Model(scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner)
+    return Model(
+        scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner, data.get("tag")
+    )
 
 
 def _spectral_radius(scene: Scene) -> float | None:

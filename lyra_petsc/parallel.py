@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -10,6 +11,24 @@ from mpi4py import MPI
 from lyra_petsc.errors import LyraError
 
 Result = TypeVar("Result")
+
+GRACE = 5.0
+"""How long [s] a rank that failed waits for the others to fail alike."""
+
+
+def all_here(comm: MPI.Comm) -> bool:
+    """Whether all ranks come here within `GRACE`, each after its own failure.
+
+    If not, nothing collective may follow on this communicator.
+    """
+    if comm.size == 1:
+        return True
+    request, deadline = comm.Ibarrier(), time.monotonic() + GRACE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
 
 
 def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -> Result | None:

@@ -9,18 +9,28 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.fields import Field, chosen
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.checkpoint import read_checkpoint, write_checkpoint
-from lyra_petsc.output.history import HISTORY_COLUMNS, History, vector_columns
-from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from lyra_petsc.output.failure import Moment, remove_failure, write_failure
+from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
+from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
 from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.difference import Change, changes
 from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation, StepReport
 
 Array = NDArray[np.float64]
+
+MOST_CHANGES = 12
+"""Changes of a resumed scene that are told one by one."""
+
+CHEAP = 100.0
+"""Time since the last checkpoint, over the time it took to write, from which on another is written."""
 
 
 class Recorder:
@@ -31,6 +41,11 @@ class Recorder:
     Parameters
     ----------
     simulation : Simulation
+
+    Attributes
+    ----------
+    changes : list of Change
+        What the scene says otherwise than the one that the run was begun with, after ``resume``.
 
     Raises
     ------
@@ -49,8 +64,12 @@ class Recorder:
             elements = model.membrane.elements
             own = elements.index[: elements.n_owned]
             self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
+        self._comm = points.comm
         self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
         self._last_state = -1
+        self._checkpoint_seconds = 0.0
+        self.changes: list[Change] = []
 
     # -- opening -------------------------------------------------------------------------------------
 
@@ -67,10 +86,19 @@ class Recorder:
         self.write_checkpoint()
 
     def resume(self, folder: Path) -> None:
-        """Put the newest checkpoint into the simulation and cut the files behind it."""
+        """Put the newest checkpoint into the simulation and cut the files behind it.
+
+        Raises
+        ------
+        InputError
+            If the run in the folder cannot go on with this scene; the folder is untouched.
+        """
         simulation = self._simulation
-        system, n = simulation.model.system, simulation.model.points.n_owned
+        model, scene = simulation.model, simulation.scene
+        system, n = model.system, model.points.n_owned
+        check_same_mesh(folder, model.mesh, _groups(scene), self._comm)
         checkpoint = read_checkpoint(folder, self._vertices)
+        on_root(self._comm, lambda: self._check_kind(folder, checkpoint))
         memory = checkpoint.scalars
         for number, start in enumerate(memory["late_starts"]):
             system.departures.resume(float(start), checkpoint.arrays[f"start_{number}"])
@@ -79,35 +107,80 @@ class Recorder:
         simulation.resume(memory, checkpoint.arrays)
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
+        self._note_changes(folder / "scene.yaml")
         self._open(folder, simulation.step_number)
+        kept, last = self._history.kept_until, simulation.step_number
+        if kept != last:
+            simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
+        on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._last_state = int(memory["last_state"])
 
+    def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
+        """Refuse what cannot go on from the checkpoint (rank 0)."""
+        now = self._simulation.scene.time.scheme
+        before = checkpoint.scalars.get("scheme", now)
+        if "static" in (now, before) and now != before:
+            raise InputError(
+                "a motion does not go on as a static analysis, nor the other way round: run without --resume",
+                file=checkpoint.file,
+                key="time.analysis",
+            )
+        for name, columns in self._tables().items():
+            check_columns(folder / name, columns)
+
+    def _note_changes(self, before: Path) -> None:
+        """Tell what the scene says otherwise than the one in the folder."""
+        scene, notes = self._simulation.scene, self._simulation.notes
+        try:
+            self.changes = on_root(self._comm, lambda: changes(before, scene)) or []
+        except InputError as error:
+            notes.append(f"{error}; what has changed since the run was begun is not known")
+            return
+        for change in self.changes[:MOST_CHANGES]:
+            if change.key == "time.end":
+                notes.append(str(change))
+            elif change.key == "time.integrator":
+                notes.append(
+                    f"changed since the run was begun: {change} (begins without memory of earlier steps)"
+                )
+            else:
+                notes.append(f"changed since the run was begun: {change}")
+        if len(self.changes) > MOST_CHANGES:
+            notes.append(f"and {len(self.changes) - MOST_CHANGES} more changes, listed in summary.json")
+
+    def _tables(self) -> dict[str, tuple[str, ...]]:
+        """Names and columns of the tables that the scene asks for."""
+        scene = self._simulation.scene
+        tables: dict[str, tuple[str, ...]] = {"history.csv": HISTORY_COLUMNS}
+        if scene.probes:
+            tables["probes.csv"] = vector_columns(list(scene.probes))
+        if scene.output.reactions and scene.handles:
+            tables["reactions.csv"] = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
+        return tables
+
     def _open(self, folder: Path, resume_after: int | None) -> None:
-        simulation = self._simulation
-        model, scene = simulation.model, simulation.scene
-        comm = model.points.comm
         self._folder = folder
+        on_root(self._comm, lambda: remove_failure(folder))
         self._states = StateWriter(
             folder,
             self._vertices,
             self._triangles,
-            n_triangles=model.outline.n_triangles,
+            n_triangles=self._simulation.model.outline.n_triangles,
             resume_after=resume_after,
         )
-        self._history = History(folder / "history.csv", HISTORY_COLUMNS, comm, resume_after=resume_after)
-        self._probes = self._reactions = None
-        if scene.probes:
-            columns = vector_columns(list(scene.probes))
-            self._probes = History(folder / "probes.csv", columns, comm, resume_after=resume_after)
-        if scene.output.reactions and scene.handles:
-            columns = vector_columns([f"handle{number}" for number in range(len(scene.handles))])
-            self._reactions = History(folder / "reactions.csv", columns, comm, resume_after=resume_after)
+        opened = {
+            name: History(folder / name, columns, self._comm, resume_after=resume_after)
+            for name, columns in self._tables().items()
+        }
+        self._history = opened["history.csv"]
+        self._probes, self._reactions = opened.get("probes.csv"), opened.get("reactions.csv")
 
     # -- a step --------------------------------------------------------------------------------------
 
     def record(self, report: StepReport) -> None:
         """Everything that the step just accepted has to leave on disk."""
         self._write_row(report)
+        self._steps_since += 1
         control = self._simulation.control
         if control.writes_at(report.time) or self._simulation.finished:
             self.write_state()
@@ -116,9 +189,16 @@ class Recorder:
             self.write_checkpoint()
 
     def _due(self) -> bool:
-        """Whether a checkpoint is due by wall time: rank 0's clock decides."""
-        seconds = self._simulation.scene.output.checkpoint.seconds
-        due = clock.monotonic() - self._last_checkpoint >= seconds
+        """Whether a checkpoint is due, by steps or by wall time: rank 0's clock decides.
+
+        Also where it costs next to nothing beside the steps since the last one: a step of minutes is
+        then not lost to a launcher that leaves a second to finish.
+        """
+        asked = self._simulation.scene.output.checkpoint
+        if asked.steps is not None and self._steps_since >= asked.steps:
+            return True
+        elapsed = clock.monotonic() - self._last_checkpoint
+        due = elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
         return bool(self._simulation.comm.bcast(due, root=0))
 
     def _write_row(self, report: StepReport) -> None:
@@ -191,13 +271,43 @@ class Recorder:
         arrays = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.departures.late)):
             arrays[f"start_{number}"] = system.departures.late[start]
-        write_checkpoint(
-            self._folder, self._vertices, arrays, {**simulation.memory(), "last_state": self._last_state}
-        )
+        scalars = simulation.memory() | {
+            "last_state": self._last_state,
+            "scheme": simulation.scene.time.scheme,
+        }
+        began = clock.monotonic()
+        write_checkpoint(self._folder, self._vertices, arrays, scalars)
         self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
+        self._checkpoint_seconds = self._last_checkpoint - began
+
+    def write_failure(self) -> None:
+        """Write why the last step could not be taken: the state before it and the failing iterate."""
+        simulation, failure = self._simulation, self._simulation.failure
+        assert failure is not None
+        system, n, stuck = simulation.model.system, simulation.model.points.n_owned, failure.stuck
+        # a converged state leaves no residual; a number that is not finite has no place in space
+        before = {"velocity": system.v[:n], "residual": np.zeros_like(stuck.residual)}
+        failing = {"velocity": stuck.velocity, "residual": stuck.residual}
+        position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])
+        write_failure(
+            self._folder,
+            self._vertices,
+            simulation.model.outline.n_triangles,
+            simulation.step_number,
+            (Moment(failure.time, system.x[:n], before), Moment(stuck.time, position, failing)),
+            failure.text,
+        )
 
     def close(self) -> None:
         """Close the tables."""
         for table in (self._history, self._probes, self._reactions):
             if table is not None:
                 table.close()
+
+
+def _groups(scene: Scene) -> set[str]:
+    """Names of the mesh's groups that a scene uses."""
+    selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
+    names = {block.group for block in scene.material} | {selector.group for selector in selectors}
+    return {name for name in names if name is not None}

@@ -13,13 +13,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.compression import Compression
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.model import Model, build_model, events
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers.options import fill_gaps, petsc_number
+from lyra_petsc.solvers.options import fill_gaps, is_set, petsc_number
+from lyra_petsc.stepping.advice import Circumstances, advice, trouble
 from lyra_petsc.stepping.control import LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.diagnosis import diagnose
 from lyra_petsc.stepping.equilibrium import Equilibrium
+from lyra_petsc.stepping.failure import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.rounding import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -49,6 +53,8 @@ class StepReport:
     rejected: int
     residual: float
     wall_seconds: float
+    smallest_stretch: float = 1.0
+    largest_stretch: float = 1.0
 
 
 def _positive(name: str, seconds: float) -> float:
@@ -74,6 +80,8 @@ class Simulation:
     time : float
         [s]
     step_number : int
+    failure : Failure or None
+        Why the last step could not be taken.
     notes : list of str
         What the user should know: mesh repairs, changed linear solver, …
 
@@ -92,16 +100,27 @@ class Simulation:
         outline, system = self.model.outline, self.model.system
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
+            if not math.isfinite(floor):
+                raise InputError(
+                    "stiffness times size overflows; give smaller numbers or another unit of length",
+                    file=scene.source,
+                    key="material",
+                )
             self.stepper = Stepper(scene, system, self.model.pattern, outline.spacing, floor)
+        self._floor = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
-            _positive("-ts_dt", ts.getTimeStep()), _positive("-ts_max_time", ts.getMaxTime())
+            _positive("-ts_dt", petsc_number("ts_dt", ts.getTimeStep())),
+            _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
         )
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
+        self.compression = Compression(self.model)
         self._told_of_error = False
+        self.failure: Failure | None = None
+        self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
         self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
@@ -143,6 +162,7 @@ class Simulation:
         system, n = self.model.system, self.model.points.n_owned
         x_before, v_before = system.x.copy(), system.v.copy()
         newton = linear = rejected = 0
+        self._tried = []
         while True:
             end = self.control.next_end(self.time)
             past = system.scheme.memory()
@@ -164,12 +184,21 @@ class Simulation:
         self.step_number += 1
         with self.phases("output"):
             self.ledger.record(x_before[:n])
+            note = self.compression.look(f"step {self.step_number} ({self._now()})")
+        if note:
+            self.notes.append(note)
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
+        stretches = self.compression.smallest, self.compression.largest
         return StepReport(
-            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds
+            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds, *stretches
         )
+
+    def _now(self) -> str:
+        """The present time, or load factor, in words."""
+        moves = self.model.system.scheme.moves
+        return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
     def _accurate(self, v_before: Array, dt: float) -> bool:
         """Whether the step just taken keeps its share of the tolerance."""
@@ -192,6 +221,7 @@ class Simulation:
         return stands
 
     def _recover(self, attempt: Attempt, end: float) -> None:
+        self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
             previous = self.stepper.preset
             following = self.stepper.next_preset()
@@ -202,14 +232,40 @@ class Simulation:
                 )
                 return
         if not self.control.failed():
-            moves = self.model.system.scheme.moves
-            now = f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
-            last = f"Δt = {end - self.time:.3g} s" if moves else f"an increment of {end - self.time:.3g}"
-            raise SolverError(
-                f"step {self.step_number + 1} ({now}) did not converge even with {last}: {attempt.words}; "
-                f"last residual {attempt.residual:.3g} N; the state at {now} is kept; {attempt.advice}",
-                collective=True,
-            )
+            self.failure = self._explain(attempt, end)
+            raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
+
+    def _explain(self, attempt: Attempt, end: float) -> Failure:
+        """Why the last attempt at a step failed; collective."""
+        model, scene, stuck = self.model, self.scene, attempt.stuck
+        assert stuck is not None
+        system, outline, stepper = model.system, model.outline, self.stepper
+        diagnosis = diagnose(
+            model.points, model.membrane, system.held, stuck, system.x, system.mass, model.tags
+        )
+        now = Circumstances(
+            dt=end - self.time,
+            nominal=self.control.step,
+            spacing=outline.spacing,
+            floor=self._floor,
+            max_iterations=stepper.snes.getTolerances()[3],
+            iterations_key="-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations",
+            linear_iterations=stepper.ksp.getTolerances()[3],
+            preconditioner=stepper.ksp.getPC().getType(),
+            ranks=self.comm.size,
+        )
+        return Failure(
+            step=self.step_number + 1,
+            time=self.time,
+            dt=now.dt,
+            static=not system.scheme.moves,
+            kind=trouble(diagnosis, stuck),
+            tried=self._tried,
+            diagnosis=diagnosis,
+            advice=advice(diagnosis, stuck, scene, now),
+            sources=outline.sources,
+            stuck=stuck,
+        )
 
     def memory(self) -> dict[str, Any]:
         """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""
@@ -251,6 +307,8 @@ class Simulation:
         while memory["preset"] in self.stepper.presets[1:]:
             self.stepper.next_preset()
         self.stepper.blend = float(memory["blend"])
+        # what a changed scene lets begin before now sets out from here; else all has begun already
+        system.begin(self.time)
         self.stepper.start(self.time, self.step_number)
 
     def destroy(self) -> None:

@@ -25,11 +25,12 @@ LEVELS = [
     {"output"},
     {"start"},
     {"model"},
-    {"fields"},
+    {"compression", "fields"},
     {"simulation"},
     {"recorder"},
     {"exact", "report"},
     {"study", "verification"},
+    {"stress"},
     {"cli"},
     {"__main__"},
 ]

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.errors import InputError
 from lyra_petsc.partition.points import Points
 
 
@@ -30,7 +31,11 @@ class SystemMatrix:
         self.mat = PETSc.Mat().create(comm)
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
         self.mat.setType(kind)
-        self.mat.setFromOptions()
+        try:
+            self.mat.setFromOptions()
+        except PETSc.Error:
+            given = PETSc.Options().getString("mat_type", "")
+            raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
         self._indptr = pattern.indptr.astype(PETSc.IntType)
         self._columns = points.global_number[pattern.columns].astype(PETSc.IntType)
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,17 @@ import click
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.arguments import split
+from lyra_petsc.cli.signals import take_back_from_petsc
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.nearest import nearest
 
 BUG = 70
 """Exit code of what should never happen."""
 
+PETSC_OUT_OF_MEMORY = 55
+"""PETSc's error code PETSC_ERR_MEM."""
+
 LATER = {
-    "stress": "stability on stiff and extreme cases",
     "render": "pictures and films",
     "view": "a live page",
     "export": "other formats",
@@ -29,9 +32,6 @@ LATER = {
     "new": "a starter scene",
 }
 """Verbs that are announced and not there yet."""
-
-GRACE_SECONDS = 5.0
-"""How long a failing rank waits for the others to fail alike before it ends the job."""
 
 
 def run_command_line(argv: Sequence[str]) -> int:
@@ -41,6 +41,8 @@ def run_command_line(argv: Sequence[str]) -> int:
         import petsc4py
 
         petsc4py.init([argv[0], *petsc])
+        take_back_from_petsc()
+        import numpy as np
         from mpi4py import MPI
     except ImportError as error:
         print(
@@ -51,38 +53,44 @@ def run_command_line(argv: Sequence[str]) -> int:
         return InputError.exit_code
 
     comm = MPI.COMM_WORLD
+    # a number that overflows makes a step fail, which is told once and in words
+    np.seterr(over="ignore", invalid="ignore")
     try:
         code = _verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
     except LyraError as error:
-        _say(comm, str(error))
-        return _leave_together(comm, error.exit_code)
+        _say(comm, str(error), error.details)
+        return _leave_together(comm, error.exit_code, str(error))
     except click.exceptions.Exit as leave:
         return leave.exit_code
     except click.ClickException as error:
-        _say(comm, _in_one_line(error))
-        return _leave_together(comm, InputError.exit_code)
+        line = _in_one_line(error)
+        _say(comm, line)
+        return _leave_together(comm, InputError.exit_code, line)
     except (Exception, KeyboardInterrupt) as error:
         _report_bug(comm, error)
+        traceback.clear_frames(error.__traceback__)  # without any memory left MPI could not even end the job
         if comm.size > 1:
             comm.Abort(BUG)
         return BUG
     return code if isinstance(code, int) else 0
 
 
-def _say(comm: Any, line: str) -> None:
+def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
     if comm.rank == 0:
-        print(f"lyra-petsc: {' '.join(line.split())}", file=sys.stderr, flush=True)
+        lines = [f"lyra-petsc: {' '.join(line.split())}", *(f"  {detail}" for detail in details)]
+        with suppress(OSError):
+            print("\n".join(lines), file=sys.stderr, flush=True)
 
 
-def _leave_together(comm: Any, code: int) -> int:
+def _leave_together(comm: Any, code: int, line: str) -> int:
     """Exit if all ranks failed alike; end the whole job if some are still at work."""
-    if comm.size > 1:
-        request = comm.Ibarrier()
-        deadline = time.monotonic() + GRACE_SECONDS
-        while not request.Test():
-            if time.monotonic() > deadline:
-                comm.Abort(code)
-            time.sleep(0.01)
+    from lyra_petsc.parallel import all_here
+
+    if not all_here(comm):
+        if comm.rank > 0:  # rank 0, which speaks for all, has not heard of it
+            with suppress(OSError):
+                print(f"lyra-petsc: rank {comm.rank}: {' '.join(line.split())}", file=sys.stderr, flush=True)
+        comm.Abort(code)
     return code
 
 
@@ -90,12 +98,19 @@ def _report_bug(comm: Any, error: BaseException) -> None:
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
     text = " ".join(str(error).split()) or "no message"
-    print(
-        f"lyra-petsc: internal error on rank {comm.rank}: {type(error).__name__}: {text} ({where}); "
-        "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened",
-        file=sys.stderr,
-        flush=True,
-    )
+    name = type(error).__name__
+    if isinstance(error, MemoryError) or getattr(error, "ierr", 0) == PETSC_OUT_OF_MEMORY:
+        line = (
+            f"lyra-petsc: out of memory on rank {comm.rank}: {name}: {text} ({where}); "
+            "take more memory, more machines or a coarser mesh"
+        )
+    else:
+        line = (
+            f"lyra-petsc: internal error on rank {comm.rank}: {name}: {text} ({where}); "
+            "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
+        )
+    with suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
     if os.environ.get("LYRA_TRACEBACK"):
         traceback.print_exception(error)
 
@@ -259,6 +274,30 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
         run_job(comm, job)
     else:
         study_scene(comm, Asked(**asked))
+
+
+@_verbs.command(context_settings=_SETTINGS)
+@_helped
+@_scene
+@_set
+@click.option("--only", multiple=True, metavar="NAME,NAME,…", help="Only these cases or families.")
+@click.option("--quick", is_flag=True, help="Fewer cases, on a coarser sheet: less than a minute.")
+@click.option("--full", is_flag=True, help="All values, and their products.")
+@click.option("--list", "listed", is_flag=True, help="Name the cases; runs nothing.")
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
+@click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
+@click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
+@click.option("--job", type=click.Path(path_type=Path), hidden=True)
+@click.pass_obj
+def stress(comm: Any, /, listed: bool, **asked: Any) -> int:
+    """Run stiff and extreme cases, on a hanging sheet or on SCENE; exit code 1 if a verdict fails."""
+    from lyra_petsc.cli.stress import Asked, list_cases
+    from lyra_petsc.cli.stress import stress as stress_cases
+
+    if listed:
+        list_cases(comm, Asked(**asked))
+        return 0
+    return stress_cases(comm, Asked(**asked))
 
 
 @_verbs.command(context_settings=_SETTINGS)

@@ -17,6 +17,7 @@ from lyra_petsc.cli.run import read_scene
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.values import one_line
 from lyra_petsc.simulation import Simulation
 
 Counts = NDArray[np.int64]
@@ -60,9 +61,9 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     if time.analysis == "static":
         plan_of_steps = f"load factor to {control.end:g}, first increment {control.step:g}; a state at each"
     else:
-        steps = math.ceil(control.end / control.step - 1e-9)
+        steps = _count(control.end / control.step)
         every = scene.output.every
-        states = 1 + (steps if every is None else math.ceil(control.end / every - 1e-9))
+        states = 1 + (steps if every is None else _count(control.end / every))
         plan_of_steps = f"{steps} of {control.step:g} s to t = {control.end:g} s, {states} states"
         if time.adaptive:
             written = "a state at each" if every is None else f"{states} states"
@@ -70,10 +71,12 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
                 f"adaptive to t = {control.end:g} s, {control.smallest:g} to {control.step:g} s, "
                 f"tolerance {time.tolerance:g}; {written}"
             )
-    console = Console(width=None if Console().is_terminal else 100, highlight=False, soft_wrap=True)
+    width = None if Console().is_terminal else 100
+    # titles and paths are text: what looks like rich's markup in them is not
+    console = Console(width=width, highlight=False, soft_wrap=True, markup=False, emoji=False)
     plan = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in (
-        ("scene", f"{path}" + (f" ({scene.title})" if scene.title else "")),
+        ("scene", one_line(f"{path}" + (f" ({scene.title})" if scene.title else ""))),
         ("mesh", f"{outline.n_vertices} vertices, {outline.n_triangles} triangles"),
         ("mean edge", f"{outline.spacing:.4g} m"),
         ("active terms", ", ".join(outline.terms)),
@@ -96,6 +99,11 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     console.print(f"load imbalance {owned.max() / owned.mean():.3f} (most owned vertices over mean)")
     for note in simulation.notes:
         console.print(f"note: {note}")
+
+
+def _count(ratio: float) -> float:
+    """Steps of which ``ratio`` make up the run; inf beyond all counting."""
+    return math.ceil(ratio - 1e-9) if math.isfinite(ratio) else ratio
 
 
 def _rank_table(ranks: Counts) -> Table:

@@ -6,6 +6,7 @@ import math
 import sys
 import time as wall
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
@@ -98,10 +99,11 @@ class Progress:
         since = math.inf if self._last_shown is None else now - self._last_shown
         if self._bar is not None:
             # in `state`, so that nothing of it is taken for markup
-            self._bar.update(self._task, completed=fraction, state=f"{state}  {duration(left)} left")
-            if since >= REDRAW_SECONDS or fraction >= 1.0:
-                self._bar.refresh()
-                self._last_shown = now
+            with suppress(OSError):
+                self._bar.update(self._task, completed=fraction, state=f"{state}  {duration(left)} left")
+                if since >= REDRAW_SECONDS or fraction >= 1.0:
+                    self._last_shown = now
+                    self._bar.refresh()
             return
         self._latest = f"{fraction:4.0%}  {state}  {duration(left)} left"
         far = fraction - self._fraction_shown >= LINE_FRACTION - 1e-9
@@ -113,16 +115,18 @@ class Progress:
         """A line for the user, above the bar."""
         if not self._shown:
             return
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        else:
-            print(text, file=self._stream, flush=True)
+        with suppress(OSError):  # a run goes on when nobody reads what it says, or cannot
+            if self._bar is not None:
+                self._bar.console.print(text, markup=False, highlight=False)
+            else:
+                print(text, file=self._stream, flush=True)
 
     def close(self) -> None:
         """Show the last step and leave the terminal as it was."""
         if self._bar is not None:
-            self._bar.refresh()
-            self._bar.stop()
+            with suppress(OSError):
+                self._bar.refresh()
+                self._bar.stop()
             self._bar = None
         self._line()
 
@@ -136,7 +140,8 @@ class Progress:
 
     def _line(self) -> None:
         if self._latest is not None:
-            print(self._latest, file=self._stream, flush=True)
+            with suppress(OSError):
+                print(self._latest, file=self._stream, flush=True)
             self._latest = None
 
 
@@ -163,9 +168,12 @@ def closing_table(
     stream : text stream
         stdout unless given.
     """
-    if comm.rank > 0:
-        return
-    stream = stream or sys.stdout
+    if comm.rank == 0:
+        with suppress(OSError):
+            _print_closing(phases, folder, outcome, stream or sys.stdout)
+
+
+def _print_closing(phases: Mapping[str, float], folder: Path | str, outcome: str, stream: TextIO) -> None:
     total = sum(phases.values())
     rows = [
         (name, f"{seconds:.2f} s", f"{seconds / total:.0%}" if total > 0 else "")

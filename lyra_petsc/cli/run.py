@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from petsc4py import PETSc
 
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.errors import Interrupted, LyraError, SolverError
-from lyra_petsc.output.folder import choose, create
+from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
+from lyra_petsc.output.claim import Claim
+from lyra_petsc.output.folder import choose
 from lyra_petsc.output.phases import Phases
-from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.default import default_scene
@@ -61,29 +63,47 @@ def run(
     stem = path.stem
     choice = choose(comm, stem, out, force=force, resume=resume)
     scene = read_scene(comm, path, settings)
-    simulation = Simulation(comm, scene, phases)
-    recorder = Recorder(simulation)
-    folder = create(comm, choice)
-    with phases("output"):
-        if choice.resume:
-            recorder.resume(folder)
-        else:
-            recorder.begin(folder)
-    simulation.model.release()
-    journey = _Journey(comm, simulation, recorder, folder)
-    journey.go(stop)
-    simulation.destroy()
+    with Claim(comm, choice) as claim:  # before the set-up, which may take long
+        simulation = Simulation(comm, scene, phases)
+        recorder = Recorder(simulation)
+        if claim.note:
+            simulation.notes.append(claim.note)
+        _leave_set_up(stop)
+        with phases("output"):
+            claim.clear()
+            if choice.resume:
+                recorder.resume(claim.path)
+            else:
+                recorder.begin(claim.path)
+        simulation.model.release()
+        journey = _Journey(comm, simulation, recorder, claim.path, resumed=choice.resume)
+        journey.go(stop)
+        simulation.destroy()
+
+
+def _leave_set_up(stop: StopRequest) -> None:
+    number = stop.signal_number()
+    if number:
+        raise Interrupted(
+            f"stopped by {signal.Signals(number).name} during the set-up; nothing was written", number
+        )
 
 
 class _Journey:
     """The loop over the steps with its progress, summary and ways of ending."""
 
-    def __init__(self, comm: MPI.Comm, simulation: Simulation, recorder: Recorder, folder: Path) -> None:
+    def __init__(
+        self, comm: MPI.Comm, simulation: Simulation, recorder: Recorder, folder: Path, *, resumed: bool
+    ) -> None:
         self._comm, self._simulation, self._recorder, self._folder = comm, simulation, recorder, folder
         self._totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
         self._versions = versions()
         self._told = 0
         self._first_step = simulation.step_number
+        self._resumed: list[dict[str, Any]] = []
+        if resumed:
+            earlier = on_root(comm, lambda: read_summary(folder / "summary.json")) or {}
+            self._resumed = [*earlier.get("resumed", []), self._resumption()]
 
     def go(self, stop: StopRequest) -> None:
         simulation, recorder = self._simulation, self._recorder
@@ -114,15 +134,15 @@ class _Journey:
                     )
                     self._obey(stop)
         except SolverError as error:
-            outcome = str(error)
             if error.collective:
-                recorder.write_state()
-                recorder.write_checkpoint()
-                self._summarise(outcome)
+                error.details += self._keep(str(error))
             raise
         except LyraError as error:
-            outcome = str(error)
-            self._summarise(outcome)
+            # the first thing that went wrong is what counts: on a full disk this fails as well
+            with suppress(OutputError):
+                self._summarise(str(error))
+            if isinstance(error, OutputError):
+                error.details += self._remedy()
             raise
         finally:
             recorder.close()
@@ -130,6 +150,36 @@ class _Journey:
         simulation.stepper.ts.viewFromOptions("-ts_view")
         closing_table(self._comm, simulation.phases.seconds(), self._folder, outcome)
         self._warn_of_unused()
+
+    def _resumption(self) -> dict[str, Any]:
+        """Where this run takes over, and what is different from then on."""
+        changes = [{"key": c.key, "old": c.old, "new": c.new} for c in self._recorder.changes]
+        simulation = self._simulation
+        return {
+            "step": simulation.step_number,
+            "time": simulation.time,
+            "ranks": self._comm.size,
+            "changes": changes,
+        }
+
+    def _remedy(self) -> tuple[str, ...]:
+        """What to do when a file cannot be written."""
+        if not self._folder.is_dir():
+            return (f"the folder {self._folder} is gone; nothing can be resumed",)
+        return ("what was announced before stands; once it can be written again, --resume goes on",)
+
+    def _keep(self, outcome: str) -> tuple[str, ...]:
+        """Write the last good state and the step that failed; where it can be looked at."""
+        try:
+            self._recorder.write_state()
+            self._recorder.write_checkpoint()
+            self._summarise(outcome)
+            if self._simulation.failure is None:
+                return ()
+            self._recorder.write_failure()
+        except OutputError as error:
+            return (str(error),)
+        return (f"look at {self._folder / 'failure.xdmf'} (ParaView) and {self._folder / 'failure.txt'}",)
 
     def _obey(self, stop: StopRequest) -> None:
         number = stop.signal_number()
@@ -168,8 +218,10 @@ class _Journey:
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
             **self._totals,
+            "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
             "notes": simulation.notes,
+            **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)
 

@@ -1,13 +1,39 @@
-"""SIGINT, SIGTERM and SIGUSR1 ask a run to finish its step, write a checkpoint and leave."""
+"""What becomes of signals: a run finishes its step and writes a checkpoint; before that, nothing is left."""
 
 from __future__ import annotations
 
+import os
 import signal
 from types import FrameType
+from typing import TYPE_CHECKING
 
-from mpi4py import MPI
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
-WATCHED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+ASKED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+LOST = signal.SIGHUP
+"""The terminal is gone; under nohup it is ignored, and stays so."""
+
+
+def watched() -> tuple[signal.Signals, ...]:
+    """The signals that ask a run to stop."""
+    return ASKED if signal.getsignal(LOST) == signal.SIG_IGN else (*ASKED, LOST)
+
+
+def leave_at_once() -> None:
+    """Until a run watches them, let these signals end the process without words."""
+    for number in watched():
+        signal.signal(number, _leave)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os._exit(130 if number == signal.SIGINT else 143)
+
+
+def take_back_from_petsc() -> None:
+    """Put back what PETSc's start replaces: a reader of our output that goes away must not end a run."""
+    for number in (signal.SIGPIPE, LOST):
+        signal.signal(number, signal.getsignal(number))
 
 
 class StopRequest:
@@ -16,7 +42,7 @@ class StopRequest:
     def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
         self._seen = 0
-        for number in WATCHED:
+        for number in watched():
             signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
@@ -26,4 +52,6 @@ class StopRequest:
 
     def signal_number(self) -> int:
         """The signal that any rank has got, else 0; collective."""
+        from mpi4py import MPI
+
         return int(self._comm.allreduce(self._seen, MPI.MAX))

@@ -5,13 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.handles.motion import Motion, Window, motion_of
+from lyra_petsc.meshing.capacity import available_memory
 from lyra_petsc.meshing.mesh import Mesh
 from lyra_petsc.meshing.select import select_vertices
 from lyra_petsc.scene.schema import Handle, Scene
 
 Array = NDArray[np.float64]
 Selection = dict[int, NDArray[np.int64]]
+
+BYTES_PER_HELD_VERTEX = 100
+"""Memory [B] of a vertex in a handle, while it is distributed and then held."""
 
 
 def is_exact(handle: Handle) -> bool:
@@ -21,11 +26,22 @@ def is_exact(handle: Handle) -> bool:
 
 def select_held(scene: Scene, mesh: Mesh) -> Selection:
     """Vertices of every exact handle of a scene, by its number, on the whole mesh (rank 0)."""
-    return {
-        number: select_vertices(mesh, handle, key=f"handles[{number}]", file=scene.source)
-        for number, handle in enumerate(scene.handles)
-        if is_exact(handle)
-    }
+    selection: Selection = {}
+    memory, held = available_memory(), 0
+    for number, handle in enumerate(scene.handles):
+        if not is_exact(handle):
+            continue
+        key = f"handles[{number}]"
+        selection[number] = select_vertices(mesh, handle, key=key, file=scene.source)
+        held += len(selection[number])
+        if held * BYTES_PER_HELD_VERTEX > memory:
+            raise InputError(
+                f"the handles up to this one hold {held} vertices in all, more than fit into "
+                f"{memory / 2**30:.3g} GiB of memory; let fewer handles hold the same vertices",
+                file=scene.source,
+                key=key,
+            )
+    return selection
 
 
 class Held:
@@ -80,6 +96,11 @@ class Held:
         for number in self.active(t0, t1):
             rate = self._motions[number].velocity(self._start[number], self._windows[number].start, at)
             out[np.ix_(self._vertices[number], self._axes[number])] = rate[:, self._axes[number]]
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the exact handles in the scene."""
+        return list(self._vertices)
 
     def vertices(self, number: int) -> NDArray[np.int64]:
         """Owned vertices of a handle, local numbering."""

@@ -19,6 +19,7 @@ def _quaternion(keyframe: Keyframe) -> Array:
     if keyframe.rotate is None:
         return np.array([1.0, 0.0, 0.0, 0.0])
     axis = np.asarray(keyframe.rotate.axis, dtype=np.float64)
+    axis = axis / np.abs(axis).max()  # whose square may not be a number
     half = 0.5 * math.radians(keyframe.rotate.degrees)
     return np.concatenate([[math.cos(half)], math.sin(half) * axis / np.linalg.norm(axis)])
 

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.meshing.capacity import check_capacity
 from lyra_petsc.meshing.files import culprits
-from lyra_petsc.meshing.grids import GridSource, grid_sheet
+from lyra_petsc.meshing.grids import GridSource, grid_sheet, grid_vertices
 from lyra_petsc.meshing.groups import GroupTable
 from lyra_petsc.meshing.layout import lay_out
-from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.meshing.mesh import Mesh, Source
 from lyra_petsc.meshing.orientation import NotOrientableError, reversed_triangles
 from lyra_petsc.meshing.sheet import Sheet
 from lyra_petsc.meshing.transform import Transform, moved, scaled
@@ -77,12 +78,16 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
     pieces: list[_Piece] = []
     notes: list[str] = []
     names: set[str] = set()
+    listed: list[Source] = []
+    tags: list[NDArray[np.int64]] = []
     n_vertices = n_triangles = 0
     for number, source in enumerate(sources):
         key = "mesh" if len(sources) == 1 else f"mesh[{number}]"
         if source.name is not None and source.name in names:
             raise InputError(f"'{source.name}' names an earlier source too", file=file, key=f"{key}.name")
         names |= {source.name} if source.name is not None else set()
+        if source.grid is not None:
+            check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
             sheet = _read(source, key, file)
             piece = _prepare(sheet, source, key, file)
@@ -92,11 +97,15 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
         notes += [f"{label}: {note}" for note in sheet.notes]
         groups.add(sheet.groups, source.name, len(piece.triangles), n_vertices, n_triangles)
         pieces.append(piece)
+        listed.append(Source(label, len(piece.positions), len(piece.triangles)))
+        tags.append(np.zeros(len(piece.positions), np.int64) if sheet.tags is None else sheet.tags)
         n_vertices += len(piece.positions)
         n_triangles += len(piece.triangles)
     mesh = _join(pieces)
     mesh.groups, group_notes = groups.finish(mesh.triangles)
     mesh.notes = notes + group_notes
+    mesh.sources = listed
+    mesh.tags = np.concatenate(tags) if any(each.any() for each in tags) else None
     return mesh
 
 

@@ -38,3 +38,8 @@ def culprits(indices: Iterable[object], limit: int = 5) -> str:
     shown = ", ".join(str(index) for index in everything[:limit])
     more = f" and {len(everything) - limit} more" if len(everything) > limit else ""
     return shown + more
+
+
+def printable(name: str) -> str:
+    """``name`` without what a terminal or HDF5 would choke on (control and null characters)."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)

@@ -1,25 +1,38 @@
-"""gmsh scripts (.geo), meshed by gmsh on the calling process."""
+"""gmsh scripts (.geo), meshed by gmsh in a process of its own."""
 
 from __future__ import annotations
 
+import json
+import os
 import signal
+import subprocess
+import sys
 import tempfile
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.meshing.files import read_bytes
+from lyra_petsc.meshing.capacity import BYTES_PER_VERTEX, available_memory
+from lyra_petsc.meshing.geo_script import check_script
 from lyra_petsc.meshing.msh import read_msh
 from lyra_petsc.meshing.sheet import Sheet
+from lyra_petsc.scene.values import one_line
 
 # beyond this ratio of the mean edge to the size asked for, the script has had its own way
 _SIZE_RATIO = 1.6
+
+SCRIPT_SECONDS = 60
+"""CPU time a script may take until gmsh begins to mesh: one that loops for ever ends here."""
+
+MESH_SECONDS = 3600
+"""CPU time gmsh may take to mesh."""
+
+_WAIT = 4.0
+"""Times the CPU time allowed that we wait for gmsh, on a machine with other work to do."""
+
+# variables by which an MPI in gmsh's process would take itself for one of our ranks
+_MPI_VARIABLES = ("OMPI_", "PMIX_", "PMI_", "HYDRA_", "MPI_", "SLURM_")
 
 
 def mesh_geo(
@@ -40,30 +53,25 @@ def mesh_geo(
     Raises
     ------
     InputError
-        If gmsh is missing, cannot read the script or cannot mesh it, or there are no triangles.
+        If gmsh is missing, cannot read the script or cannot mesh it, or there are no triangles; if the
+        script does what a mesh script need not (see `check_script`), or asks for more time or memory
+        than there is.
     """
-    read_bytes(path)
     if size is not None and not (np.isfinite(size) and size > 0):
         raise InputError(
             f"{size} is no element size; give a positive number [m]", key=f"{key}.size", file=file
         )
+    script = check_script(path)
     with tempfile.TemporaryDirectory() as folder:
         meshed = Path(folder) / "surface.msh"
-        with _session() as gmsh:
-            try:
-                _generate(gmsh, path, size)
-                # written and read back: one way from gmsh's blocks to vertices, triangles and groups
-                gmsh.write(str(meshed))
-            except InputError:
-                raise
-            except Exception as error:  # gmsh raises nothing more precise
-                raise InputError(
-                    f"gmsh: {_complaint(gmsh, path) or ' '.join(str(error).split())}", file=path
-                ) from None
+        _run_gmsh(path, size, meshed)
         try:
             sheet = read_msh(meshed, note_loose=False)  # construction points of the script
+            sheet.tags = None  # those of a file that nobody sees
         except InputError as error:
             raise InputError(error.message, file=path) from None
+    if script.further:
+        sheet.notes.append(f"the script includes {', '.join(script.further)}")
     if size is not None:
         corners = sheet.points[sheet.triangles]
         mean = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
@@ -75,82 +83,64 @@ def mesh_geo(
     return sheet
 
 
-def _generate(gmsh: ModuleType, path: Path, size: float | None) -> None:
-    gmsh.logger.start()
-    _set_size(gmsh, size)
-    gmsh.merge(str(path))  # not open, which clears the models of a session that is not ours
-    if complaint := _complaint(gmsh, path):
-        raise InputError(f"gmsh: {complaint}", file=path)
-    _set_size(gmsh, size)  # the script may have set its own
-    has_mesh = any(len(tags) for tags in gmsh.model.mesh.getElements(2)[1])
-    if not has_mesh or size is not None:
-        if has_mesh:
-            gmsh.model.mesh.clear()
-        gmsh.model.mesh.generate(2)
-        if complaint := _complaint(gmsh, path):
-            raise InputError(f"gmsh: {complaint}", file=path)
-    for option, value in {"SaveAll": 1, "MshFileVersion": 4.1, "Binary": 1, "SaveParametric": 0}.items():
-        gmsh.option.setNumber(f"Mesh.{option}", value)
-
-
-def _set_size(gmsh: ModuleType, size: float | None) -> None:
-    if size is None:
-        return
-    for option, value in {"MeshSizeFactor": 1.0, "MeshSizeMin": size, "MeshSizeMax": size}.items():
-        gmsh.option.setNumber(f"Mesh.{option}", value)
-
-
-def _complaint(gmsh: ModuleType, path: Path) -> str:
-    """First error gmsh logged, in one line, without the path of the script itself."""
+def _run_gmsh(path: Path, size: float | None, meshed: Path) -> None:
+    """Have the script meshed into ``meshed`` by another process; its failures are ours."""
+    memory = available_memory()
+    job = {
+        "script": str(path.absolute()),
+        "size": size,
+        "mesh": str(meshed),
+        "script_seconds": SCRIPT_SECONDS,
+        "mesh_seconds": MESH_SECONDS,
+        "memory": memory,
+        "most_triangles": 2 * memory // BYTES_PER_VERTEX,
+    }
+    folder = meshed.parent
+    job_file, outcome_file = folder / "job.json", folder / "outcome.json"
+    job_file.write_text(json.dumps(job))
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(_MPI_VARIABLES)}
+    environment["PYTHONPATH"] = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lyra_petsc.meshing.gmsh_process", str(job_file)],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for the run, which ends us in its own time
+    )
     try:
-        lines = gmsh.logger.get()
-    except UnicodeDecodeError:  # an error message that quotes the script
-        return "the script has an error, in text that is not UTF-8"
-    for line in lines:
-        if line.startswith("Error"):
-            words = " ".join(line.split(":", 1)[1].split())
-            return words.replace(f"'{path}', ", "").removesuffix(" ()")
-    return ""
-
-
-@contextmanager
-def _session() -> Iterator[ModuleType]:
-    """gmsh, quiet, with the user's gmsh configuration ignored; signal handlers are left as they were."""
-    handlers = _signal_handlers()  # before the import: gmsh 4.8 resets SIGINT there
-    try:
-        import gmsh
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f".geo files need gmsh ({error}); install it (apt install python3-gmsh or pip install gmsh) "
-            "or give a .msh file"
-        ) from None
-    try:
-        # someone else's session in this process goes on after ours (isInitialized came after gmsh 4.8)
-        shared = bool(getattr(gmsh, "isInitialized", lambda: False)())
-        if not shared:
-            gmsh.initialize(readConfigFiles=False)
-        theirs = gmsh.model.getCurrent()
-        gmsh.model.add("lyra_petsc")
-    except Exception as error:  # its Python module and its library may be of different versions
-        raise InputError(f"gmsh does not start ({error}); .geo files need a working gmsh") from None
-    try:
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.option.setNumber("General.Verbosity", 1)  # errors only
-        gmsh.option.setNumber("General.AbortOnError", 0)
-        yield gmsh
+        _, errors = process.communicate(timeout=_WAIT * (SCRIPT_SECONDS + MESH_SECONDS))
+    except subprocess.TimeoutExpired:
+        errors = b""
     finally:
-        gmsh.logger.stop()
-        if shared:
-            gmsh.model.remove()
-            gmsh.model.setCurrent(theirs)
-        else:
-            gmsh.finalize()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+    try:
+        outcome: dict[str, str] = json.loads(outcome_file.read_text())
+    except (OSError, ValueError):
+        outcome = {}
+    if "refused" in outcome:
+        raise InputError(one_line(outcome["refused"]), file=path)
+    if outcome.get("stage") != "done" or process.returncode != 0:
+        words = _ending(outcome.get("stage", ""), process.returncode, errors, memory)
+        raise InputError(words, file=path)
 
 
-def _signal_handlers() -> dict[signal.Signals, Any]:
-    if threading.current_thread() is not threading.main_thread():
-        return {}  # only the main thread may set them
-    watched = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-    return {number: handler for number in watched if (handler := signal.getsignal(number)) is not None}
+def _ending(stage: str, code: int, errors: bytes, memory: int) -> str:
+    """Why gmsh did not come to its end, in words."""
+    doing = "meshing" if stage == "mesh" else "reading the script"
+    if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
+        return (
+            f"gmsh needs more than the {memory / 2**30:.3g} GiB there are, {doing}: "
+            "is a mesh size too small, or a loop too long?"
+        )
+    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+        seconds = MESH_SECONDS if stage == "mesh" else SCRIPT_SECONDS
+        what = "are its mesh sizes too small?" if stage == "mesh" else "does it loop for ever?"
+        return f"gmsh did not finish {doing} in {seconds} s of CPU time; {what}"
+    if code < 0:
+        return f"gmsh broke down ({signal.Signals(-code).name}) {doing}"
+    last = one_line(errors.decode("utf-8", errors="replace")[-200:])
+    return f"gmsh ended early ({code}) {doing}{': ' + last if last else ''}"

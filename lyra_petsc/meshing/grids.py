@@ -11,7 +11,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.sheet import NamedSet, Sheet
 
 PATTERNS = ("diagonal", "alternating", "criss-cross")
-MAX_CELLS = 200_000_000
 
 
 class GridSource(Protocol):
@@ -56,8 +55,6 @@ def grid_sheet(grid: GridSource, *, key: str = "mesh.grid", file: object | None 
             f"unknown pattern '{grid.pattern}'; one of {', '.join(PATTERNS)}", key=f"{key}.pattern", file=file
         )
     nx, ny = int(grid.nx), int(grid.ny)
-    if nx * ny > MAX_CELLS:
-        raise InputError(f"{nx} × {ny} cells; at most {MAX_CELLS} in all", key=key, file=file)
     points = _lattice(nx, ny, grid.width, grid.height)
     low_left = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)[None, :]).reshape(-1)
     cell = np.stack([low_left, low_left + 1, low_left + nx + 2, low_left + nx + 1], axis=1)
@@ -77,6 +74,12 @@ def grid_sheet(grid: GridSource, *, key: str = "mesh.grid", file: object | None 
         )
     triangles = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.int64)
     return Sheet(points, triangles, groups=_grid_groups(nx, ny, len(triangles)))
+
+
+def grid_vertices(grid: GridSource) -> int:
+    """Number of vertices of a grid."""
+    nx, ny = int(grid.nx), int(grid.ny)
+    return (nx + 1) * (ny + 1) + (nx * ny if grid.pattern == "criss-cross" else 0)
 
 
 def _lattice(nx: int, ny: int, width: float, height: float) -> NDArray[np.float64]:

@@ -30,6 +30,15 @@ class Group:
     edges: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class Source:
+    """One source of a mesh: its name or file, and how much of the mesh is its."""
+
+    label: str
+    n_vertices: int
+    n_triangles: int
+
+
 @dataclass
 class Mesh:
     """Triangle mesh of all sheets of a scene.
@@ -58,6 +67,10 @@ class Mesh:
         True if some vertex has more than one material coordinate (``corner_uv`` is needed).
     has_uv : bool
         True if any sheet came with ``vt``.
+    sources : list of Source
+        In the order of the numbering.
+    tags : (V,) int64 or None
+        Node tags of .msh files, 0 elsewhere; None where they only count the vertices.
     """
 
     positions: NDArray[np.float64]
@@ -69,6 +82,8 @@ class Mesh:
     notes: list[str] = field(default_factory=list)
     has_seams: bool = False
     has_uv: bool = False
+    sources: list[Source] = field(default_factory=list)
+    tags: NDArray[np.int64] | None = None
 
     @property
     def n_vertices(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.meshing.files import read_bytes
+from lyra_petsc.meshing.files import printable, read_bytes
 from lyra_petsc.meshing.msh_elements import Block, blocks_2, blocks_2_binary, blocks_4
 from lyra_petsc.meshing.msh_surface import NoTrianglesError, assemble
 from lyra_petsc.meshing.msh_values import BinaryValues, MshError, TextValues, Values, one, several
@@ -179,5 +179,5 @@ def _entities(content: _File) -> dict[tuple[int, int], list[int]]:
 
 
 def _names(content: _File) -> dict[tuple[int, int], str]:
-    text = content.sections.get("PhysicalNames", b"").decode("utf-8", errors="replace")
-    return {(int(dim), abs(int(tag))): name for dim, tag, name in _NAME.findall(text.replace("\r", ""))}
+    text = content.sections.get("PhysicalNames", b"").decode("utf-8", errors="replace").replace("\r", "")
+    return {(int(dim), abs(int(tag))): printable(name) for dim, tag, name in _NAME.findall(text)}

@@ -67,7 +67,11 @@ def assemble(
     }
     if empty:
         notes.append(f"physical groups without elements on the triangles left out: {culprits(sorted(empty))}")
-    return Sheet(points[used], new_number[triangles], groups=groups, notes=notes)
+    kept = tags[used]
+    counted = np.array_equal(kept, np.arange(1, len(kept) + 1))
+    return Sheet(
+        points[used], new_number[triangles], groups=groups, notes=notes, tags=None if counted else kept
+    )
 
 
 def _numbered(blocks: list[Block], tags: Ints) -> list[Block]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.meshing.files import culprits, read_bytes
+from lyra_petsc.meshing.files import culprits, printable, read_bytes
 from lyra_petsc.meshing.polygons import split_polygon, split_quads
 from lyra_petsc.meshing.sheet import NamedSet, Sheet
 
@@ -37,6 +37,10 @@ _IGNORED = frozenset(
     + ("cstype", "deg", "bmat", "step", "curv", "curv2", "surf", "parm", "trim", "hole", "scrv", "sp", "end")
     + ("con", "mg", "shadow_obj", "trace_obj", "ctech", "stech")
 )
+
+
+MOST_CORNERS = 256
+"""Corners of a polygon that is split: the work grows with their square."""
 
 
 @dataclass
@@ -124,13 +128,13 @@ def _parse(text: str, path: Path) -> _Raw:
             elif word == "vt":
                 raw.uv.extend((float(parts[1]), float(parts[2]) if len(parts) > 2 else 0.0))
             elif word == "g":
-                close("g", parts[1:])
+                close("g", [printable(name) for name in parts[1:]])
             elif word == "o":
-                close("o", [" ".join(parts[1:])] if len(parts) > 1 else [])
+                close("o", [printable(" ".join(parts[1:]))] if len(parts) > 1 else [])
             elif word not in _IGNORED:
-                raw.unknown[word[:20]] = number
+                raw.unknown[printable(word[:20])] = number
         except (ValueError, IndexError, OverflowError) as error:
-            shown = "".join(c if c.isprintable() else "?" for c in line.strip()[:60])
+            shown = printable(line.strip()[:60])
             reason = f" ({error})" if isinstance(error, _FaceError) else ""
             raise InputError(f"line {number}: '{shown}' cannot be read{reason}", file=path) from None
     close("g", [])
@@ -145,6 +149,8 @@ class _FaceError(ValueError):
 def _parse_face(raw: _Raw, parts: list[str], number: int) -> None:
     if len(parts) < 4:
         raise _FaceError("a face has at least three corners")
+    if len(parts) > MOST_CORNERS + 1:
+        raise _FaceError(f"{len(parts) - 1} corners, at most {MOST_CORNERS}; split it into triangles")
     for corner in parts[1:]:
         fields = corner.split("/")
         raw.corner_point.append(_position(int(fields[0]), len(raw.points) // 3, "vertex"))

@@ -40,6 +40,8 @@ class Sheet:
     groups : list of NamedSet
     notes : list of str
         What the reader dropped or split.
+    tags : (V,) int64 or None
+        Numbers that the file itself gives its vertices, where they are not 1, 2, 3, …
     """
 
     points: NDArray[np.float64]
@@ -47,3 +49,4 @@ class Sheet:
     uv: NDArray[np.float64] | None = None
     groups: list[NamedSet] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    tags: NDArray[np.int64] | None = None

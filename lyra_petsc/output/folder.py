@@ -1,4 +1,4 @@
-"""Which folder a run writes to: chosen before the set-up, created when the set-up succeeded."""
+"""Which folder a run writes to: chosen before anything is done."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mpi4py import MPI
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.checkpoint import checkpoint_files
+from lyra_petsc.output.lock import LOCK_FILE
 from lyra_petsc.parallel import on_root
 
 RUNS = Path("runs")
@@ -21,7 +22,7 @@ RUNS = Path("runs")
 # what a run writes, and nothing else: --force removes no other file
 RESULT = re.compile(
     r"(states-\d{4,}\.h5|mesh\.h5|checkpoint(-previous|-next)?\.h5|states\.xdmf"
-    r"|(history|probes|reactions)\.csv|scene\.yaml|summary\.json)(\.part)?"
+    r"|(history|probes|reactions)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
 )
 
 Result = TypeVar("Result")
@@ -83,17 +84,6 @@ def choose(
     return _shared(comm, lambda: _choose(scene_stem, out, force, resume))
 
 
-def create(comm: MPI.Comm, choice: RunFolder) -> Path:
-    """Create the folder chosen, or clear our old results out of it, and return its path.
-
-    Raises
-    ------
-    InputError
-        On every rank, if it cannot be created.
-    """
-    return _shared(comm, lambda: _create(choice))
-
-
 def _shared(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
     result = on_root(comm, work)
     assert result is not None
@@ -132,7 +122,7 @@ def _check(choice: RunFolder, key: str) -> None:
             raise InputError(
                 "holds no checkpoint to resume from; run without --resume", file=path, key="--resume"
             )
-    elif path.exists() and choice.given and not choice.force:
+    elif choice.given and not choice.force and path.exists() and os.listdir(path) != [LOCK_FILE]:
         raise InputError(
             "exists; name another folder, or give --resume to go on with its run or --force to replace it",
             file=path,
@@ -178,25 +168,3 @@ def _newest(stem: str) -> Path:
             f"no run of {stem} with a checkpoint under {RUNS}; run without --resume", key="--resume"
         )
     return max(ages)[1]
-
-
-def _create(choice: RunFolder) -> Path:
-    path = choice.path
-    try:
-        if choice.resume or (choice.force and path.is_dir()):
-            for entry in sorted(path.iterdir()):
-                match = RESULT.fullmatch(entry.name)
-                if match and (choice.force or entry.name.endswith(".part")):
-                    entry.unlink()
-            return path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            try:
-                path.mkdir()
-                return path
-            except FileExistsError:
-                if choice.given:
-                    raise
-                path = free_name(choice.first or choice.path)
-    except OSError as error:
-        raise InputError(f"cannot be created: {reason(error)}", file=path, key="--out") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -74,7 +75,9 @@ class History:
         self.columns = tuple(columns)
         self.comm = comm
         self._file: TextIO | None = None
+        self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
+        self.kept_until = comm.bcast(self.kept_until, root=0)
 
     def append(self, values: Mapping[str, float]) -> None:
         """Write one row and flush it.
@@ -87,9 +90,13 @@ class History:
         on_root(self.comm, lambda: self._append(values))
 
     def close(self) -> None:
-        """Close the file; nothing can be appended afterwards. Not collective."""
+        """Close the file; nothing can be appended afterwards. Not collective.
+
+        Every row is on its way when ``append`` returns: what a failed one left behind is dropped.
+        """
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()
             self._file = None
 
     def _open(self, resume_after: int | None) -> None:
@@ -119,27 +126,39 @@ class History:
 
     def _cut(self, last_step: int) -> None:
         """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""
+        check_columns(self.path, self.columns)
         kept = self.path.with_name(self.path.name + ".part")
         with (
             open(self.path, encoding="utf-8", errors="replace", newline="") as old,
             open(kept, "w", encoding="utf-8", newline="") as new,
         ):
-            header = next(csv.reader([old.readline()]), [])
-            if tuple(header) != self.columns:
-                kept.unlink()
-                raise InputError(
-                    f"has the columns {', '.join(header)}; this run writes {', '.join(self.columns)}: "
-                    "resume with the scene it was begun with",
-                    file=self.path,
-                )
-            csv.writer(new, lineterminator="\n").writerow(self.columns)
+            new.write(old.readline())
             for line in old:
                 if not line.endswith("\n") or not _is_row_until(line, last_step):
                     break
+                self.kept_until = int(line.split(",", 1)[0])
                 new.write(line)
             new.flush()
             os.fsync(new.fileno())
         os.replace(kept, self.path)
+
+
+def check_columns(path: Path, columns: Sequence[str]) -> None:
+    """Refuse to continue a table that has other columns; for one rank.
+
+    Raises
+    ------
+    InputError
+        Both sets of columns. A file that is missing or cannot be read is left to `History`.
+    """
+    with suppress(OSError), open(path, encoding="utf-8", errors="replace", newline="") as table:
+        header = next(csv.reader([table.readline()]), [])
+        if tuple(header) != tuple(columns):
+            raise InputError(
+                f"has the columns {', '.join(header)}; this run writes {', '.join(columns)}: "
+                "resume with the scene it was begun with",
+                file=path,
+            )
 
 
 def _is_row_until(line: str, last_step: int) -> bool:

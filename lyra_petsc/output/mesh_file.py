@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,19 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.errors import InputError
+from lyra_petsc.meshing.mesh import Group, Mesh
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.parallel import on_root
 
 MESH_FILE = "mesh.h5"
+
+ROUNDING = 1e-9
+"""Difference between coordinates over the size of the mesh that another machine's arithmetic may make."""
+
+PARTS = ("vertices", "edges", "triangles")
 
 
 def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm) -> None:
@@ -22,6 +31,9 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
 
     ``/mesh/triangles`` (F, 3) int64, ``/mesh/rest`` (V, 3) [m] and the material coordinates
     [m]: ``/mesh/uv`` (V, 2) where each vertex has one, else ``/mesh/corner_uv`` (F, 3, 2).
+    Beside them, for `check_same_mesh`: ``/start`` (V, 3), the start positions [m], and
+    ``/groups/<number>`` with an attribute ``name`` and its ``vertices`` (n,), ``edges`` (k, 2)
+    and ``triangles`` (m,) where it has any.
 
     Parameters
     ----------
@@ -41,10 +53,13 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     def work() -> None:
         if mesh is None:
             raise ValueError("rank 0 needs the mesh")
-        datasets: dict[str, NDArray[Any]] = {"mesh/triangles": mesh.triangles, "mesh/rest": mesh.rest}
-        uv = vertex_uv(mesh)
-        datasets["mesh/corner_uv" if uv is None else "mesh/uv"] = mesh.triangle_uv if uv is None else uv
-        write_collective(Path(folder) / MESH_FILE, datasets, {}, MPI.COMM_SELF)
+        datasets = _arrays(mesh)
+        names: dict[str, dict[str, int | float | str]] = {}
+        for number, (name, group) in enumerate(mesh.groups.items()):
+            names[f"groups/{number}"] = {"name": name}
+            parts = _parts(group)
+            datasets |= {f"groups/{number}/{part}": rows for part, rows in parts.items() if len(rows)}
+        write_collective(Path(folder) / MESH_FILE, datasets, names, MPI.COMM_SELF)
 
     on_root(comm, work)
 
@@ -54,3 +69,102 @@ def vertex_uv(mesh: Mesh) -> NDArray[np.float64] | None:
     uv = np.zeros((mesh.n_vertices, 2))
     uv[mesh.triangles] = mesh.triangle_uv
     return uv if np.array_equal(uv[mesh.triangles], mesh.triangle_uv) else None
+
+
+def check_same_mesh(
+    folder: str | os.PathLike[str], mesh: Mesh | None, groups: Iterable[str], comm: MPI.Comm
+) -> None:
+    """Refuse to go on with another mesh than the one that the run was begun with. Collective.
+
+    Parameters
+    ----------
+    folder : path
+        The run's folder, with its ``mesh.h5``.
+    mesh : Mesh or None
+        The scene's mesh; needed on rank 0 only.
+    groups : iterable of str
+        Names of the groups that the scene uses.
+    comm : MPI.Comm
+        All ranks.
+
+    Raises
+    ------
+    InputError
+        On every rank: what differs, or why ``mesh.h5`` cannot be read.
+    """
+    file = Path(folder) / MESH_FILE
+
+    def work() -> None:
+        if mesh is None:
+            raise ValueError("rank 0 needs the mesh")
+        try:
+            difference = _difference(file, mesh, set(groups))
+        except HDF5_ERRORS as error:
+            raise InputError(
+                f"cannot be read ({reason(error)}), so nothing shows that the mesh is still the same: "
+                "put it back, or run without --resume",
+                file=file,
+            ) from error
+        if difference:
+            raise InputError(
+                f"the scene's mesh is not the one that the run was begun with: {difference}; "
+                "give that one, or run without --resume into a new folder",
+                file=file,
+                key="mesh",
+            )
+
+    on_root(comm, work)
+
+
+def _arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
+    uv = vertex_uv(mesh)
+    material = {"mesh/corner_uv": mesh.triangle_uv} if uv is None else {"mesh/uv": uv}
+    return {
+        "mesh/triangles": mesh.triangles,
+        "mesh/rest": mesh.rest,
+        **material,
+        "start": mesh.positions,
+    }
+
+
+def _parts(group: Group) -> dict[str, NDArray[np.int64]]:
+    return {part: getattr(group, part) for part in PARTS}
+
+
+def _difference(file: Path, mesh: Mesh, used: set[str]) -> str:
+    """What sets a mesh apart from the one in the file, in words; empty if nothing does."""
+    ours = _arrays(mesh)
+    with import_h5py().File(file, "r") as stored:
+        counts = len(stored["mesh/rest"]), len(stored["mesh/triangles"])
+        if counts != (mesh.n_vertices, mesh.n_triangles):
+            ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
+            return f"it has {ours_too}, not {counts[0]} and {counts[1]}"
+        rows = np.flatnonzero((stored["mesh/triangles"][()] != mesh.triangles).any(axis=1))
+        if len(rows):
+            return f"triangle {rows[0]} has other vertices ({len(rows)} such triangles)"
+        slack = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
+        for name, words in (("mesh/rest", "at rest"), ("start", "at the start")):
+            if name in stored and (place := _apart(stored[name][()], ours[name], slack)):
+                return f"vertex {place[0]} stands {place[1]:.3g} m off {words}"
+        material = "mesh/uv" if "mesh/uv" in ours else "mesh/corner_uv"
+        if material not in stored or _apart(stored[material][()], ours[material], slack):
+            return "other material coordinates"
+        for group in stored.get("groups", {}).values():
+            name = group.attrs["name"]
+            if name in used and name in mesh.groups and not _same_group(group, mesh.groups[name]):
+                return f"group {name!r} has other members"
+    return ""
+
+
+def _apart(stored: NDArray[Any], ours: NDArray[Any], slack: float) -> tuple[int, float] | None:
+    """The row that differs most and by how much [m], if by more than ``slack``."""
+    distance = np.abs(stored - ours).reshape(len(ours), -1).max(axis=1)
+    row = int(np.argmax(distance))
+    return (row, float(distance[row])) if distance[row] > slack else None
+
+
+def _same_group(stored: Any, ours: Group) -> bool:
+    return all(
+        np.array_equal(stored[part][()] if part in stored else np.empty((0, *rows.shape[1:]), int), rows)
+        for part, rows in _parts(ours).items()
+    )

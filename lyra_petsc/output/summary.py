@@ -45,6 +45,16 @@ def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm
     on_root(comm, work)
 
 
+def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a summary holds; empty if there is none or it cannot be read. For one rank."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            content = json.load(file)
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def versions() -> dict[str, str]:
     """Names and versions of what takes part in a run; numba only if a term has loaded it."""
     import mpi4py

@@ -76,11 +76,11 @@ def convergence(
         x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
         slope = fitted_slope(x, y)
         words = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
-        axes.plot(x, y, marker=_marker(number), color=_colour(number), label=words, lw=1.6, ms=5)
+        axes.plot(x, y, marker=_marker(number), color=colour(number), label=words, lw=1.6, ms=5)
     _triangles(axes, series)
     _floor(axes, floor, floor_label)
     _finish(axes)
-    return _drawn(figure, name, caption)
+    return drawn(figure, name, caption)
 
 
 def work_precision(
@@ -123,14 +123,14 @@ def work_precision(
                 [max(0.0, line.high[i] - line.x[i]) for i in shown],
             ]
         axes.errorbar(
-            x, y, xerr=spread, marker=_marker(number), color=_colour(number), label=line.name,
+            x, y, xerr=spread, marker=_marker(number), color=colour(number), label=line.name,
             lw=1.4, ms=5, capsize=2, elinewidth=1.0,
         )  # fmt: skip
         for i in shown:
             if i < len(line.labels):
                 axes.annotate(
                     line.labels[i], (line.x[i], line.y[i]), xytext=(5, 4), textcoords="offset points",
-                    fontsize=7, color=_colour(number),
+                    fontsize=7, color=colour(number),
                 )  # fmt: skip
     best = sorted(point for point in front if _visible(point[0]) and _visible(point[1]))
     if best:
@@ -160,7 +160,7 @@ def work_precision(
         )  # fmt: skip
     _floor(axes, floor, floor_label)
     _finish(axes)
-    return _drawn(figure, name, caption)
+    return drawn(figure, name, caption)
 
 
 def fitted_slope(x: Sequence[float], y: Sequence[float]) -> float:
@@ -180,7 +180,8 @@ def _visible(value: float) -> bool:
     return math.isfinite(value) and value > 0.0
 
 
-def _colour(number: int) -> str:
+def colour(number: int) -> str:
+    """Of a figure's line of that number."""
     return COLOURS[number % len(COLOURS)]
 
 
@@ -249,7 +250,8 @@ def _finish(axes: Any) -> None:
         axes.legend(fontsize=8, framealpha=0.9, edgecolor="#d5d9de")
 
 
-def _drawn(figure: Any, name: str, caption: str) -> Drawing:
+def drawn(figure: Any, name: str, caption: str) -> Drawing:
+    """A matplotlib figure as PNG and SVG."""
     from matplotlib import rc_context
 
     png, svg = io.BytesIO(), io.BytesIO()

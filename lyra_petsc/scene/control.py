@@ -1,16 +1,15 @@
-"""Scene blocks that steer the run: time, output, solver, PETSc options."""
+"""Scene blocks that steer the run: time, output, solver."""
 
 from __future__ import annotations
 
-import re
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, PlainValidator, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.values import Count, Flag, Fraction, Positive, StepLength, number, problem, shown
+from lyra_petsc.scene.values import Count, Flag, Fraction, Positive, StepLength, problem, shown
 
 INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "alpha2", "bdf2")
 ANALYSES = ("dynamic", "static")
@@ -126,9 +125,12 @@ class Checkpoint(Block):
     ----------
     seconds : float [s]
         Wall time.
+    steps : int or None
+        Accepted steps; None: only by wall time.
     """
 
     seconds: Positive = 60.0
+    steps: Count | None = None
 
 
 class Output(Block):
@@ -183,28 +185,3 @@ class Solver(Block):
     step_tolerance: Positive = 1e-6
     max_iterations: Count = 50
     hessian: Literal["adaptive", "regularised", "exact"] = "adaptive"
-
-
-def _petsc_value(value: Any) -> Any:
-    if value is None or isinstance(value, (str, bool)):
-        return value
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return number(value)
-    raise problem(f"must be text, a number, true or false, not {shown(value)}")
-
-
-PetscValue = Annotated[str | int | float | bool | None, PlainValidator(_petsc_value)]
-
-
-def petsc_options(value: Any) -> Any:
-    """Check the option names of a ``petsc`` block."""
-    if not isinstance(value, dict):
-        raise problem(f"must be a block of options like {{ksp_type: cg}}, not {shown(value)}")
-    for key in value:
-        if not isinstance(key, str) or not re.fullmatch(r"[A-Za-z_]\w*", key, re.ASCII):
-            word = key if isinstance(key, str) else shown(key)
-            dash = " without the dash" if word.startswith("-") else ""
-            raise problem(f"is not an option name; write it as in ksp_type: cg{dash}", word)
-    return value

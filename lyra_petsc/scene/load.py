@@ -47,7 +47,7 @@ def load_scene(path: Path | str, overrides: Sequence[str] = ()) -> Scene:
     if not isinstance(data, dict):
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
     try:
-        data = unshared(data, file=path)
+        data = unshared(data)
         overridden = apply_overrides(data, overrides)
         scene = Scene.model_validate(data, context={"directory": path.absolute().parent})
     except ValidationError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -129,6 +130,9 @@ class ObjLabels:
 
     def _words(self, cloth: int) -> list[list[str]]:
         if cloth not in self._lines:
-            split = (line.split(maxsplit=2)[:2] for line in read_text(self.files[cloth]).splitlines())
+            split = (
+                line.split(maxsplit=2)[:2]
+                for line in read_text(self.files[cloth], largest=math.inf).splitlines()
+            )
             self._lines[cloth] = [words for words in split if words and words[0] in ("v", "nl", "vt")]
         return self._lines[cloth]

@@ -15,8 +15,6 @@ from lyra_petsc.scene.values import one_line
 # keys under which a single block may stand for a list of one
 ONE_OR_MANY = ("mesh", "material")
 
-MOST_ENTRIES = 2_000_000
-
 _PART = re.compile(r"([^.\[\]\s]+)((?:\[\d+\])*)")
 
 
@@ -39,28 +37,11 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> list[str]
     return [_apply(data, text) for text in overrides]
 
 
-def unshared(value: Any, *, file: object | None = None) -> Any:
-    """A copy in which no two places hold the same block (YAML anchors make such).
-
-    Raises
-    ------
-    InputError
-        More than `MOST_ENTRIES`, to which a few anchors within anchors grow.
-    """
-    left = MOST_ENTRIES
-
-    def copy(value: Any) -> Any:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            raise InputError(
-                f"holds more than {MOST_ENTRIES} entries once its anchors are expanded", file=file
-            )
-        if isinstance(value, dict):
-            return {key: copy(entry) for key, entry in value.items()}
-        return [copy(entry) for entry in value] if isinstance(value, list) else value
-
-    return copy(value)
+def unshared(value: Any) -> Any:
+    """A copy in which no two places hold the same block (YAML anchors make such)."""
+    if isinstance(value, dict):
+        return {key: unshared(entry) for key, entry in value.items()}
+    return [unshared(entry) for entry in value] if isinstance(value, list) else value
 
 
 def _apply(data: dict[str, Any], text: str) -> str:
@@ -112,7 +93,8 @@ def _step(
 ) -> Any:
     """One part of the path: descend, or set ``value`` if no ``rest`` follows; ``walked`` grows by it."""
     if isinstance(target, list):
-        if not part.isdecimal() or int(part) > len(target):
+        # Python converts no number of thousands of digits
+        if not part.isdecimal() or len(part) > 9 or int(part) > len(target):
             many = f"[0] to [{len(target)}]" if target else "[0]"
             raise InputError(f"{dotted(walked)} is a list; give an index, {many}", key=option)
         index = int(part)

@@ -15,8 +15,9 @@ from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.control import Output, PetscValue, Solver, Time, petsc_options
+from lyra_petsc.scene.control import Output, Solver, Time
 from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
+from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
 from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
 
@@ -39,6 +40,17 @@ __all__ = [
     "Vec3",
     "Wind",
 ]
+
+
+SMALLEST_STEP = 2.0**-52
+"""Step over the end of the run below which the time, a 64-bit number, would stand still."""
+
+
+def _too_small(step: float, end: float) -> str:
+    return (
+        f"is too small, {step:g}: times near {end:g} s are not told apart below {end * SMALLEST_STEP:.2g} s; "
+        "take a longer one or an earlier time.end"
+    )
 
 
 def _one_or_many(value: Any) -> Any:
@@ -117,6 +129,15 @@ class Scene(Block):
         return isinstance(other, Scene) and self.model_dump() == other.model_dump()
 
     __hash__ = None  # type: ignore[assignment]
+
+    @model_validator(mode="after")
+    def _time_advances(self) -> Self:
+        smallest = self.time.end * SMALLEST_STEP
+        if self.time.step != "auto" and self.time.step < smallest:
+            raise problem(_too_small(self.time.step, self.time.end), "time", "step")
+        if self.output.every is not None and self.output.every < smallest:
+            raise problem(_too_small(self.output.every, self.time.end), "output", "every")
+        return self
 
     @model_validator(mode="after")
     def _names_agree(self) -> Self:

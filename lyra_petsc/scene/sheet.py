@@ -12,7 +12,6 @@ from lyra_petsc.materials.tables import names
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.values import (
-    LARGEST_INDEX,
     Axis,
     Bending,
     Count,
@@ -78,13 +77,6 @@ class Grid(Block):
     nx: Count
     ny: Count
     pattern: Literal["diagonal", "alternating", "criss-cross"] = "diagonal"
-
-    @model_validator(mode="after")
-    def _countable(self) -> Self:
-        vertices = (self.nx + 1) * (self.ny + 1) + (self.nx * self.ny if self.pattern == "criss-cross" else 0)
-        if vertices > LARGEST_INDEX:
-            raise problem(f"has {vertices} vertices, more than {LARGEST_INDEX} can be numbered")
-        return self
 
 
 class MeshSource(Block):

@@ -5,20 +5,30 @@ from __future__ import annotations
 import io
 import json
 import math
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.values import one_line
 
+if TYPE_CHECKING:
+    from ruamel.yaml.nodes import Node
 
-def read_text(path: Path) -> str:
+LARGEST_SCENE = 32 * 2**20
+"""Bytes of a scene file; a list of some million vertices. Meshes have files of their own."""
+
+MOST_ENTRIES = 2_000_000
+"""Entries of a scene once its YAML anchors are expanded."""
+
+
+def read_text(path: Path, *, largest: float = LARGEST_SCENE) -> str:
     """The text of a file.
 
     Raises
     ------
     InputError
-        Missing, a directory, unreadable, not UTF-8, or empty.
+        Missing, a directory, unreadable, larger than ``largest`` bytes, not UTF-8, or empty.
     """
     try:
         if path.is_dir():
@@ -27,6 +37,9 @@ def read_text(path: Path) -> str:
             raise InputError("no such file", file=path)
         if not path.is_file():
             raise InputError("is not a regular file", file=path)
+        size = path.stat().st_size
+        if size > largest:
+            raise InputError(f"holds {size} bytes; at most {largest} are read", file=path)
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"is not UTF-8 text (byte {error.start})", file=path) from None
@@ -39,12 +52,20 @@ def read_text(path: Path) -> str:
 
 
 def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any:
-    """YAML 1.2 text as plain values; duplicate keys are refused."""
+    """YAML 1.2 text as plain values; duplicate keys are refused, and anchors that grow beyond memory."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    yaml = YAML(typ="safe", pure=True)
     try:
-        return YAML(typ="safe", pure=True).load(io.StringIO(text))
+        # nodes first: there a block that many anchors refer to stands once
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an anchor may be set anew
+            node = yaml.compose(io.StringIO(text))
+        if (entries := _entries(node, {})) > MOST_ENTRIES:
+            grown = f"holds more than {MOST_ENTRIES} entries once its anchors are expanded"
+            raise InputError("refers to itself" if entries == math.inf else grown, file=file, key=key)
+        return None if node is None else yaml.constructor.construct_document(node)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
@@ -54,6 +75,20 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
     except (YAMLError, ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
         # the reader lets such slip out for odd scalars (a 13th month, tags on the wrong kind of node)
         raise InputError(one_line(f"is not YAML: {error}"), file=file, key=key) from None
+
+
+def _entries(node: Node | None, known: dict[int, float]) -> float:
+    """Entries below a node, those behind an anchor counted wherever it is named; inf in a loop.
+
+    ``known`` holds the counts by the nodes' identities.
+    """
+    if node is None or isinstance(node.value, str):
+        return 1.0
+    if id(node) not in known:
+        known[id(node)] = math.inf  # what it is below itself
+        entries = [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
+        known[id(node)] = 1.0 + sum(_entries(entry, known) for entry in entries)
+    return known[id(node)]
 
 
 def parse_json(text: str, *, file: object | None) -> Any:

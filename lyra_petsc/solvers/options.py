@@ -8,9 +8,13 @@ database is never cleared.
 from __future__ import annotations
 
 import ctypes
+import re
 from collections.abc import Mapping
 
 from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.solvers.reasons import last_words
 
 Value = str | int | float | bool | None
 
@@ -35,8 +39,33 @@ def is_set(name: str) -> bool:
 
 
 def petsc_number(name: str, default: float) -> float:
-    """A number from the options database, or ``default``."""
-    return float(PETSc.Options().getReal(name, default))
+    """A number from the options database, or ``default``.
+
+    Raises
+    ------
+    InputError
+        If something else stands there.
+    """
+    value = PETSc.Options().getString(name, "")
+    if is_set(name) and not value:
+        raise InputError("needs a number after it", key=f"-{name}")
+    try:
+        return float(PETSc.Options().getReal(name, default))
+    except PETSc.Error:
+        raise InputError(f"must be a number, not '{value}'", key=f"-{name}") from None
+
+
+def refused(error: PETSc.Error) -> InputError:
+    """What PETSc has against an option."""
+    return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
+
+
+def culprits(error: PETSc.Error) -> str:
+    """The options that an error is about: those whose value it quotes, as it does not tell their names."""
+    told = re.split(r"[\s;:,]+", last_words(error))
+    options = PETSc.Options().getAll()
+    names = [f"-{name}" for name, value in options.items() if value and value.strip() in told]
+    return " or ".join(sorted(names)) or "PETSc options"
 
 
 def _text(value: Value) -> str:

@@ -1,4 +1,4 @@
-"""Why PETSc stopped, in words, and what to try."""
+"""Why PETSc stopped, in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from petsc4py import PETSc
 NOT_A_NUMBER = -4
 """SNES reason of a residual that is not a number; its name changed in PETSc 3.25."""
 
-_NOT_A_NUMBER = "the residual is not a number (a triangle collapsed?)"
+_NOT_A_NUMBER = "the residual is not a finite number"
 _SNES = {
     PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "Newton did not converge within its iterations",
     PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH: "the line search found no smaller energy",
@@ -50,13 +50,6 @@ def in_words(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
 def preconditioner_failed(ksp: PETSc.KSP) -> bool:
     """Whether another preconditioner might help."""
     return ksp.getConvergedReason() in _PRECONDITIONER
-
-
-def advice(snes: PETSc.SNES, ksp: PETSc.KSP) -> str:
-    """What a user may try after the smallest step has failed."""
-    if ksp.getConvergedReason() < 0:
-        return "try -pc_type lu (one rank) or -pc_type lu -pc_factor_mat_solver_type mumps, or -ksp_max_it"
-    return "try a smaller time.step, solver.max_iterations above 50, more damping, or a finer mesh"
 
 
 def last_words(error: PETSc.Error) -> str:

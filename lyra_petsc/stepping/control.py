@@ -97,11 +97,12 @@ class StepControl:
 
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold to go on alike."""
-        return {"factor": self.factor, "good": self.good}
+        return {"factor": self.factor, "good": self.good, "nominal": self.step}
 
     def restore(self, memory: Mapping[str, float]) -> None:
-        """Go on with a memory."""
-        self.factor, self.good = float(memory["factor"]), int(memory["good"])
+        """Go on with a memory; one of another nominal step has no say."""
+        if float(memory.get("nominal", self.step)) == self.step:
+            self.factor, self.good = float(memory["factor"]), int(memory["good"])
 
 
 class ToleranceControl(StepControl):
@@ -141,6 +142,14 @@ class ToleranceControl(StepControl):
 
     def succeeded(self, iterations: int) -> None:
         """The error alone decides."""
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory; one of another largest step says how long the last was."""
+        super().restore(memory)
+        nominal = float(memory.get("nominal", self.step))
+        if nominal != self.step:
+            planned = float(memory["factor"]) * nominal
+            self.factor = min(max(planned, self.smallest) / self.step, 1.0)
 
 
 class LoadControl(StepControl):

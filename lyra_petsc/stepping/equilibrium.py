@@ -21,6 +21,7 @@ from lyra_petsc.stepping.relaxation import Relaxation
 from lyra_petsc.stepping.schemes.static import Static
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.trace import Iteration, Stuck
 
 Array = NDArray[np.float64]
 
@@ -76,11 +77,13 @@ class Equilibrium:
         system.load_factor = factor
         newton = linear = solves = 0
         anchored, last, arrived = 0.0, np.inf, False
+        history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
         while solves < MOST_SOLVES:
             force = self._out_of_balance(before, factor, first=solves == 0)
             anchored = anchored if solves else system.anchored
+            history.append(_row(force, attempt if solves else None))
             if arrived and force <= self._allowed():
                 system.anchored = anchored
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
@@ -102,6 +105,7 @@ class Equilibrium:
                 break
             else:
                 self._scheme.pseudo *= SHRINK
+        stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
         return dataclasses.replace(
@@ -110,7 +114,30 @@ class Equilibrium:
             newton_iterations=newton,
             linear_iterations=linear,
             words=attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps",
-            advice=attempt.advice or "is the sheet held? Else try time.step smaller, or a damped motion",
+            stuck=stuck,
+        )
+
+    def _off_balance(self, before: float, factor: float, history: list[Iteration], x: Array) -> Stuck:
+        """Where so many proximal steps led that began at positions x."""
+        system, n = self._system, self._system.points.n_owned
+        system.begin_step(before, factor)
+        force, _ = system.out_of_balance()
+        goal = x.copy()
+        if system.held:
+            system.held.targets(before, factor, factor, goal)
+        return Stuck(
+            iterations=tuple(history),
+            norm=self._norm(force),
+            time=factor,
+            velocity=np.zeros_like(x),
+            position=system.x[:n].copy(),
+            residual=-force,
+            forces={"loads": -system.loads_now, "internal": system.loads_now - force},
+            prescribed=system.mask[:n].copy(),
+            goal=goal,
+            snes_reason=0,
+            ksp_reason=0,
+            linear_residuals=np.empty(0),
         )
 
     def _out_of_balance(self, before: float, factor: float, *, first: bool) -> float:
@@ -132,6 +159,11 @@ class Equilibrium:
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
+
+
+def _row(force: float, attempt: Attempt | None) -> Iteration:
+    """The out-of-balance force [N] after a proximal step, or before the first."""
+    return Iteration(force, attempt.linear_iterations if attempt else 0, 0, 1.0 if attempt else None)
 
 
 def growth(iterations: int) -> float:

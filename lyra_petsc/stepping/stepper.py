@@ -12,15 +12,17 @@ from petsc4py import PETSc
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.parallel import all_here
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
-from lyra_petsc.solvers.options import Value, fill_gaps, is_set
+from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.solvers.presets import candidates, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.trace import Stuck, Trace
 
 Array = NDArray[np.float64]
 
@@ -34,8 +36,8 @@ class Attempt:
     linear_iterations: int
     residual: float
     words: str = ""
-    advice: str = ""
     at_roundoff: bool = False
+    stuck: Stuck | None = None
 
 
 FIRST_OF_ALL = 1e-3
@@ -135,7 +137,9 @@ class Stepper:
             iterates=self._iterates,
         )
         ksp.setType(PETSc.KSP.Type.CG)
+        self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
+            snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(newton.objective)
             snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
@@ -150,9 +154,7 @@ class Stepper:
         try:
             ts.setFromOptions()
         except PETSc.Error as error:
-            raise InputError(
-                f"PETSc refuses the options: {reasons.last_words(error)}", key="PETSc options"
-            ) from None
+            raise refused(error) from None
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
@@ -229,18 +231,17 @@ class Stepper:
         self.ts.setTime(t0 + system.stage.after - theta * length)
         self.ts.setTimeStep(length)
         self._newton.begin_step()
+        self._trace.begin()
         try:
             self.ts.step()
         except PETSc.Error as error:
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
-                "the state before it is kept; check the PETSc options"
+                f"the state before it is kept; check {culprits(error)}",
+                collective=all_here(system.points.comm),
             ) from None
-        newton, linear = (
-            self.snes.getIterationNumber(),
-            self.snes.getLinearSolveIterations() + self._newton.more_linear,
-        )
-        words, advice = "the velocities are not finite", "try a smaller time.step"
+        newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
+        words = "the velocities are not finite"
         self._linear_failed = False
         if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
             velocity = self.velocity.getArray().reshape(self._shape).copy()
@@ -253,13 +254,17 @@ class Stepper:
                 self.ts.setTimeStep(t1 - t0)
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
         else:
-            words, advice = reasons.in_words(self.snes, self.ksp), reasons.advice(self.snes, self.ksp)
+            words = reasons.in_words(self.snes, self.ksp)
             self._linear_failed = reasons.preconditioner_failed(self.ksp)
+        stuck = self._trace.stuck()
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        return Attempt(False, newton, linear, self._newton.norm, words, advice)
+        return Attempt(False, newton, linear, self._newton.norm, words, stuck=stuck)
+
+    def _linear_iterations(self) -> int:
+        return int(self.snes.getLinearSolveIterations()) + self._newton.more_linear
 
     @property
     def blend(self) -> float:

@@ -106,42 +106,62 @@ class Launcher:
         replace_text(told, job.text())
         words = [*self._command, sys.executable, "-m", "lyra_petsc", "study", "--job", str(told)]
         try:
-            with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
-                code = self._wait([*words, *self._petsc], complaints.fileno(), folder, watch)
-                complaints.seek(0)
-                heard = complaints.read()
+            code, heard = run_launched(
+                [*words, *self._petsc], lambda: watch(_fraction(folder)), keep_open=(self._lock,)
+            )
+            watch(1.0)
         finally:
             told.unlink(missing_ok=True)
             (folder / PROGRESS_FILE).unlink(missing_ok=True)
         result = read_result(folder, job.fingerprint)
         if result is None:
-            result = Result(job.fingerprint, problem=_last_words(heard, code))
+            result = Result(job.fingerprint, problem=last_words(heard, code))
             folder.mkdir(parents=True, exist_ok=True)
             result.write(folder)
         return result
 
-    def _wait(self, words: list[str], complaints: int, folder: Path, watch: Callable[[float], None]) -> int:
+
+def run_launched(
+    words: Sequence[str], watch: Callable[[], None], keep_open: Sequence[int] = ()
+) -> tuple[int, str]:
+    """Run a launcher's command to its end; its exit code and what it said on stderr.
+
+    Parameters
+    ----------
+    words : sequence of str
+    watch : callable
+        Called again and again; where it raises, the process is ended.
+    keep_open : sequence of int
+        File descriptors that it inherits.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be started.
+    """
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
         try:
             process = subprocess.Popen(
                 words,
                 env=environment(),
                 stdin=subprocess.DEVNULL,
-                stderr=complaints,
+                stderr=complaints.fileno(),
                 start_new_session=True,
                 preexec_fn=_with_parent(),
-                pass_fds=(self._lock,),
+                pass_fds=tuple(keep_open),
             )
         except OSError as error:
             raise OutputError(f"{words[0]} cannot be started: {reason(error)}") from error
         try:
             while process.poll() is None:
                 time.sleep(POLL)
-                watch(_fraction(folder))
-            watch(1.0)
+                watch()
+            watch()
         except BaseException:
             _end(process)
             raise
-        return int(process.returncode)
+        complaints.seek(0)
+        return int(process.returncode), complaints.read()
 
 
 def _with_parent() -> Callable[[], None] | None:
@@ -183,7 +203,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _last_words(heard: str, code: int) -> str:
+def last_words(heard: str, code: int) -> str:
+    """What a launched process had to say in the end: our line, else its last, and the exit code."""
     ours = [line for line in heard.splitlines() if line.startswith("lyra-petsc: ")]
     if ours:
         return ours[0].removeprefix("lyra-petsc: ")

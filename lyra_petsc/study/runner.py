@@ -14,7 +14,7 @@ from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, S
 from lyra_petsc.meshing.build import build_mesh
 from lyra_petsc.output.checkpoint import checkpoint_files
 from lyra_petsc.output.phases import Phases
-from lyra_petsc.parallel import on_root
+from lyra_petsc.parallel import all_here, on_root
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation, StepReport
@@ -24,9 +24,6 @@ from lyra_petsc.study.folder import empty_case
 
 Watch = Callable[[float], None]
 """Called with the fraction of the case that is done, after every step, on all ranks; may raise."""
-
-PATIENCE = 5.0
-"""Seconds [s] that a failing rank waits for the others to fail alike."""
 
 
 def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
@@ -67,7 +64,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     except (Interrupted, OutputError):
         raise
     except (InputError, SolverError) as error:
-        if isinstance(error, SolverError) and not error.collective and not _all_here(comm):
+        if isinstance(error, SolverError) and not error.collective and not all_here(comm):
             raise
         result.problem = " ".join(str(error).split())
         result.timings = []
@@ -77,18 +74,6 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
 
 def _scheme(scene: Scene) -> str:
     return str(getattr(scene.time, "scheme", scene.time.integrator))
-
-
-def _all_here(comm: MPI.Comm) -> bool:
-    """Whether all ranks come here in time, each after its own failure."""
-    if comm.size == 1:
-        return True
-    request, deadline = comm.Ibarrier(), time.monotonic() + PATIENCE
-    while not request.Test():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 class _Run:

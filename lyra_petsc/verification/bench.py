@@ -1,4 +1,4 @@
-"""Where cases run their simulations: a direct linear solver, tight tolerances, counted steps."""
+"""Where cases run their simulations: counted steps; for exact answers a direct solver, tight tolerances."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lyra_petsc.errors import LyraError
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.messages import input_error
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.simulation import Simulation, StepReport
 from lyra_petsc.solvers.options import is_set
 from lyra_petsc.verification.case import Measured
 
@@ -58,11 +58,12 @@ class Trial:
         self.simulation = simulation
         self._start = self.x
 
-    def step(self) -> None:
+    def step(self) -> StepReport:
         """One accepted step; collective."""
         self._bench.watch()
-        self.simulation.step()
+        report = self.simulation.step()
         self._bench.steps += 1
+        return report
 
     def run(self) -> Trial:
         """Steps to the end of the scene; collective."""
@@ -141,6 +142,8 @@ class Bench:
     comm : MPI.Comm
     watch : callable, optional
         Called before every step on all ranks; may raise to end the work.
+    exact : bool
+        Fill a direct solver and tight tolerances in; without, scenes run as a user's do.
 
     Attributes
     ----------
@@ -150,8 +153,11 @@ class Bench:
         Accepted steps and wall seconds of the latest simulation, set-up included.
     """
 
-    def __init__(self, comm: MPI.Comm, watch: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self, comm: MPI.Comm, watch: Callable[[], None] | None = None, *, exact: bool = True
+    ) -> None:
         self.comm = comm
+        self._exact = exact
         self.watch = watch or (lambda: None)
         self.steps = 0
         self.latest = (0, 0.0)
@@ -173,7 +179,7 @@ class Bench:
 
         def write() -> str:
             if self._folder is None:
-                self._folder = TemporaryDirectory(prefix="lyra-verify-")
+                self._folder = TemporaryDirectory(prefix="lyra-cases-")
             self._files += 1
             path = Path(self._folder.name) / f"{self._files}.obj"
             lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
@@ -192,11 +198,13 @@ class Bench:
     def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
         """Set a scene up; freed, with the options it set, when the block ends; collective.
 
-        ``content`` is a scene as in a file. Filled in where it says nothing: a direct linear solver,
-        tight tolerances, no output times.
+        ``content`` is a scene as in a file. Filled in where it says nothing: no output times, and on an
+        exact bench a direct linear solver and tight tolerances.
         """
-        filled: dict[str, Any] = {"solver": TIGHT, "output": {"every": None}} | dict(content)
-        filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
+        filled: dict[str, Any] = {"output": {"every": None}} | dict(content)
+        if self._exact:
+            filled = {"solver": TIGHT} | filled
+            filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
         try:
             scene = Scene.model_validate(filled)
         except ValidationError as error:

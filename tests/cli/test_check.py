@@ -36,6 +36,19 @@ def test_plan(tmp_path: Path, ranks: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
 
 
+def test_titles_are_text_and_any_number_of_steps_is_told(tmp_path: Path) -> None:
+    (tmp_path / "plain.yaml").write_text(
+        'title: "[/red] :smile: \\e[31m"\n' + MEMBRANE.replace("0.01", "1e-15")
+    )
+    result = lyra(["check", "plain.yaml"], tmp_path)
+    assert result.code == 0, result.err
+    assert "[/red] :smile: \\x1b[31m" in result.out
+    assert "1000000000000000 of 1e-15 s to t = 1 s, 11 states" in result.out
+    result = lyra(["check", "plain.yaml", "--set", "petsc.ts_dt=1e-310"], tmp_path)
+    assert result.code == 0, result.err
+    assert "inf of 1e-310 s" in result.out
+
+
 def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:
     (tmp_path / "plain.yaml").write_text(MEMBRANE)
     program = (
@@ -50,4 +63,4 @@ def test_a_membrane_imports_no_other_term(tmp_path: Path) -> None:
     )
     loaded = result.stdout.split("LOADED")[1].split()
     names = {name.removeprefix("lyra_petsc.terms.") for name in loaded}
-    assert names == {"kernel", "membrane", "registry", "rest", "term"}
+    assert names == {"kernel", "membrane", "registry", "rest", "stretch", "term"}

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from launch import SCENE, Left, done, write_scene
+from launch import SCENE, Left, done, lyra, write_scene
 
 
 def history(folder: Path) -> list[dict[str, str]]:
@@ -71,6 +71,29 @@ def test_petsc_prints_what_is_asked_for(tmp_path: Path, options: list[str], word
 def test_times_follow_the_options(tmp_path: Path, options: list[str], times: list[float]) -> None:
     ran(tmp_path, *options)
     assert [float(row["time"]) for row in history(tmp_path / "out")] == pytest.approx(times, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["-ts_dt", "abc"], "-ts_dt: "),
+        (["-ts_max_time", "-ts_dt"], "-ts_dt: needs a number after it"),
+        (["-ts_adapt_dt_min", "q"], "-ts_adapt_dt_min: "),
+        (["-snes_max_it", "1.5"], "-snes_max_it: "),
+        (["-ksp_type", "nonsense"], "-ksp_type: "),
+        (
+            ["--set", "time.integrator=alpha2", "-ts_alpha_radius", "a"],
+            "-ts_alpha_radius: must be a number, not 'a'",
+        ),
+    ],
+    ids=lambda value: value[-2] if isinstance(value, list) else "",
+)
+def test_a_value_that_petsc_refuses_is_named(tmp_path: Path, options: list[str], words: str) -> None:
+    left = lyra(["run", write_scene(tmp_path), "--out", "out", *options], tmp_path)
+    assert left.code == 2, left.err
+    (line,) = left.ours
+    assert line.startswith(f"lyra-petsc: {words}")
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_path: Path) -> None:

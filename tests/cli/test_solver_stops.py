@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import h5py
+import numpy as np
 import pytest
 from launch import DIRECT, SCENE, done, lyra, write_scene
 
@@ -24,17 +26,80 @@ def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks
     left = lyra(["run", scene, "--out", "out", "--set", "solver.max_iterations=1"], tmp_path, ranks)
     assert left.code == 3, left.err
     (line,) = left.ours
-    assert "did not converge even with" in line
-    assert "Newton did not converge within its iterations" in line
-    assert "try a smaller time.step" in line
+    assert re.search(r"step \d+ \(t = \S+ s\) did not converge even with Δt = 9\.77e-06 s: ", line)
+    assert "Newton did not converge within its iterations (nonlinear trouble)" in line
+    assert "try solver.max_iterations above 1" in line
+    lines = left.err.splitlines()
+    told = lines[lines.index(line) + 1 :]
+    assert told[0].startswith("  residual [N] by iteration (linear iterations): ")
+    assert [words.split()[0] for words in told if words.startswith(("  vertex", "  triangle"))] == [
+        "vertex",
+        "triangle",
+    ]
+    assert "  look at out/failure.xdmf (ParaView) and out/failure.txt" in told
     summary = json.loads((tmp_path / "out/summary.json").read_text())
-    assert "did not converge" in summary["outcome"]
+    assert summary["outcome"] == line.removeprefix("lyra-petsc: ")
+    failure = summary["failure"]
+    assert failure["kind"] == "nonlinear trouble"
+    assert failure["attempts"][-1]["dt"] == pytest.approx(0.04 / 2**12)
+    assert failure["step"] == summary["steps"] + 1
+    assert f"worst at vertex {failure['vertex']['number']} around" in line
+    assert f"and triangle {failure['triangle']['number']};" in line
+    text = (tmp_path / "out/failure.txt").read_text()
+    assert text.startswith(summary["outcome"] + "\n")
+    assert text.count("Newton and") == len(failure["attempts"])
+    with h5py.File(tmp_path / "out/failure.h5", "r") as file:
+        before, failing = file["states/000000"], file["states/000001"]
+        assert failing.attrs["time"] - before.attrs["time"] == pytest.approx(0.04 / 2**12)
+        residual = failing["residual"][:]
+        assert residual[failure["vertex"]["number"]] == pytest.approx(failure["vertex"]["residual"])
+        assert np.abs(failing["position"][:] - before["position"][:]).max() > 0.0
     rows = history(tmp_path / "out")
     assert summary["steps"] == int(rows[-1]["step"])
     with h5py.File(max((tmp_path / "out").glob("states-*.h5")), "r") as file:
         newest = file["states"][max(file["states"])]
         assert newest.attrs["step"] == summary["steps"]
     assert (tmp_path / "out/checkpoint.h5").exists()
+
+
+def test_a_run_resumed_with_success_leaves_no_failure(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path, STIFF)
+    left = lyra(
+        ["run", scene, "--out", "out", "--set", "solver.max_iterations=1", "-ts_adapt_dt_min", "1"], tmp_path
+    )
+    assert left.code == 3, left.err
+    assert (tmp_path / "out/failure.xdmf").exists()
+    done(["run", scene, "--out", "out", "--resume", *DIRECT], tmp_path)
+    assert not list((tmp_path / "out").glob("failure*"))
+    assert "failure" not in json.loads((tmp_path / "out/summary.json").read_text())
+    lyra(
+        [
+            "run",
+            scene,
+            "--out",
+            "out",
+            "--force",
+            "--set",
+            "solver.max_iterations=1",
+            "-ts_adapt_dt_min",
+            "1",
+        ],
+        tmp_path,
+    )
+    assert (tmp_path / "out/failure.xdmf").exists()
+    done(["run", scene, "--out", "out", "--force", *DIRECT], tmp_path)
+    assert not list((tmp_path / "out").glob("failure*"))
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_what_petsc_cannot_do_in_a_step_keeps_the_state(tmp_path: Path, ranks: int) -> None:
+    scene = write_scene(tmp_path)
+    left = lyra(["run", scene, "--out", "out", "-ksp_converged_reason", "nonsense"], tmp_path, ranks)
+    assert left.code == 3, left.err
+    (line,) = left.ours
+    assert "PETSc stopped in the step from t = 0 s" in line
+    assert line.endswith("check -ksp_converged_reason")
+    assert json.loads((tmp_path / "out/summary.json").read_text())["outcome"] in line
 
 
 def test_a_step_that_fails_is_retried_smaller_and_recovers(tmp_path: Path) -> None:

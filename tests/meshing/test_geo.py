@@ -117,7 +117,7 @@ def test_surfaces_that_face_each_other_are_oriented_alike(script: Path) -> None:
     [
         ("// broken\nPoint(1) = {0, 0};\n", "geo: gmsh: line 2: syntax error"),
         (SQUARE + "Line(9) = {1, 77};\n", "gmsh: "),
-        (SQUARE + 'Merge "nowhere.step";\n', "gmsh: "),
+        (SQUARE + 'Merge "nowhere.step";\n', "line 5: includes 'nowhere.step', which does not exist"),
         ("Point(1) = {0, 0, 0};\n", "no triangles"),
         ("// nothing\n", "no triangles"),
         ("   \n", "empty"),
@@ -165,11 +165,19 @@ def test_a_session_of_the_caller_goes_on(script: Path) -> None:
         gmsh.finalize()
 
 
-def test_a_gmsh_that_does_not_start_is_told(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(**_: object) -> None:
-        raise AttributeError("undefined symbol")
-
+@pytest.mark.parametrize(
+    ("fake", "words"),
+    [
+        ("raise ImportError('no library')", r"need gmsh \(no library\)"),
+        ("def initialize(**_): raise AttributeError('undefined symbol')", r"start \(undefined symbol\)"),
+    ],
+)
+def test_a_gmsh_that_does_not_start_is_told(
+    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: str, words: str
+) -> None:
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake" / "gmsh.py").write_text(fake)
     script.write_text(SQUARE)
-    monkeypatch.setattr(gmsh, "initialize", fails)
-    with pytest.raises(InputError, match=r"gmsh does not start \(undefined symbol\)"):
+    monkeypatch.syspath_prepend(tmp_path / "fake")
+    with pytest.raises(InputError, match=words):
         mesh_of(script)

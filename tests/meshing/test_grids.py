@@ -64,7 +64,8 @@ def test_groups() -> None:
         ({"nx": 0}, "mesh.grid.nx", "at least 1"),
         ({"width": float("nan")}, "mesh.grid.width", "positive"),
         ({"height": -1.0}, "mesh.grid.height", "positive"),
-        ({"nx": 10**9, "ny": 10**9}, "mesh.grid", "at most"),
+        ({"nx": 10**9, "ny": 10**9}, "mesh.grid", r"1000000002000000001 vertices take about 1.86e\+12 GiB"),
+        ({"nx": 30000, "ny": 30000, "pattern": "criss-cross"}, "mesh.grid", "1800060001 vertices take"),
     ],
 )
 def test_refused(options: dict[str, object], key: str, message: str) -> None:

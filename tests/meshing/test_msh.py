@@ -170,3 +170,12 @@ def test_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         mesh_of(file)
     assert caught.value.file == str(file)
+
+
+def test_names_hold_nothing_that_steers_a_terminal(tmp_path: Path) -> None:
+    file = tmp_path / "mesh.msh"
+    file.write_bytes(
+        b'$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n1\n2 3 "a\0b\x1b[31m"\n$EndPhysicalNames\n'
+        b"$Nodes\n3\n1 0 0 0\n2 1 0 0\n3 0 1 0\n$EndNodes\n$Elements\n1\n1 2 2 3 1 1 2 3\n$EndElements\n"
+    )
+    assert list(mesh_of(file).groups) == ["a\N{REPLACEMENT CHARACTER}b\N{REPLACEMENT CHARACTER}[31m"]

@@ -139,3 +139,17 @@ def test_large_file_in_reasonable_time(tmp_path: Path) -> None:
     begin = time.perf_counter()
     assert obj_mesh(tmp_path, "\n".join(lines)).n_triangles == 2 * n * n
     assert time.perf_counter() - begin < 5.0
+
+
+def test_a_polygon_of_many_corners_is_refused(tmp_path: Path) -> None:
+    ring = "".join(f"v {np.cos(a)} {np.sin(a)} 0\n" for a in np.linspace(0, 6, 300))
+    with pytest.raises(
+        InputError, match=r"line 301: .*\(257 corners, at most 256; split it into triangles\)"
+    ):
+        obj_mesh(tmp_path, ring + f"f {' '.join(map(str, range(1, 258)))}\n")
+
+
+def test_names_hold_nothing_that_steers_a_terminal(tmp_path: Path) -> None:
+    mesh = obj_mesh(tmp_path, SQUARE + "g \x1b[31mred\n\x1bword 1\nf 1 2 3\nf 1 3 4\n")
+    assert list(mesh.groups) == ["\N{REPLACEMENT CHARACTER}[31mred"]
+    assert all(note.isprintable() for note in mesh.notes)

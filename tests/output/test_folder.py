@@ -4,7 +4,9 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.folder import choose, create
+from lyra_petsc.output.claim import Claim
+from lyra_petsc.output.folder import choose
+from lyra_petsc.output.lock import LOCK_FILE, Busy, FolderLock
 
 pytestmark = pytest.mark.parallel
 
@@ -26,14 +28,25 @@ def here(comm, shared_tmp, monkeypatch):
     comm.Barrier()
 
 
+def create(comm, choice, *names):
+    """The folder of a run that begins, leaves files of these names, and ends."""
+    with Claim(comm, choice) as claim:
+        claim.clear()
+        if comm.rank == 0:
+            for name in names:
+                (claim.path / name).write_text("x")
+    comm.Barrier()
+    return claim.path
+
+
 def test_default_folder_is_the_first_free_one_and_choosing_touches_nothing(comm, here):
     assert choose(comm, "flag").path == Path("runs/flag")
     assert not Path("runs").exists()
     comm.Barrier()
     for expected in ("flag", "flag-2", "flag-3"):
-        path = create(comm, choose(comm, "flag"))
+        path = create(comm, choose(comm, "flag"), "history.csv")
         assert path == Path("runs", expected)
-        assert path.is_dir()
+        assert [entry.name for entry in path.iterdir()] == ["history.csv"]
 
 
 def test_a_default_folder_taken_meanwhile_becomes_the_next(comm, here):
@@ -55,7 +68,7 @@ def test_a_given_folder_that_exists_is_refused(comm, here):
         choose(comm, "flag", "out")
     choice = choose(comm, "flag", "new/out")
     here("new/out/notes.txt")
-    with pytest.raises(InputError, match="cannot be created"):
+    with pytest.raises(InputError, match=r"new/out: --out: exists"):
         create(comm, choice)
 
 
@@ -124,3 +137,78 @@ def test_no_permission(comm, here, monkeypatch):
     with pytest.raises(InputError, match=r"no permission to write in .*closed"):
         choose(comm, "flag", "closed/out")
     assert choose(comm, "flag", "open/out").path == Path("open/out")
+
+
+def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
+    here("mine/notes.txt")
+    with Claim(comm, choose(comm, "flag", "mine/deep/out")) as claim:
+        assert claim.path.is_dir()
+    comm.Barrier()
+    assert os.listdir("mine") == ["notes.txt"]
+    comm.Barrier()
+    create(comm, choose(comm, "flag", "mine", force=True))
+    assert os.listdir("mine") == ["notes.txt"]
+
+
+@pytest.mark.parametrize("way", [{}, {"force": True}, {"resume": True}], ids=str)
+def test_a_second_run_into_a_folder_is_refused(comm, here, way):
+    here("out/checkpoint.h5")
+    with Claim(comm, choose(comm, "flag", "out", force=True)):
+        with pytest.raises(InputError, match=r"another run is at work|exists; name another") as caught:
+            Claim(comm, choose(comm, "flag", "out", **way))
+        assert "\n" not in str(caught.value)
+    comm.Barrier()
+    assert os.listdir("out") == ["checkpoint.h5"]
+
+
+def test_a_second_run_is_refused_while_the_first_sets_up(comm, here):
+    with Claim(comm, choose(comm, "flag", "out")):
+        for _ in range(2):
+            with pytest.raises(
+                InputError, match=rf"another run.*process {os.getpid() if comm.size == 1 else ''}"
+            ):
+                Claim(comm, choose(comm, "flag", "out"))
+        comm.Barrier()
+        assert create(comm, choose(comm, "flag")) == Path("runs/flag")
+    comm.Barrier()
+    assert not os.listdir(".")
+
+
+def test_two_runs_without_a_name_get_two_folders(comm, here):
+    both = [choose(comm, "flag"), choose(comm, "flag")]
+    with Claim(comm, both[0]) as first, Claim(comm, both[1]) as second:
+        assert (first.path.name, second.path.name) == ("flag", "flag-2")
+
+
+def test_what_a_kill_during_the_set_up_left_is_no_obstacle(comm, here):
+    here(f"out/{LOCK_FILE}")
+    path = create(comm, choose(comm, "flag", "out"), "history.csv")
+    assert os.listdir(path) == ["history.csv"]
+
+
+def test_a_lock_file_left_behind_locks_nothing(comm, here):
+    here(f"out/{LOCK_FILE}", "out/checkpoint.h5")
+    assert create(comm, choose(comm, "flag", "out", resume=True)) == Path("out")
+    assert os.listdir("out") == ["checkpoint.h5"]
+
+
+def test_a_file_system_without_locks_is_said(comm, here, monkeypatch):
+    def refuse(descriptor, operation):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with Claim(comm, choose(comm, "flag", "out")) as claim:
+        assert "no locks" in claim.note
+    comm.Barrier()
+
+
+def test_the_lock_is_that_of_the_file_others_find(comm, tmp_path):
+    first = FolderLock(tmp_path)
+    with pytest.raises(Busy, match=f"process {os.getpid()} on "):
+        FolderLock(tmp_path)
+    first.path.unlink()
+    second = FolderLock(tmp_path)
+    first.release()  # must leave the second's file alone
+    assert os.listdir(tmp_path) == [LOCK_FILE]
+    second.release()
+    assert os.listdir(tmp_path) == []

@@ -62,9 +62,9 @@ def strain(step):
     return step + np.arange(9.0).reshape(3, 3)
 
 
-def announced(folder):
+def announced(folder, series=XDMF_FILE):
     """Every state of the XDMF file as an independent reader sees it: time and meshio's mesh."""
-    document = ElementTree.parse(folder / XDMF_FILE)
+    document = ElementTree.parse(folder / series)
     states = []
     for grid in document.iterfind("Domain/Grid/Grid"):
         stamp = grid.find("Time")

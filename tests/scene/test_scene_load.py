@@ -41,7 +41,7 @@ time: {end: 4.0, step: 0.005, integrator: semi-implicit}
 output: {every: null, fields: [velocity, stress], checkpoint: {seconds: 5}, reactions: true}
 probes: {tip: {group: tip}}
 solver: {force_tolerance: 1e-6, hessian: exact}
-petsc: {ksp_type: cg, ksp_rtol: 1e-9, ksp_monitor: , mat_view: "1", flag: true, n: 3}
+petsc: {ksp_type: cg, ksp_rtol: 1e-9, ksp_monitor: , mat_view: "::ascii_info", flag: true, n: 3}
 """
 
 SMALL = """
@@ -83,7 +83,8 @@ def test_values_and_defaults(full: Path, small: Path) -> None:
     assert scene.handles[2].axis_numbers == (0, 2)
     assert scene.output.every is None
     assert scene.petsc == {
-        "ksp_type": "cg", "ksp_rtol": 1e-9, "ksp_monitor": None, "mat_view": "1", "flag": True, "n": 3
+        "ksp_type": "cg", "ksp_rtol": 1e-9, "ksp_monitor": None, "mat_view": "::ascii_info", "flag": True,
+        "n": 3,
     }  # fmt: skip
     plain = load_scene(small)
     assert plain.gravity is None
@@ -192,6 +193,7 @@ BAD_OVERRIDES = [
     ("time.end.x=3", "--set time.end.x=3", "time.end holds a single value"),
     ("handles.until=3", "--set handles.until=3", "give an index, [0] to [2]"),
     ("handles[7].until=3", "--set handles[7].until=3", "give an index, [0] to [2]"),
+    (f"handles.{'9' * 5000}=3", f"--set handles.{'9' * 49}...", "give an index, [0] to [2]"),
     ("tiem.end=3", "tiem", "did you mean 'time'"),
     ("time.end=-3", "time.end", "must be > 0, not -3 (from --set)"),
     ("material.cloth=papre", "material.cloth", "did you mean 'paper'? (from --set)"),

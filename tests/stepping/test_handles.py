@@ -87,6 +87,13 @@ def test_transform_scales_then_turns_then_translates() -> None:
     np.testing.assert_allclose(matrix @ [1, 1, 1] + offset, [-1, 2, 4], atol=1e-15)
 
 
+@pytest.mark.parametrize("length", [1e-140, 1e200, 1e308])
+def test_the_length_of_an_axis_does_not_matter(length: float) -> None:
+    rows = keyframes({"time": 0, "rotate": turn(90, [0, 0, length])})
+    matrix, _ = Motion(rows, "linear").transform(0.0)
+    np.testing.assert_allclose(matrix @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
 def test_a_motion_is_relative_to_the_handles_start() -> None:
     motion = Motion(
         keyframes({"time": 0, "translate": [1, 0, 0]}, {"time": 2, "translate": [3, 0, 0]}), "linear"

@@ -1,0 +1,1 @@
+"""Stability on stiff and extreme cases, judged from physics."""

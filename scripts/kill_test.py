@@ -1,0 +1,304 @@
+#!/usr/bin/env python3
+"""Kill runs at random moments, look at what they left, resume them, and compare with one left alone.
+
+    python scripts/kill_test.py --kills 100 --ranks 2 --seed 1
+
+A run is killed again and again, each time going on with --resume, until it reaches its end; then the
+next one begins, with another integrator. Who is killed is random too: one rank, all ranks, or the
+launcher (SIGKILL), or the launcher is asked to stop and leaves its ranks a second (SIGTERM, SIGINT).
+After every kill all processes must be gone within 20 s and every state in states.xdmf must be whole;
+at the end states, history, probes and reactions must be those of an uninterrupted run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import csv
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
+
+import h5py
+import numpy as np
+
+PATIENCE = 20.0
+"""Seconds within which the other ranks must be gone."""
+
+SAME = 1e-9
+"""Largest difference [m] between positions of two runs on the same ranks with a direct solver."""
+
+SCENE = """\
+mesh: {grid: {width: 1.0, height: 1.0, nx: 6, ny: 6}}
+material: {density: 0.15, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}, bending: 2.0e-5, damping: 0.005}
+gravity: [0, 0, -9.81]
+handles:
+  - {nodes: [0, 6]}
+  - {nodes: [45], from: 0.205, motion: lift}
+motions:
+  lift: [{time: 0.3, translate: [0, 0, 0]}, {time: 0.9, translate: [0, 0, 0.2]}]
+time: {end: 0.4, step: 0.005}
+output: {every: 0.02, checkpoint: {seconds: 0.05}, fields: [velocity], reactions: true}
+probes: {middle: {nodes: [24]}}
+"""
+
+WAYS = {
+    "beuler": [],
+    "bdf2": ["--set", "time.integrator=bdf2"],
+    "alpha2, adaptive": [
+        "--set",
+        "time={end: 0.4, step: auto, tolerance: 0.02, integrator: alpha2}",
+    ],
+}
+
+DIRECT = ["-ksp_type", "preonly", "-pc_type", "lu"]
+
+TARGETS = ("one rank", "all ranks", "launcher", "launcher, SIGTERM", "launcher, SIGINT")
+
+
+class Wrong(Exception):
+    """What a run left is not what it must leave."""
+
+
+def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[bytes]:
+    """Start the program; its words go to ``words.txt``."""
+    words = [sys.executable, "-m", "lyra_petsc", "run", *arguments, *DIRECT]
+    if ranks > 1:
+        words = ["mpirun", "-n", str(ranks), *words, "-pc_factor_mat_solver_type", "mumps"]
+    environment = os.environ | {
+        "OMPI_ALLOW_RUN_AS_ROOT": "1",
+        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+        "OMPI_MCA_rmaps_base_oversubscribe": "1",
+        "OMPI_MCA_mpi_yield_when_idle": "1",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": f"{Path(__file__).resolve().parents[1]}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
+    with open(folder / "words.txt", "ab") as said:
+        return subprocess.Popen(
+            words,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+        )
+
+
+def ranks_of(folder: Path) -> list[int]:
+    """Processes of the program that work in ``folder``."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+                if b"lyra_petsc" in words and b"-n" not in words and (entry / "cwd").readlink() == folder:
+                    found.append(int(entry.name))
+            except OSError:  # gone meanwhile
+                continue
+    return found
+
+
+def rows(path: Path) -> int:
+    """Lines of a file; 0 if there is none."""
+    try:
+        return path.read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def wait_for_a_moment(
+    process: subprocess.Popen[bytes], history: Path, draw: random.Random, length: float
+) -> None:
+    """A moment drawn from the whole run and its set-up, or some rows of the history further on."""
+    deadline = time.monotonic() + draw.uniform(0.0, length)
+    goal = None
+    if draw.random() < 0.6:
+        goal = rows(history) + draw.randint(1, 40)
+        deadline = time.monotonic() + 10 * length
+    while process.poll() is None and time.monotonic() < deadline:
+        if goal is not None and rows(history) >= goal:
+            time.sleep(draw.uniform(0.0, 0.03))
+            return
+        time.sleep(0.002)
+
+
+def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: random.Random) -> bool:
+    """Kill; whether there was still something to kill."""
+    victims = ranks_of(folder)
+    if process.poll() is not None:
+        return False
+    if not target.startswith("launcher") and not victims:
+        target = "launcher"  # which has not started them yet
+    number = {"launcher, SIGTERM": signal.SIGTERM, "launcher, SIGINT": signal.SIGINT}.get(
+        target, signal.SIGKILL
+    )
+    if target == "one rank":
+        victims = [draw.choice(victims)]
+    elif target.startswith("launcher"):
+        victims = [process.pid]
+    for victim in victims:
+        try:
+            os.kill(victim, number)
+        except ProcessLookupError:
+            continue
+    return True
+
+
+def wait_until_gone(process: subprocess.Popen[bytes], folder: Path) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while process.poll() is None or ranks_of(folder):
+        if time.monotonic() > deadline:
+            left = ranks_of(folder)
+            for victim in [*left, *([process.pid] if process.poll() is None else [])]:
+                os.kill(victim, signal.SIGKILL)
+            raise Wrong(f"after {PATIENCE:g} s there are still ranks: {left}")
+        time.sleep(0.02)
+
+
+def check_announced(out: Path) -> int:
+    """Open every state that ``states.xdmf`` announces as ParaView would; their number."""
+    xdmf = out / "states.xdmf"
+    if not xdmf.exists():
+        return 0
+    grids = ElementTree.parse(xdmf).findall(".//Grid[@GridType='Uniform']")
+    times = [float(grid.find("Time").attrib["Value"]) for grid in grids]
+    if times != sorted(set(times)):
+        raise Wrong(f"times {times}")
+    for grid in grids:
+        for item in grid.iter("DataItem"):
+            name, path = item.text.strip().split(":")
+            with h5py.File(out / name, "r") as file:
+                data = file[path]
+                if data.shape != tuple(map(int, item.attrib["Dimensions"].split())):
+                    raise Wrong(f"{name}: {path} has shape {data.shape}")
+                if not np.isfinite(data[()]).all():
+                    raise Wrong(f"{name}: {path} is not finite")
+    return len(grids)
+
+
+def table(path: Path) -> np.ndarray:
+    """The rows of a CSV file, without wall times."""
+    with path.open(encoding="utf-8") as file:
+        lines = list(csv.reader(file))
+    skipped = {"wall_seconds", "residual", "linear_iterations"}
+    columns = [i for i, name in enumerate(lines[0]) if name not in skipped]
+    return np.array([[float(line[i]) for i in columns] for line in lines[1:]])
+
+
+def last_state(out: Path) -> tuple[float, np.ndarray]:
+    newest = max(out.glob("states-*.h5"))
+    with h5py.File(newest, "r") as file:
+        (group,) = file["states"].values()
+        return float(group.attrs["time"]), group["position"][()]
+
+
+def compare(out: Path, whole: Path) -> None:
+    """The resumed run against the uninterrupted one."""
+    left, right = last_state(out), last_state(whole)
+    if left[0] != right[0] or np.abs(left[1] - right[1]).max() > SAME:
+        raise Wrong(f"ends at t = {left[0]}, {np.abs(left[1] - right[1]).max():.3g} m off")
+    for name in ("history.csv", "probes.csv", "reactions.csv"):
+        mine, other = table(out / name), table(whole / name)
+        if mine.shape != other.shape or not np.array_equal(mine[:, 0], np.arange(len(mine))):
+            raise Wrong(f"{name}: steps {mine[:, 0].astype(int).tolist()}")
+        if not np.allclose(mine, other, rtol=1e-6, atol=1e-9):
+            raise Wrong(
+                f"{name} differs in row {np.flatnonzero(~np.isclose(mine, other, 1e-6, 1e-9).all(1))[0]}"
+            )
+    if check_announced(out) != check_announced(whole):
+        raise Wrong("another number of states")
+    clutter = [entry.name for entry in out.iterdir() if entry.suffix in (".part", ".lock")]
+    if clutter:
+        raise Wrong(f"clutter: {clutter}")
+
+
+def how_to_go_on(out: Path) -> list[str]:
+    """--resume once there is a checkpoint; before, the run begins again."""
+    if list(out.glob("checkpoint*.h5")):
+        return ["--resume"]
+    return ["--force"] if out.exists() else []
+
+
+def run_to_end(arguments: list[str], folder: Path, ranks: int) -> float:
+    began = time.monotonic()
+    process = launch(arguments, folder, ranks)
+    if process.wait(600) != 0:
+        raise Wrong((folder / "words.txt").read_text(errors="replace")[-2000:])
+    return time.monotonic() - began
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--ranks", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--folder", type=Path, help="where to work and to leave everything; else a temporary one"
+    )
+    asked = parser.parse_args()
+    draw = random.Random(asked.seed)
+    folder = (asked.folder or Path(tempfile.mkdtemp(prefix="kill_test-"))).resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    scene = folder / "scene.yaml"
+    scene.write_text(SCENE, encoding="utf-8")
+
+    whole: dict[str, tuple[Path, float]] = {}
+    kills: collections.Counter[str] = collections.Counter()
+    finished, states = 0, 0
+    try:
+        while kills.total() < asked.kills:
+            way = list(WAYS)[finished % len(WAYS)]
+            words = [str(scene), *WAYS[way]]
+            if way not in whole:
+                straight = folder / f"whole-{len(whole)}"
+                whole[way] = straight, run_to_end([*words, "--out", straight.name], folder, asked.ranks)
+            straight, length = whole[way]
+            out = folder / f"killed-{finished}"
+            while kills.total() < asked.kills:
+                target = draw.choice(TARGETS if asked.ranks > 1 else TARGETS[:1])
+                process = launch([*words, "--out", out.name, *how_to_go_on(out)], folder, asked.ranks)
+                wait_for_a_moment(process, out / "history.csv", draw, length)
+                struck = strike(process, folder, target, draw)
+                wait_until_gone(process, folder)
+                if not struck:
+                    if process.returncode != 0:
+                        raise Wrong((folder / "words.txt").read_text(errors="replace")[-2000:])
+                    break
+                kills[target] += 1
+                states += check_announced(out)
+                print(
+                    f"{kills.total():4d}  {way:<18} {target:<18} rows {rows(out / 'history.csv'):4d}",
+                    flush=True,
+                )
+            else:
+                run_to_end([*words, "--out", out.name, *how_to_go_on(out)], folder, asked.ranks)
+            compare(out, straight)
+            finished += 1
+            shutil.rmtree(out)
+    except Wrong as error:
+        print(f"FAILED after {kills.total()} kills in {folder}: {error}")
+        return 1
+    listed = ", ".join(f"{name} {count}" for name, count in sorted(kills.items()))
+    print(
+        f"{kills.total()} kills on {asked.ranks} ranks ({listed}), seed {asked.seed}: "
+        f"{states} announced states read back, {finished} runs resumed to the same end"
+    )
+    if asked.folder is None:
+        shutil.rmtree(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

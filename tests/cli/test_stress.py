@@ -1,0 +1,210 @@
+"""``stress`` from the command line: table, folder, exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from launch import environment, lyra, start, write_scene
+
+from lyra_petsc.stress.registry import families
+from lyra_petsc.stress.table import COLUMNS
+
+TWO = ["--only", "one-triangle,chain-1e6"]
+
+
+def test_list_names_families_and_cases(tmp_path: Path) -> None:
+    left = lyra(["stress", "--full", "--list"], tmp_path)
+    assert left.code == 0, left.err
+    words = [line.split()[0].rstrip(":") for line in left.out.splitlines()]
+    assert words == [name for f in families() for name in (f.name, *(case.name for case in f.cases))]
+    usual = lyra(["stress", "--list"], tmp_path).out.splitlines()
+    quick = lyra(["stress", "--quick", "--list"], tmp_path).out.splitlines()
+    assert len(quick) < len(usual) < len(words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_cases_pass_and_leave_table_and_page(tmp_path: Path, ranks: int) -> None:
+    left = lyra(["stress", "--quick", *TWO, "--out", "out"], tmp_path, ranks)
+    assert left.code == 0, left.err + left.out
+    assert "2 of 2 cases passed" in left.out
+    with open(tmp_path / "out" / "stress.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert [row["case"] for row in rows] == ["one-triangle", "chain-1e6"]
+    assert {row["passed"] for row in rows} == {"True"}
+    assert [int(row["steps"]) for row in rows] == [40, 40]
+    assert all(0.0 < float(row["energy_defect"]) < float(row["energy_tolerance"]) for row in rows)
+    assert all(float(row["step_over_base"]) > 0.0 for row in rows)
+    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    assert content["passed"] is content["complete"] is True
+    assert content["ranks"] == ranks
+    assert set(content["cases"][1]["verdicts"]) == {
+        "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit"
+    }  # fmt: skip
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "2 of 2 cases passed" in report
+    assert "stress --quick --only one-triangle,chain-1e6" in report
+
+
+def test_the_page_holds_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    left = lyra(["stress", "--quick", *TWO], tmp_path)
+    assert left.code == 0, left.err
+    folder = tmp_path / "stress" / "sheet"
+    assert (folder / "report.html").read_text().count("data:image/svg+xml;base64,") == 4
+    for name in ("one-triangle-shape", "chain-1e6-shape", "chain-1e6-energy"):
+        assert (folder / "plots" / f"{name}.png").stat().st_size > 1000
+
+
+def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
+    program = (
+        "import sys;"
+        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
+        "import importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
+        "from lyra_petsc.cli.app import run_command_line;"
+        "sys.exit(run_command_line(['lyra-petsc', 'stress', '--quick', '--only', 'free', '--out', 'out']))"
+    )
+    left = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert left.returncode == 0, left.stderr
+    assert "1 of 1 cases passed" in left.stdout
+    assert "pip install 'lyra-petsc[study]'" in left.stdout
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        "report.md",
+        "stress.csv",
+        "stress.json",
+    ]
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: int) -> None:
+    scene = write_scene(tmp_path)
+    names = "stiff-1e6-5ms,bending-1e6,jump,slivers"
+    left = lyra(["stress", scene, "--quick", "--only", names, "--set", "gravity=[0, 0, -5]"], tmp_path, ranks)
+    assert left.code == 0, left.err + left.out
+    assert "slivers: left out" in left.out
+    assert "3 of 3 cases passed" in left.out
+    content = json.loads((tmp_path / "stress" / "scene" / "stress.json").read_text())
+    assert [case["name"] for case in content["cases"]] == ["stiff-1e6-5ms", "bending-1e6", "jump"]
+    assert list(content["left_out"]) == ["slivers"]
+    again = lyra(["stress", scene, "--quick", "--only", "jump"], tmp_path)
+    assert again.code == 0
+    assert (tmp_path / "stress" / "scene-2" / "stress.csv").exists()
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_failed_verdict_is_exit_code_1(tmp_path: Path, ranks: int) -> None:
+    # steps that stop at a tenth of their first residual are not what the scene's tolerances promise
+    left = lyra(["stress", "--quick", *TWO, "--out", "out", "-snes_rtol", "0.1"], tmp_path, ranks)
+    assert left.code == 1, left.err + left.out
+    assert "equations: worst in step" in left.out
+    assert left.ours == []
+    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    assert content["passed"] is False
+    assert content["cases"][0]["failures"].startswith("equations: ")
+    assert "What failed" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_base_that_does_not_run_is_exit_code_3(tmp_path: Path, ranks: int) -> None:
+    left = lyra(["stress", "--quick", "--out", "out", "-snes_max_it", "0"], tmp_path, ranks)
+    assert left.code == 3, left.err + left.out
+    [line] = left.ours
+    assert "did not converge" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path, ranks: int) -> None:
+    left = lyra(["stress", "--only", "chain-1e6,wint", "--out", "out"], tmp_path, ranks)
+    assert left.code == 2
+    [line] = left.ours
+    assert line.startswith("lyra-petsc: wint: unknown case or family, did you mean 'wind'")
+    assert left.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--quick", "--full"], "--quick"),
+        (["none.yaml"], "none.yaml"),
+        (["--set", "material.density=-1"], "density"),
+        (["--set", "time.analysis=static"], "time"),
+        (["--set", "handles=[{group: nowhere}]"], "nowhere"),
+        (["--ranks", "0"], "--ranks"),
+        (["--only", "products"], "--full"),
+        (["--out", "taken"], "--force"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, arguments: list[str], words: str) -> None:
+    (tmp_path / "taken").mkdir()
+    left = lyra(["stress", *arguments], tmp_path)
+    assert left.code == 2, left.err
+    [line] = left.ours
+    assert words in line
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+    assert list((tmp_path / "taken").iterdir()) == []
+
+
+def test_one_mpirun_for_each_case(tmp_path: Path) -> None:
+    left = lyra(["stress", "--quick", *TWO, "--ranks", "2", "--out", "out"], tmp_path)
+    if "not found" in left.err:
+        pytest.skip("needs mpirun")
+    assert left.code == 0, left.err + left.out
+    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    assert content["ranks"] == 2
+    assert [case["passed"] for case in content["cases"]] == [True, True]
+    assert [len(case["newton_iterations"]) for case in content["cases"]] == [40, 40]
+
+
+def test_ranks_under_mpirun_are_refused(tmp_path: Path) -> None:
+    left = lyra(["stress", "--quick", "--ranks", "2"], tmp_path, 2)
+    assert left.code == 2
+    assert "--ranks" in left.ours[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_between_cases(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    process = start(["stress", "--only", "one-triangle,rigid-plate", "--out", "out"], tmp_path)
+    deadline = time.monotonic() + 60.0
+    while not (tmp_path / "out" / "stress.json").exists():
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == code, err
+    assert f"stopped by {number.name}" in err
+    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    assert content["complete"] is False
+    assert [case["name"] for case in content["cases"]] == ["one-triangle"]
+    assert "one-triangle" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_petsc_options_go_through_and_unused_ones_are_told(tmp_path: Path) -> None:
+    left = lyra(["stress", "--quick", *TWO, "-pc_type", "lu", "-snes_typo", "1", "--out", "out"], tmp_path)
+    assert left.code == 0, left.err + left.out
+    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
+    with open(tmp_path / "out" / "stress.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    # a direct solver takes an iteration or two where the default takes tens
+    for row in rows:
+        assert int(row["linear_iterations"]) < 5 * 40 * float(row["newton_worst"])

@@ -1,0 +1,17 @@
+"""The kinds of cases, by name, and their shares of a hundred."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+from judge import Case
+from mesh_cases import geo_cases, mesh_cases
+from original_cases import original_cases
+from scene_cases import scene_cases, text_bombs
+
+KINDS: dict[str, tuple[int, st.SearchStrategy[Case]]] = {
+    "scenes": (48, scene_cases()),
+    "bombs": (3, text_bombs()),
+    "originals": (15, original_cases()),
+    "meshes": (30, mesh_cases()),
+    "scripts": (4, geo_cases()),
+}

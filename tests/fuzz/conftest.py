@@ -1,0 +1,6 @@
+"""These tests start the program as those of the command line do."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "cli"))

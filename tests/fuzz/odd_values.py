@@ -1,0 +1,223 @@
+"""Odd values as a YAML file might hold them, and numbers of every size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import strategies as st
+
+
+class Raw(str):
+    """A piece of YAML that is written as it stands."""
+
+
+NUMBERS = [
+    "0",
+    "-0.0",
+    "1",
+    "-1",
+    "2",
+    "3",
+    "0.5",
+    "1e-3",
+    "1e3",
+    "1e308",
+    "-1e308",
+    "1.7976931348623157e308",
+    "1e309",
+    "-1e309",
+    "5e-324",
+    "2.2e-308",
+    "1e-320",
+    "1e-160",
+    "1e160",
+    "1e-30",
+    "1e30",
+    "1e15",
+    "1e-15",
+    ".nan",
+    ".NaN",
+    ".inf",
+    "-.inf",
+    "2147483647",
+    "2147483648",
+    "-2147483648",
+    "4294967296",
+    "9223372036854775807",
+    "9223372036854775808",
+    "18446744073709551616",
+    "1" + "0" * 400,
+    "1" + "0" * 5000,
+    "0x10",
+    "0o17",
+    "017",
+    "0b11",
+    "1_000",
+    "1:30:00",
+    "190:20:30.15",
+    "12e03",
+    "+1",
+    "+.5",
+    "1.",
+    "1e",
+    "0.1e-4000",
+]
+
+WORDS = [
+    "~",
+    "null",
+    "true",
+    "false",
+    "yes",
+    "no",
+    "on",
+    "auto",
+    "static",
+    "",
+    "''",
+    '" "',
+    "abc",
+    "gravity",
+    '"1.0"',
+    "'nan'",
+    '"\\0"',
+    '"a\\0b"',
+    '"\\n"',
+    '"a\\nb"',
+    '"\\r\\n"',
+    '"\\u202e"',
+    '"\\ud83d\\ude00"',
+    '"\\x07"',
+    '"\\e[31m"',
+    "ünïcödé",
+    "日本語",
+    "'" + "x" * 3000 + "'",
+    "|\n  a\n  b",
+    ">\n  a\n  b",
+    "2001-01-01",
+    "2001-12-14t21:59:43.10-05:00",
+    "2001-13-45",
+    "12:30",
+    "../../etc/passwd",
+    "/etc/passwd",
+    "/dev/zero",
+    "/",
+    "mesh.obj",
+    "none.geo",
+    "a: b",
+    "- a",
+    "-",
+    "?",
+    "%",
+    "@a",
+    "`a`",
+    "*",
+    "*nowhere",
+    "&anchor 1",
+    "&anchor",
+    "!!str 1",
+    "!!int 1.5",
+    "!!int abc",
+    "!!float abc",
+    "!!bool 1",
+    "!!binary aGVsbG8=",
+    "!!binary ?",
+    "!!null ''",
+    "!!timestamp 2001-01-01",
+    "!!timestamp abc",
+    "!!omap [a: 1]",
+    "!!set {a, b}",
+    "!!pairs [a: 1]",
+    "!local 1",
+    "!!python/object/apply:os.system ['touch mark']",
+    "!!python/name:os.system ''",
+    "!<tag:x> 1",
+    "! 1",
+]
+
+BLOCKS = [
+    "[]",
+    "{}",
+    "[[]]",
+    "[{}]",
+    "{a: 1}",
+    "{1: 2}",
+    "{[1]: 2}",
+    "{? a}",
+    "[1, 2]",
+    "[1, 2, 3]",
+    "[0, 0, 0]",
+    "[a, b, c]",
+    "[1, [2], 3]",
+    "[.nan, 0, 0]",
+    "[1e308, 1e308, 1e308]",
+    "[1e-320, 0, 0]",
+    "[x]",
+    "[x, y, z]",
+    "[x, x]",
+    "[[0, 0, 0], [1, 1, 1]]",
+    "[" + "1, " * 3000 + "1]",
+    "[" * 300 + "]" * 300,
+    "{a: " * 100 + "1" + "}" * 100,
+    "{<<: {a: 1}}",
+    "{<<: [1]}",
+    "{<<: 1}",
+    "{a: 1, a: 2}",
+    "[&a [1, *a]]",
+    "&loop [*loop]",
+    "&b {c: *b}",
+]
+
+
+def raw(pieces: list[str]) -> st.SearchStrategy[Any]:
+    """One of the pieces, to be written as it stands."""
+    return st.sampled_from([Raw(piece) for piece in pieces])
+
+
+def anything() -> st.SearchStrategy[Any]:
+    """A number, a word or a block that hardly fits."""
+    return raw(NUMBERS) | raw(WORDS) | raw(BLOCKS)
+
+
+def magnitude() -> st.SearchStrategy[float]:
+    """A positive number of any size a double has."""
+    return st.floats(-323.0, 308.0).map(lambda power: max(10.0**power, 5e-324))
+
+
+def usual(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
+    """A number of a usual size; one in ``wild`` of any size."""
+    return st.integers(0, wild - 1).flatmap(
+        lambda which: magnitude() if which == wild - 1 else st.floats(low, high)
+    )
+
+
+def signed(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
+    """The same, of either sign."""
+    return st.tuples(usual(low, high, wild=wild), st.sampled_from([1.0, -1.0, 0.0])).map(
+        lambda pair: pair[0] * pair[1]
+    )
+
+
+def vector(low: float = 0.0, high: float = 10.0, *, wild: int = 10) -> st.SearchStrategy[list[float]]:
+    """Three numbers."""
+    return st.lists(signed(low, high, wild=wild), min_size=3, max_size=3)
+
+
+def emit(value: Any) -> str:
+    """YAML of plain values in flow style; `Raw` pieces as they stand."""
+    if isinstance(value, Raw):
+        return str(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {emit(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(emit(entry) for entry in value) + "]"
+    if value is None:
+        return "~"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def document(blocks: dict[str, Any]) -> str:
+    """A scene file: one top-level key a line."""
+    return "".join(f"{key}: {emit(value)}\n" for key, value in blocks.items())

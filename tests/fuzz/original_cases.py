@@ -1,0 +1,154 @@
+"""The original program's conf.json, and what mutation makes of it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from hypothesis import strategies as st
+from judge import Case
+from odd_values import Raw, magnitude, signed, usual, vector
+from scene_cases import SHEET
+from text_damage import damaged
+
+ODD = [
+    "0",
+    "-1",
+    "1e308",
+    "1e309",
+    "-1e-320",
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "null",
+    "true",
+    "false",
+    '""',
+    '"a"',
+    "[]",
+    "{}",
+    "[[]]",
+    "[0,0,0]",
+    "[1,2]",
+    "[1e308,1e308,1e308]",
+    "1" + "0" * 400,
+    "1" + "0" * 5000,
+    "1.5",
+    '"\\u0000"',
+    '"\\ud800"',
+    '"../../../etc/passwd"',
+    '"/etc/passwd"',
+    "[" * 2000 + "]" * 2000,
+    '{"a":' * 500 + "1" + "}" * 500,
+    '"' + "x" * 3000 + '"',
+    "2147483647",
+    "99999999999999999999",
+    "// comment\n1",
+    "/* a */ 2",
+    "01",
+    "+1",
+    ".5",
+    "1.",
+    "'a'",
+    "undefined",
+    '{"a":1,"a":2}',
+]
+TABLE = {
+    "density": 0.2,
+    "stretching": [[60.0, 10.0, 60.0, 20.0]] * 6,
+    "bending": [[1e-5] * 5] * 3,
+}
+Draw = Any
+
+
+def _json(value: Any) -> str:
+    if isinstance(value, Raw):
+        return str(value)
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)}: {_json(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_json, value)) + "]"
+    return json.dumps(value)
+
+
+def _placement(draw: Draw) -> dict[str, Any]:
+    return {
+        "translate": draw(vector(0.0, 1.0)),
+        "scale": draw(st.just(1.0) | usual(0.5, 2.0)),
+        "rotate": [draw(signed(0.0, 360.0)), *draw(vector(0.1, 1.0))],
+    }
+
+
+@st.composite
+def originals(draw: Draw) -> dict[str, Any]:
+    """A conf.json that is meant to be sound."""
+    data: dict[str, Any] = {
+        "frame_time": draw(usual(0.01, 0.1)),
+        "frame_steps": draw(st.integers(1, 10)),
+        "end_time": draw(usual(0.1, 10.0)),
+        "cloths": [
+            {
+                "mesh": "sheet.obj",
+                "transform": _placement(draw),
+                "materials": [
+                    {
+                        "data": draw(
+                            st.sampled_from(["materials/gray-interlock.json", "paper", "table.json"])
+                        ),
+                        "damping": draw(usual(0.0, 0.1)),
+                        "thicken": draw(usual(0.5, 2.0)),
+                        "bending_mult": draw(usual(0.0, 10.0)),
+                    }
+                ],
+            }
+            for _ in range(draw(st.integers(1, 2)))
+        ],
+        "handles": [
+            {
+                "nodes": [draw(st.integers(0, 5))],
+                "end_time": draw(usual(0.1, 10.0)),
+                "motion": draw(st.integers(-1, 1)),
+            }
+            for _ in range(draw(st.integers(0, 2)))
+        ],
+        "gravity": draw(vector(0.0, 10.0)),
+    }
+    if draw(st.booleans()):
+        data["motions"] = [
+            [{"time": 0, "transform": _placement(draw)}, {"time": draw(magnitude()), "transform": {}}]
+        ]
+    if draw(st.booleans()):
+        data["wind"] = {"velocity": draw(vector(0.0, 10.0)), "density": draw(usual(0.0, 2.0))}
+    return data
+
+
+def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    found = []
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    for key, entry in entries:
+        found += [(*path, key), *_places(entry, (*path, key))]
+    return found
+
+
+@st.composite
+def original_cases(draw: Draw) -> Case:
+    """A conf.json with its mesh and a material table."""
+    data = draw(originals())
+    kind = draw(st.sampled_from(["sound", "mutated", "mutated", "damaged"]))
+    if kind == "mutated":
+        for _ in range(draw(st.integers(1, 2))):
+            *path, last = draw(st.sampled_from(_places(data)))
+            block = data
+            for key in path:
+                block = block[key]
+            block[last] = Raw(draw(st.sampled_from(ODD)))
+    comment = draw(st.sampled_from(["", "// a comment\n", "/* one */\n"]))
+    text = (comment + _json(data)).encode("utf-8", errors="surrogatepass")
+    table = json.dumps(TABLE).encode()
+    if kind == "damaged":
+        which = draw(st.integers(0, 2))
+        text, table = (draw(damaged(text)), table) if which else (text, draw(damaged(table)))
+    files = {"conf.json": text, "sheet.obj": SHEET, "table.json": table}
+    return Case(f"original-{kind}", files, scene="conf.json")

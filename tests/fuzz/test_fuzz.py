@@ -1,0 +1,145 @@
+"""A few hundred fuzz cases, the same each time; ``scripts/fuzz.py`` runs thousands of others.
+
+Most run in a forked process (see ``judge``), a sample in the real program, a handful on two ranks.
+"""
+
+from __future__ import annotations
+
+import random
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hypothesis")
+
+from all_cases import KINDS
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as seeded
+from judge import Case, Outcome, complaint, judge, listing, warm
+from launch import lyra
+from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
+from scene_cases import bomb, nested
+
+CASES = 240
+IN_THE_PROGRAM = 8
+ON_TWO_RANKS = 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ready(tmp_path_factory: pytest.TempPathFactory) -> None:
+    warm(tmp_path_factory.mktemp("warm"))
+
+
+@pytest.fixture
+def fresh() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def drawn(kind: str, number: int, seed: int) -> list[Case]:
+    """``number`` cases of a kind, the same for the same seed."""
+    cases: list[Case] = []
+
+    @seeded(seed)
+    @settings(
+        max_examples=number,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=KINDS[kind][1])
+    def draw(case: Case) -> None:
+        cases.append(case)
+
+    draw()
+    return cases
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_case_ends_in_a_run_or_in_one_line(kind: str, tmp_path: Path) -> None:
+    number = CASES * KINDS[kind][0] // 100
+    codes: Counter[int] = Counter()
+    wrong = []
+    for count, case in enumerate(drawn(kind, number, seed=20)):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        outcome = judge(case, folder)
+        codes[outcome.code] += 1
+        if outcome.complaint:
+            wrong.append(f"{folder}: {outcome.complaint}: {outcome.err[-500:]}")
+    assert not wrong, "\n".join(wrong)
+    assert codes.total() >= number // 2
+    assert codes[2] > 0
+    assert kind in ("bombs", "scripts") or codes[0] > 0, "no case ran: the drawing of sound ones is broken"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_sample_in_the_program_itself(ranks: int, tmp_path: Path) -> None:
+    cases = [case for kind in KINDS for case in drawn(kind, 30, seed=21)]
+    number = IN_THE_PROGRAM if ranks == 1 else ON_TWO_RANKS
+    for count, case in enumerate(random.Random(ranks).sample(cases, number)):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        case.write(folder)
+        before = listing(folder)
+        left = lyra([*case.arguments, "-ts_max_steps", 2], folder, ranks)
+        err = left.err
+        if ranks > 1 and left.code:  # the launcher adds its banner
+            assert len(left.ours) == 1, err
+            err = left.ours[0] + "\n"
+        outcome = Outcome(left.code, left.out, err)
+        assert complaint(outcome, folder, before) == "", f"{folder}: {left.err}"
+
+
+@pytest.mark.parametrize("name", ["obj", "msh2", "msh2-binary", "msh4", "msh4-binary", "geo"])
+def test_the_meshes_that_are_mutated_are_sound(name: str, fresh: Path) -> None:
+    form, _, binary = name.partition("-")
+    data = {"obj": OBJ, "geo": GEO}.get(form) or {"msh2": msh_2, "msh4": msh_4}[form](binary=bool(binary))
+    file = f"mesh.{form[:3]}"
+    held = "group: all" if form == "obj" else "group: edge"
+    scene = SCENE.format(name=file, size="", held=held).encode()
+    outcome = judge(Case(name, {"scene.yaml": scene, file: data}), fresh)
+    assert (outcome.code, outcome.complaint) == (0, ""), outcome.err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (bomb("lists", 40, 9), "more than 2000000 entries"),
+        (bomb("merges", 40, 9), "more than 2000000 entries"),
+        (nested(3000, "list"), "nested too deeply"),
+        (nested(1500, "indented"), "nested too deeply"),
+        (b"mesh: {grid: {width: 1, height: 1, nx: 1000000000, ny: 1000000000}}\n"
+         b"material: {cloth: paper}\ntime: {end: 1, step: 1}\n", "1000000002000000001 vertices take about"),
+        (b"x: &g {grid: {width: 1, height: 1, nx: 1000, ny: 1000}}\n"
+         b"mesh: [" + b"*g, " * 1000 + b"*g]\n", "x: unknown key"),
+        (b"mesh: [&g {grid: {width: 1, height: 1, nx: 10000, ny: 10000}}, " + b"*g, " * 1000 + b"*g]\n"
+         b"material: {cloth: paper}\ntime: {end: 1, step: 1}\n", "vertices take about"),
+        (b"a: !!python/object/apply:os.system ['touch mark']\n", "could not determine a constructor"),
+    ],
+)  # fmt: skip
+def test_small_files_do_not_grow(text: bytes, words: str, fresh: Path) -> None:
+    outcome = judge(Case("bomb", {"scene.yaml": text}), fresh)
+    assert (outcome.code, outcome.complaint) == (2, ""), outcome.err
+    assert words in outcome.line
+
+
+def test_what_is_wrong_is_seen(fresh: Path) -> None:
+    before = listing(fresh)
+    line = "lyra-petsc: scene.yaml: wrong\n"
+    assert complaint(Outcome(2, "", line), fresh, before) == ""
+    assert complaint(Outcome(2, "", line + line), fresh, before) != ""
+    assert complaint(Outcome(2, "words", line), fresh, before) != ""
+    assert complaint(Outcome(70, "", line), fresh, before) == "exit code 70"
+    assert complaint(Outcome(-11, "", ""), fresh, before) == "ended by SIGSEGV"
+    assert complaint(Outcome(0, "", "x.py:1: RuntimeWarning: overflow\n"), fresh, before) != ""
+    assert complaint(Outcome(0, "", ""), fresh, before) == "neither a plan nor results"
+    assert complaint(Outcome(3, "", line), fresh, before) == "no states.xdmf"
+    (fresh / "mark").touch()
+    assert complaint(Outcome(2, "", line), fresh, before) == "bad input, and mark is left"

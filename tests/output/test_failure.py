@@ -1,0 +1,70 @@
+"""failure.xdmf, failure.h5 and failure.txt, as ParaView would read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from test_states import announced, on_first
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.output.failure import DATA_FILE, TEXT_FILE, XDMF_FILE, Moment, remove_failure, write_failure
+from lyra_petsc.output.folder import RESULT
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+
+pytestmark = pytest.mark.parallel
+
+REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=float)
+TRIANGLES = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
+
+
+def write(comm: MPI.Comm, folder: Path) -> None:
+    mesh = Mesh(REST, REST, TRIANGLES, REST[TRIANGLES][..., :2].copy(), np.zeros(3, dtype=bool))
+    write_mesh(folder, mesh if comm.rank == 0 else None, comm)
+    owned = np.arange(5)[::-1][comm.rank :: comm.size]
+    moments = tuple(
+        Moment(0.25 + 0.125 * n, REST[owned] + n, {"velocity": n + REST[owned], "residual": n * REST[owned]})
+        for n in range(2)
+    )
+    write_failure(folder, FileOrder(comm, owned, 5), 3, 7, (moments[0], moments[1]), "why\n")
+
+
+def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: Path) -> None:
+    write(comm, shared_tmp)
+
+    def check() -> None:
+        before, failing = announced(shared_tmp, XDMF_FILE)
+        for number, (time, seen) in enumerate((before, failing)):
+            assert time == 0.25 + 0.125 * number
+            assert np.array_equal(seen.points, REST + number)
+            assert np.array_equal(seen.cells_dict["triangle"], TRIANGLES)
+            assert np.array_equal(seen.point_data["velocity"], number + REST)
+            assert np.array_equal(seen.point_data["residual"], number * REST)
+        assert (shared_tmp / TEXT_FILE).read_text() == "why\n"
+        assert not list(shared_tmp.glob("*.part"))
+
+    on_first(comm, check)
+
+
+def test_a_new_run_removes_them(comm: MPI.Comm, shared_tmp: Path) -> None:
+    write(comm, shared_tmp)
+    assert all(RESULT.fullmatch(name) for name in (XDMF_FILE, DATA_FILE, TEXT_FILE))
+
+    def check() -> None:
+        assert len(list(shared_tmp.glob("failure*"))) == 3
+        remove_failure(shared_tmp)
+        remove_failure(shared_tmp)  # nothing there is no mistake
+        assert not list(shared_tmp.glob("failure*"))
+
+    on_first(comm, check)
+
+
+def test_a_folder_that_is_gone_is_told_on_all_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    owned = np.arange(5)[comm.rank :: comm.size]
+    moment = Moment(0.0, REST[owned], {})
+    with pytest.raises(OutputError, match=r"failure\.txt: cannot be written"):
+        write_failure(shared_tmp / "gone", FileOrder(comm, owned, 5), 3, 0, (moment, moment), "")

@@ -1,0 +1,94 @@
+"""What a resumed run compares its mesh with."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.meshing.mesh import Group, Mesh
+from lyra_petsc.output.mesh_file import MESH_FILE, check_same_mesh, write_mesh
+
+pytestmark = pytest.mark.parallel
+
+REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=float)
+TRIANGLES = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
+NOTHING = np.empty(0, int)
+EDGES = np.array([[0, 1], [1, 4]])
+
+
+def strip():
+    groups = {
+        "a/b": Group(1, np.array([0, 1, 4]), NOTHING, EDGES),
+        "patch": Group(2, np.array([0, 1, 2]), np.array([0]), NOTHING.reshape(0, 2)),
+    }
+    return Mesh(REST + 1.0, REST, TRIANGLES, REST[TRIANGLES][..., :2], np.ones(3, dtype=bool), groups)
+
+
+@pytest.fixture
+def compare(comm, shared_tmp):
+    """Compares a mesh, as it stands on rank 0, with the strip on disk."""
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+
+    def check(mesh, groups=("a/b", "patch")):
+        check_same_mesh(shared_tmp, mesh if comm.rank == 0 else None, groups, comm)
+
+    return check
+
+
+def moved(rows, row, by):
+    rows = rows.copy()
+    rows[row, -1] += by
+    return rows
+
+
+def with_group(name, group):
+    mesh = strip()
+    return replace(mesh, groups=mesh.groups | {name: group})
+
+
+def test_the_same_mesh(compare):
+    compare(strip())
+    # another machine's rounding of a rotation
+    compare(replace(strip(), positions=strip().positions * (1 + 1e-15), rest=REST * (1 + 1e-15)))
+    compare(with_group("new", Group(0, np.array([3]), NOTHING, NOTHING.reshape(0, 2))), ("new", "patch"))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "words"),
+    [
+        (replace(strip(), rest=moved(REST, 3, 1e-6)), "vertex 3 stands 1e-06 m off at rest"),
+        (replace(strip(), positions=moved(REST + 1, 4, 0.5)), r"vertex 4 stands 0\.5 m off at the start"),
+        (replace(strip(), triangles=TRIANGLES[:, [1, 2, 0]]), "triangle 0 has other vertices"),
+        (
+            replace(strip(), triangles=TRIANGLES[:2], triangle_uv=strip().triangle_uv[:2]),
+            "2 triangles, not 5",
+        ),
+        (replace(strip(), triangle_uv=strip().triangle_uv * 1.1), "other material coordinates"),
+        (replace(strip(), triangle_uv=moved(strip().triangle_uv, 1, 0.1)), "other material coordinates"),
+        (with_group("a/b", Group(1, np.array([0, 1]), NOTHING, EDGES[:1])), "group 'a/b' has other members"),
+        (
+            with_group("patch", Group(0, np.array([0, 1, 2]), NOTHING, NOTHING)),
+            "group 'patch' has other members",
+        ),
+    ],
+)
+def test_another_mesh_is_refused(compare, mesh, words):
+    with pytest.raises(InputError, match=words) as caught:
+        compare(mesh)
+    assert "\n" not in str(caught.value)
+    assert "run without --resume" in str(caught.value)
+
+
+def test_a_group_that_the_scene_does_not_use_may_change(compare):
+    compare(with_group("patch", Group(0, np.array([4]), NOTHING, NOTHING.reshape(0, 2))), ("a/b",))
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"no")])
+def test_a_mesh_file_that_is_missing_or_damaged(comm, shared_tmp, compare, damage):
+    comm.Barrier()
+    if comm.rank == 0:
+        damage(shared_tmp / MESH_FILE)
+    comm.Barrier()
+    with pytest.raises(InputError, match=r"mesh\.h5: cannot be read"):
+        compare(strip())

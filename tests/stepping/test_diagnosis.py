@@ -1,0 +1,242 @@
+"""A step that cannot be taken: what is said of it, the same on any number of ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.errors import SolverError
+from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping import equilibrium
+from lyra_petsc.stepping.diagnosis import worst
+from lyra_petsc.stepping.failure import Failure
+
+pytestmark = pytest.mark.parallel
+
+Array = NDArray[np.float64]
+Spoil = Callable[[Simulation, Array], None]
+
+SCENE: dict[str, Any] = {
+    "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
+    "material": CLOTH | {"bending": 1e-4},
+    "gravity": [0, 0, -9.81],
+    "handles": [{"nodes": [0, 5]}],
+    "time": {"end": 1.0, "step": 0.01},
+}
+STIFF = CLOTH | {"membrane": {"c11": 1.2e6, "c22": 1.2e6, "c12": 0.0, "c33": 6e5}, "bending": 1e-4}
+ONE_ATTEMPT = {"ts_adapt_dt_min": "1.0"}
+"""No Δt is that large, so that none is tried twice."""
+
+
+@contextmanager
+def failing(
+    comm: MPI.Comm,
+    scene: Mapping[str, Any],
+    spoil: Spoil | None = None,
+    options: Mapping[str, str] = ONE_ATTEMPT,
+) -> Iterator[tuple[Simulation, SolverError, Failure]]:
+    """A simulation whose step fails, and what it says of that."""
+    direct = {"pc_type": "lu", "ksp_rtol": "1e-12"}
+    if comm.size > 1:
+        direct["pc_factor_mat_solver_type"] = "mumps"
+    database = PETSc.Options()
+    for name, value in (direct | dict(options)).items():
+        database.setValue(name, value)
+    simulation = Simulation(comm, scene_of({**SCENE, **scene}))
+    if spoil is not None:
+        system = simulation.model.system
+        plain = system.residual
+
+        def spoiled(v: Array, vdot: Array, out: Array) -> None:
+            plain(v, vdot, out)
+            spoil(simulation, out)
+
+        system.residual = spoiled  # type: ignore[method-assign]
+
+    def run() -> None:
+        while not simulation.finished:
+            simulation.step()
+
+    with pytest.raises(SolverError) as caught:
+        run()
+    assert simulation.failure is not None
+    yield simulation, caught.value, simulation.failure
+    simulation.destroy()
+    for name in [*direct, *options, *simulation.stepper.our_options]:
+        database.delValue(name)
+
+
+def pushed(vertex: int, value: float) -> Spoil:
+    """Put a force that nothing balances on one vertex of the mesh."""
+
+    def spoil(simulation: Simulation, out: Array) -> None:
+        out[simulation.model.points.original == vertex] = value
+
+    return spoil
+
+
+def test_the_vertex_and_triangle_with_the_largest_residual_are_named(comm: MPI.Comm) -> None:
+    with failing(comm, {}, pushed(17, 1e6)) as (simulation, error, failure):
+        assert error.collective
+        vertex, triangle = failure.diagnosis.vertex, failure.diagnosis.triangle
+        assert vertex.number == 17
+        mesh = simulation.model.mesh
+        stored = comm.bcast((mesh.positions, mesh.triangles) if mesh is not None else None)
+        assert vertex.before == pytest.approx(stored[0][17])
+        # all triangles around it are as bad: the smallest number is named
+        around = np.flatnonzero((stored[1] == 17).any(axis=1))
+        assert len(around) > 1
+        assert triangle.number == around.min()
+        assert list(triangle.vertices) == stored[1][triangle.number].tolist()
+        assert f"vertex 17 around ({stored[0][17][0]:.4g}, {stored[0][17][1]:.4g}, 0) m" in str(error)
+        assert f"triangle {triangle.number};" in str(error)
+        assert comm.allgather(str(error)) == [str(error)] * comm.size
+        assert comm.allgather(error.details) == [error.details] * comm.size
+
+
+def test_numbers_that_overflow_on_one_rank_are_met_by_all(comm: MPI.Comm) -> None:
+    with failing(comm, {}, pushed(23, np.nan)) as (_, error, failure):
+        assert failure.kind == "overflow"
+        assert failure.diagnosis.not_finite == 1
+        assert failure.diagnosis.vertex.number == 23
+        assert "overflow" in str(error)
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_what_overflows_is_told_by_its_key(comm: MPI.Comm) -> None:
+    with failing(comm, {"gravity": [0, 0, -1e200]}) as (_, error, failure):
+        assert failure.kind == "overflow"
+        assert failure.diagnosis.overflowing == ["loads"]
+        assert "try smaller numbers where one is absurd, or lost its unit: in gravity and loads" in str(error)
+
+
+def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
+    scene = {"material": STIFF, "solver": {"max_iterations": 3}, "time": {"end": 1.0, "step": 0.04}}
+    with failing(MPI.COMM_SELF, scene) as (_, _, alone):
+        pass
+    with failing(comm, scene) as (simulation, error, together):
+        for one, other in ((alone.diagnosis.vertex, together.diagnosis.vertex),
+                           (alone.diagnosis.triangle, together.diagnosis.triangle)):  # fmt: skip
+            assert one.number == other.number
+        residual = gathered(simulation.model.points, together.stuck.residual)
+        residual[[0, 5]] = 0.0
+        sizes = np.linalg.norm(residual, axis=1)
+        assert together.diagnosis.vertex.number == sizes.argmax()
+        assert together.diagnosis.norm == pytest.approx(np.linalg.norm(residual))
+        assert together.diagnosis.norm == pytest.approx(alone.diagnosis.norm, rel=1e-5)
+        assert together.kind == "nonlinear trouble"
+        norms = [each.residual for each in together.stuck.iterations]
+        assert len(norms) == 4
+        assert norms[-1] == pytest.approx(together.diagnosis.norm)
+        assert error.details[0].startswith("residual [N] by iteration (linear iterations): ")
+        assert "try solver.max_iterations above 3" in str(error)
+
+
+def test_earlier_attempts_are_told(comm: MPI.Comm) -> None:
+    time = {"end": 1.0, "step": 0.04}
+    scene = {"material": STIFF, "solver": {"max_iterations": 1}, "time": time}
+    with failing(comm, scene, options={"ts_adapt_dt_min": "0.005"}) as (_, error, failure):
+        assert [tried.dt for tried in failure.tried] == pytest.approx([0.04, 0.02, 0.01, 0.005])
+        assert all(tried.newton_iterations == 1 and tried.residual > 0.0 for tried in failure.tried)
+        (line,) = [line for line in error.details if line.startswith("attempts before")]
+        assert line.count(" (1)") == 3
+        assert "-ts_adapt_dt_min below 0.005" in " ".join(error.details)
+
+
+def test_a_handle_that_jumps_is_named(comm: MPI.Comm) -> None:
+    scene = {
+        "handles": [{"nodes": [0]}, {"nodes": [5, 29], "motion": "jump"}],
+        "motions": {"jump": [{"time": 0.0}, {"time": 1e-3, "translate": [3.0, 0, 0]}]},
+        "solver": {"max_iterations": 2},
+    }
+    with failing(comm, scene) as (_, error, failure):
+        assert failure.diagnosis.handle == 1
+        assert failure.diagnosis.jump == pytest.approx(3.0)
+        told = " ".join([str(error), *error.details])
+        assert "try more time for motions.jump (handles[1] moves 3 m in this step" in told
+
+
+def test_a_linear_solver_that_fails_is_told_apart(comm: MPI.Comm) -> None:
+    scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}, "material": STIFF}
+    iterative = ONE_ATTEMPT | {"pc_type": "jacobi", "ksp_max_it": "2"}
+    with failing(comm, scene, options=iterative) as (_, error, failure):
+        assert failure.kind == "linear trouble"
+        assert "the linear solve failed: too many linear iterations (linear trouble)" in str(error)
+        assert "try -ksp_max_it above 2" in str(error)
+        assert "in 2 iterations" in error.details[0]
+        assert "a direct solver" in " ".join(error.details)
+
+
+def test_a_velocity_that_is_not_finite_stops_the_run_in_words(comm: MPI.Comm) -> None:
+    def lost(simulation: Simulation, out: Array) -> None:
+        out[:] = np.inf
+
+    scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}}
+    with failing(comm, scene, lost) as (_, error, failure):
+        assert failure.kind == "overflow"
+        assert "overflow" in str(error)
+
+
+def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equilibrium, "MOST_SOLVES", 2)
+    with failing(comm, {"time": {"analysis": "static"}}) as (simulation, error, failure):
+        assert "(load factor 0) did not converge even with an increment of" in str(error)
+        assert "no equilibrium within 2 proximal steps" in str(error)
+        assert len(failure.stuck.iterations) == 2
+        assert failure.stuck.time == pytest.approx(failure.dt)
+        force = failure.stuck.residual
+        assert np.sqrt(comm.allreduce(float(np.vdot(force, force)))) == pytest.approx(failure.diagnosis.norm)
+        # the state is the one before the load step, the iterate another
+        x = simulation.model.system.x[: simulation.model.points.n_owned]
+        assert comm.allreduce(float(np.abs(x[:, 2]).max(initial=0.0)), MPI.MAX) == 0.0
+        assert comm.allreduce(float(np.abs(failure.stuck.position - x).max(initial=0.0)), MPI.MAX) > 0.0
+
+
+def test_without_handles_an_equilibrium_is_not_sought_in_vain(comm: MPI.Comm) -> None:
+    with failing(comm, {"time": {"analysis": "static"}, "handles": []}) as (_, error, _):
+        assert "try handles (nothing holds the sheet)" in str(error)
+
+
+def test_numbers_are_those_of_the_files(comm: MPI.Comm, shared_tmp: Path) -> None:
+    triangles = (
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n5\n7 0 0 0\n9 5 5 5\n11 1 0 0\n30 0 1 0\n31 1 1 0\n"
+    )
+    triangles += "$EndNodes\n$Elements\n2\n1 2 2 0 1 7 11 30\n2 2 2 0 1 11 31 30\n$EndElements\n"
+    if comm.rank == 0:
+        (shared_tmp / "two.msh").write_text(triangles)
+    comm.Barrier()
+    left = {"file": str(shared_tmp / "two.msh")}
+    with failing(comm, {"mesh": left, "handles": [{"nodes": [0]}]}, pushed(3, 1e6)) as (_, error, failure):
+        assert failure.diagnosis.vertex.tag == 31
+        assert "vertex 3 (node 31 of two.msh) around (1, 1, 0) m and triangle 1;" in str(error)
+    right = {"name": "right", **grid(1.0, 1.0, 2, 2), "transform": {"translate": [4, 0, 0]}}
+    mesh = [left, right]
+    with failing(comm, {"mesh": mesh, "handles": [{"nodes": [0, 4]}]}, pushed(12, 1e6)) as (_, error, _):
+        assert "vertex 12 (vertex 8 of right) around (5, 1, 0) m" in str(error)
+        assert "triangle 8 (triangle 6 of right)" in str(error) or "triangle 9 (triangle 7 of right)" in str(
+            error
+        )
+    with failing(comm, {"mesh": mesh, "handles": [{"nodes": [0, 4]}]}, pushed(2, 1e6)) as (_, error, _):
+        assert "vertex 2 (node 30 of two.msh) around (0, 1, 0) m" in str(error)
+
+
+def test_of_equals_the_smallest_number_is_the_worst(comm: MPI.Comm) -> None:
+    # ten rows dealt to the ranks backwards; rows 3, 4 and 8 are equal but for round-off
+    numbers = np.arange(10)[::-1][comm.rank :: comm.size]
+    sizes = np.array([0.0, 1, 2, 7 * (1 - 1e-9), 7, 5, 6, 4, 7 * (1 + 1e-9), 3])[numbers]
+    assert worst(comm, sizes, numbers, lambda row: int(numbers[row])) == 3
+    assert worst(comm, np.where(numbers < 6, sizes, np.inf), numbers, lambda row: int(numbers[row])) == 6
+    assert worst(comm, np.zeros(len(numbers)), numbers, lambda row: int(numbers[row])) == 0
+    # a rank without rows
+    mine = numbers if comm.rank == comm.size - 1 else numbers[:0]
+    least = int(np.arange(10)[::-1][comm.size - 1 :: comm.size].min())
+    assert worst(comm, np.ones(len(mine)), mine, lambda row: int(mine[row])) == least

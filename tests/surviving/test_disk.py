@@ -1,0 +1,128 @@
+"""Full disks, limits, folders that vanish: clear words, exit code 3, and what was announced stands."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from launch import DIRECT, Left, done, finish, lyra, start, write_scene
+from leftovers import ENDLESS, SHEET, announced, ranks_in, steps, wait_for_states
+
+LIMITED = """
+import resource, sys
+import lyra_petsc.recorder as recorder
+from lyra_petsc.cli.app import run_command_line
+
+begin = recorder.Recorder.begin
+
+def begin_and_limit(self, folder):
+    begin(self, folder)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+
+recorder.Recorder.begin = begin_and_limit
+sys.exit(run_command_line(sys.argv))
+"""
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 200 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(words, capture_output=True).returncode != 0:
+        pytest.skip("mounting a tmpfs is not permitted here")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def refused(left: Left, words: str) -> None:
+    """Exit code 3, one line of ours with these words, no traceback."""
+    assert left.code == 3, left.err
+    (line,) = left.ours
+    assert words in line
+    assert "Traceback" not in left.err
+
+
+def goes_on(scene: Path, out: Path, folder: Path, ranks: int = 1) -> None:
+    """The run resumes behind its last whole state, without a gap or a double."""
+    before = announced(out)
+    end = before[-1] + 0.1
+    done(["run", scene, "--out", out, "--resume", "--set", f"time.end={end:.3f}"], folder, ranks)
+    after = announced(out)
+    assert after[: len(before)] == before
+    assert after == pytest.approx([0.02 * k for k in range(len(after))])
+    assert steps(out) == list(range(4 * (len(after) - 1) + 1))
+    assert not [entry.name for entry in out.iterdir() if entry.suffix in (".part", ".lock")]
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_a_full_disk(tmp_path: Path, small_disk: Path, ranks: int) -> None:
+    scene = write_scene(tmp_path, ENDLESS)
+    left = lyra(["run", scene, "--out", "disk/out"], tmp_path, ranks)
+    refused(left, "cannot be written: No space left on device")
+    assert "--resume goes on" in left.err
+    assert not ranks_in(tmp_path)
+    assert len(announced(small_disk / "out")) > 1
+    subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
+    goes_on(scene, small_disk / "out", tmp_path, ranks)
+
+
+def test_a_disk_full_from_the_start(tmp_path: Path, small_disk: Path) -> None:
+    (small_disk / "filler").write_bytes(bytes(150_000))
+    left = lyra(["run", write_scene(tmp_path, ENDLESS), "--out", "disk/out"], tmp_path)
+    refused(left, "No space left on device")
+    (small_disk / "filler").unlink()
+    done(["run", write_scene(tmp_path, SHEET % 0.02), "--out", "disk/out", "--force"], tmp_path)
+    assert announced(small_disk / "out") == [0.0, 0.02]
+
+
+@pytest.mark.parametrize("limit", [20_000, 68_500])
+def test_a_limit_on_the_size_of_files(tmp_path: Path, limit: int) -> None:
+    """The smaller one meets a state, the larger one the history in the middle of a row."""
+    program = tmp_path / "limited.py"
+    program.write_text(LIMITED.format(limit=limit))
+    scene = write_scene(tmp_path, ENDLESS)
+    every = ["--set", "output.every=0.5"] if limit > 60_000 else []
+    left = lyra(["run", scene, "--out", "out", *every, *DIRECT], tmp_path, program=(str(program),))
+    refused(left, "cannot be written: File too large")
+    if every:
+        assert "history.csv" in left.ours[0]
+        assert not (tmp_path / "out/history.csv").read_text().endswith("\n")
+        last = announced(tmp_path / "out")[-1]
+        more = ["--set", "output.every=0.5", "--set", f"time.end={last + 0.5}"]
+        done(["run", scene, "--out", "out", "--resume", *more, *DIRECT], tmp_path)
+        assert steps(tmp_path / "out") == list(range(round((last + 0.5) / 0.005) + 1))
+    else:
+        goes_on(scene, tmp_path / "out", tmp_path)
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_the_folder_vanishes(tmp_path: Path, ranks: int) -> None:
+    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, ranks)
+    wait_for_states(tmp_path / "out", 4)
+    (tmp_path / "out").rename(tmp_path / "elsewhere")
+    left = finish(process)
+    refused(left, "cannot be written: No such file or directory")
+    assert "is gone" in left.err
+    assert not ranks_in(tmp_path)
+    assert len(announced(tmp_path / "elsewhere")) >= 3
+    done(["run", "--out", "elsewhere", "--resume", "-ts_max_steps", "1"], tmp_path)
+
+
+def test_a_folder_that_becomes_read_only(tmp_path: Path, small_disk: Path) -> None:
+    subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
+    scene = write_scene(tmp_path, ENDLESS)
+    done(["run", scene, "--out", "disk/out", "-ts_max_steps", "8"], tmp_path)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    for words in (["--out", "disk/out", "--resume"], ["--out", "disk/out", "--force"], ["--out", "disk/new"]):
+        left = lyra(["run", scene, *words], tmp_path)
+        assert left.code == 2, left.err
+        (line,) = left.ours
+        assert "Read-only file system" in line or "no permission to write" in line
+    assert len(announced(small_disk / "out")) == 3
+    subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+    goes_on(scene, small_disk / "out", tmp_path)

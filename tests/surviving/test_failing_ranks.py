@@ -1,0 +1,143 @@
+"""One rank that fails ends the job within 20 s, wherever it is, and no process stays behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from launch import Left, done, finish, start, write_scene
+from leftovers import ENDLESS, announced, ranks_in, wait_for_states
+
+WITHIN = 20.0
+
+FAILING = """
+import resource, sys, time
+from pathlib import Path
+import numpy as np
+from mpi4py import MPI
+import lyra_petsc.{module} as module
+from lyra_petsc.cli.app import run_command_line
+
+right = module.{name}
+calls = 0
+
+def out_of_memory():
+    now = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (now, now))
+    hoard = [np.ones(2**18) for _ in range(10**6)]
+
+def wrong(*arguments, **keywords):
+    global calls
+    calls += 1
+    if MPI.COMM_WORLD.rank == {rank} and calls > {after}:
+        Path("failed").touch()
+        {what}
+    return right(*arguments, **keywords)
+
+module.{name} = wrong
+sys.exit(run_command_line(sys.argv))
+"""
+
+PLACES = {
+    "meshing": ("model", "build_mesh", 0),
+    "distributing": ("model", "distribute", 0),
+    "assembly": ("model", "BlockPattern", 0),
+    "residual": ("stepping.system", "ReducedSystem.residual", 25),
+    "jacobian": ("stepping.system", "ReducedSystem.jacobian", 9),
+    "writing a state": ("output.hdf5", "write_by_all", 3),
+    "a row of the history": ("output.history", "History.append", 4),
+}
+
+
+def job(folder: Path, place: str, what: str, rank: int, ranks: int) -> Left:
+    """A run with a fault, which must end in time."""
+    module, name, after = PLACES[place]
+    program = folder / "failing.py"
+    program.write_text(FAILING.format(module=module, name=name, after=after, what=what, rank=rank))
+    process = start(
+        ["run", write_scene(folder, ENDLESS), "--out", "out"], folder, ranks, program=(str(program),)
+    )
+    deadline = time.monotonic() + 60
+    while not (folder / "failed").exists():
+        assert time.monotonic() < deadline, "the fault is never reached"
+        time.sleep(0.01)
+    failed = time.monotonic()
+    left = finish(process, patience=60)
+    while ranks_in(folder):
+        assert time.monotonic() - failed < WITHIN, "ranks stay behind"
+        time.sleep(0.05)
+    assert time.monotonic() - failed < WITHIN
+    return left
+
+
+@pytest.mark.parametrize(
+    ("place", "rank", "ranks"),
+    [
+        ("meshing", 0, 2),
+        ("distributing", 1, 2),
+        ("assembly", 2, 3),
+        ("residual", 0, 2),
+        ("jacobian", 1, 3),
+        ("writing a state", 1, 2),
+        ("a row of the history", 1, 2),
+    ],
+)
+def test_an_exception(tmp_path: Path, place: str, rank: int, ranks: int) -> None:
+    left = job(tmp_path, place, "raise ZeroDivisionError('here')", rank, ranks)
+    assert left.code not in (0, 2, 3)
+    assert f"internal error on rank {rank}: ZeroDivisionError: here" in left.err
+
+
+@pytest.mark.parametrize(("place", "rank"), [("distributing", 1), ("residual", 0), ("jacobian", 1)])
+def test_no_memory_left(tmp_path: Path, place: str, rank: int) -> None:
+    left = job(tmp_path, place, "out_of_memory()", rank, 2)
+    assert left.code not in (0, 2, 3)
+    assert f"out of memory on rank {rank}: MemoryError" in left.err
+
+
+def test_an_error_of_ours_on_one_rank_only(tmp_path: Path) -> None:
+    """Which should never be; the others are not waited for."""
+    what = "from lyra_petsc.errors import OutputError; raise OutputError('nowhere: cannot be written')"
+    left = job(tmp_path, "a row of the history", what, 1, 2)
+    assert left.code != 0
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_killed_during_the_set_up(tmp_path: Path, rank: int) -> None:
+    left = job(tmp_path, "assembly", "import os; os.kill(os.getpid(), 9)", rank, 2)
+    assert left.code != 0
+    # only the lock's file may stand, and it is no obstacle
+    assert [entry.name for entry in (tmp_path / "out").iterdir()] == ["run.lock"]
+    done(["run", "scene.yaml", "--out", "out", "-ts_max_steps", "2"], tmp_path)
+
+
+@pytest.mark.parametrize("rank", [0, 2])
+def test_killed_during_the_steps(tmp_path: Path, rank: int) -> None:
+    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 3)
+    wait_for_states(tmp_path / "out", 3)
+    began = time.monotonic()
+    os.kill(sorted(ranks_in(tmp_path))[rank], signal.SIGKILL)
+    left = finish(process)
+    assert left.code != 0
+    while ranks_in(tmp_path):
+        assert time.monotonic() - began < WITHIN
+        time.sleep(0.05)
+    assert time.monotonic() - began < WITHIN
+    before = announced(tmp_path / "out")
+    done(["run", "--out", "out", "--resume", "--set", f"time.end={before[-1] + 0.04:.3f}"], tmp_path)
+    assert announced(tmp_path / "out")[: len(before)] == before
+
+
+def test_the_launcher_killed(tmp_path: Path) -> None:
+    process = start(["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, 2)
+    wait_for_states(tmp_path / "out", 3)
+    began = time.monotonic()
+    process.kill()
+    process.communicate()
+    while ranks_in(tmp_path):
+        assert time.monotonic() - began < WITHIN, "ranks stay behind"
+        time.sleep(0.05)
+    assert announced(tmp_path / "out")
