@@ -223,12 +223,12 @@ class Simulation:
     def _recover(self, attempt: Attempt, end: float) -> None:
         self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
-            previous = self.stepper.preset
+            previous, slow = self.stepper.preset, self.stepper.linear_solver_slow
             following = self.stepper.next_preset()
             if following is not None:
+                why = "took too many iterations" if slow else "broke down"
                 self.notes.append(
-                    f"step {self.step_number + 1}: linear solver '{previous}' broke down, "
-                    f"going on with '{following}'"
+                    f"step {self.step_number + 1}: linear solver '{previous}' {why}, going on with '{following}'"
                 )
                 return
         if not self.control.failed():

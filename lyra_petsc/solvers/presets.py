@@ -8,11 +8,21 @@ storage came out wrong when factored again (PETSc 3.18, ``baij``, fill 1).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from lyra_petsc.solvers.options import Value, is_set
 
 PRESETS: dict[str, dict[str, Value]] = {
     # what an equilibrium without inertia's help asks for: bending is a millionth of the membrane
     "direct": {"mat_type": "aij", "ksp_type": "cg", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
+    # on one rank: half the work, and without optimised BLAS faster than multifrontal codes
+    "cholesky": {
+        "mat_type": "aij",
+        "ksp_type": "cg",
+        "pc_type": "cholesky",
+        "pc_factor_mat_ordering_type": "qmd",
+    },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
     # symmetric sweeps instead of PETSc's Chebyshev default, whose bounds age within a step. No
@@ -34,16 +44,29 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor"})
 
 
 DIRECT_UNTIL = 30_000
-"""Vertices up to which an equilibrium is sought with a direct factorisation."""
+"""Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
+
+FACTOR_COST = 10.0
+"""A factorisation costs as much as this times √vertices iterations of conjugate gradients."""
 
 
-def candidates(n_vertices: int, *, static: bool = False) -> list[str]:
+def candidates(n_vertices: int, ranks: int, *, static: bool = False) -> list[str]:
     """Presets to try in order; only ``user`` when the user chose the preconditioner."""
     if is_set("pc_type"):
         return ["user"]
     if static and n_vertices <= DIRECT_UNTIL:
         return ["direct", "gamg", "block-jacobi"]
-    return ["gamg", "block-jacobi"] if n_vertices >= MULTIGRID_FROM else ["block-jacobi", "gamg"]
+    factor = "cholesky" if ranks == 1 else "direct"
+    if n_vertices < MULTIGRID_FROM:
+        return ["block-jacobi", factor, "gamg"]
+    return ["gamg", factor, "block-jacobi"] if n_vertices <= DIRECT_UNTIL else ["gamg", "block-jacobi"]
+
+
+def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
+    """Linear iterations per Newton iteration from which the factorisation that is next pays."""
+    if len(presets) > 1 and presets[1] in ("cholesky", "direct"):
+        return FACTOR_COST * math.sqrt(n_vertices)
+    return math.inf
 
 
 def options_of(name: str, chosen_pc: str) -> dict[str, Value]:

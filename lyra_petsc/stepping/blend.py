@@ -8,10 +8,18 @@ singular Hessian shows in the line search: a step that had to be cut asks for mo
 
 from __future__ import annotations
 
+import math
+
 FIRST = 0.05
 RAISE = 4.0
 LOWER = 0.25
 SMALLEST = 1e-3
+CLOSE = 0.7
+"""Fraction of one that was enough up to which less is tried."""
+
+FORGET = 0.7
+"""By how much what was too little falls in an iteration, so that less is tried again."""
+
 CUT = 0.5
 """Fraction of a step taken by the line search below which the Hessian was too soft."""
 
@@ -32,19 +40,34 @@ class Blend:
     def __init__(self, mode: str) -> None:
         self._adaptive = mode == "adaptive"
         self.value = 1.0 if mode == "regularised" else 0.0
+        # what was too little lately, and what was enough: the least lies between them
+        self._too_little, self._enough = 0.0, 1.0
 
     def after(self, taken: float) -> float:
         """The fraction for the next iteration, when the line search took ``taken`` of the last step."""
         if taken < CUT:
             self.raise_()
         elif self._adaptive:
+            self._enough = self.value
             lowered = LOWER * self.value
+            if lowered <= self._too_little < self.value:
+                lowered = self._between(self._too_little, self.value)
             self.value = lowered if lowered > SMALLEST else 0.0
+            self._too_little *= FORGET
         return self.value
 
     def raise_(self) -> bool:
         """Take more, after negative curvature was met; False if there is no more."""
         if not self._adaptive or self.value >= 1.0:
             return False
-        self.value = min(1.0, max(FIRST, RAISE * self.value))
+        self._too_little = self.value
+        raised = max(FIRST, RAISE * self.value)
+        if self.value < self._enough < raised:
+            raised = self._between(self.value, self._enough)
+        self.value = min(1.0, raised)
         return True
+
+    @staticmethod
+    def _between(low: float, high: float) -> float:
+        """A fraction between two, in the middle of their logarithms; the upper one where they are close."""
+        return math.sqrt(low * high) if 0.0 < low < CLOSE * high else high

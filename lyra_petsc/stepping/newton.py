@@ -22,6 +22,16 @@ ENERGY_ROUNDOFF = 1e-14
 """Differences of the objective below this fraction of its summands are noise."""
 
 
+STALLED = 0.5
+"""Fraction of the residual left by an iteration above which, at the round-off floor, it falls no more."""
+
+NEAR = 1e-3
+"""Last increment over element size below which the preconditioner is kept."""
+
+JUDGED = 2
+"""Newton iterations by whose linear iterations the linear solver is judged."""
+
+
 class Newton:
     """Callbacks of one SNES and the memory between them.
 
@@ -40,6 +50,8 @@ class Newton:
         Norm [N] of the residual's round-off.
     iterates : bool
         There is more than one iteration (not so under ``semi-implicit``).
+    linear_limit : float
+        Linear iterations per Newton iteration above which another preconditioner is cheaper.
 
     Attributes
     ----------
@@ -49,6 +61,8 @@ class Newton:
         Whether the solve ended because only round-off was left.
     more_linear : int
         Linear iterations of directions that were solved for again.
+    too_slow : bool
+        Whether the solve was given up since its linear iterations passed the limit.
     """
 
     def __init__(
@@ -63,8 +77,9 @@ class Newton:
         floor: float,
         *,
         iterates: bool,
+        linear_limit: float,
     ) -> None:
-        self._iterates = iterates
+        self._iterates, self._linear_limit = iterates, linear_limit
         self._snes, self._ksp, self._system = snes, snes.getKSP(), system
         self._matrix, self._preconditioner, self._blend = matrix, preconditioner, blend
         self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
@@ -80,6 +95,8 @@ class Newton:
         self._length = self._first_norm = self._at_norm = 0.0
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
+        self._stalled, self.too_slow, self._increment = 0, False, np.inf
+        self._spent: list[int] = [0]
         self._watchdog.begin()
         self.forcing.begin()
 
@@ -90,7 +107,8 @@ class Newton:
             self._system.new_iterate(v)
             self.forcing.before_solve(self.norm)
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
-        if self._preconditioner is not self._matrix:
+        # near the solution the geometry hardly changes: what was set up an iteration ago still serves
+        if self._preconditioner is not self._matrix and not self._increment <= NEAR * self._spacing:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
 
     def remember(self, u: PETSc.Vec) -> None:
@@ -158,12 +176,20 @@ class Newton:
     def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
         """SNES's reason to stop, in terms of the scene's tolerances and of the user's ``-snes_*tol``."""
         _, _, residual = norms
-        self.norm = residual
+        before, self.norm = self.norm, residual
         if not np.isfinite(residual):
             return NOT_A_NUMBER
-        if residual <= self._floor:
-            self.at_roundoff = True
+        self._stalled = self._stalled + 1 if STALLED * before < residual <= self._floor else 0
+        if self._stalled > 1 or residual == 0.0:
+            self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
+        if iteration > 0:
+            self._increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
+        spent = snes.getLinearSolveIterations() + self.more_linear
+        self._spent.append(spent)
+        if iteration >= JUDGED and spent - self._spent[-1 - JUDGED] > JUDGED * self._linear_limit:
+            self.too_slow = True
+            return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol, _ = snes.getTolerances()
         if residual <= atol:
             return int(Reason.CONVERGED_FNORM_ABS)
@@ -172,14 +198,13 @@ class Newton:
             return None
         if residual <= rtol * self._first_norm:
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
         forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
         scale = float(np.sqrt(forces.max()))
         if (
             residual <= self._tolerances.force_tolerance * scale
-            and increment <= self._tolerances.step_tolerance * self._spacing
+            and self._increment <= self._tolerances.step_tolerance * self._spacing
         ):
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < increment <= stol * self._spacing:
+        if 0.0 < self._increment <= stol * self._spacing:
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None

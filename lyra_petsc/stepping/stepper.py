@@ -17,9 +17,10 @@ from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.solvers.presets import candidates, options_of
+from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import LOOSEST
+from lyra_petsc.stepping.guess import first_guess
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.stepping.trace import Stuck, Trace
@@ -86,7 +87,8 @@ class Stepper:
         self._scene, self._system, self._pattern = scene, system, pattern
         self._spacing, self._floor = spacing, floor
         self._iterates = scene.time.scheme != "semi-implicit"
-        self.presets = candidates(system.points.n_global, static=scene.time.scheme == "static")
+        points = system.points
+        self.presets = candidates(points.n_global, points.comm.size, static=scene.time.scheme == "static")
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
@@ -135,6 +137,7 @@ class Stepper:
             self._spacing,
             self._floor,
             iterates=self._iterates,
+            linear_limit=linear_limit(points.n_global, self.presets),
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, system, self._linear_iterations)
@@ -255,7 +258,7 @@ class Stepper:
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
         else:
             words = reasons.in_words(self.snes, self.ksp)
-            self._linear_failed = reasons.preconditioner_failed(self.ksp)
+            self._linear_failed = self._newton.too_slow or reasons.preconditioner_failed(self.ksp)
         stuck = self._trace.stuck()
         self.ts.setTime(t0)
         self.ts.setTimeStep(t1 - t0)
@@ -274,6 +277,11 @@ class Stepper:
     @blend.setter
     def blend(self, value: float) -> None:
         self._blend.value = value
+
+    @property
+    def linear_solver_slow(self) -> bool:
+        """Whether it did not fail, but took more iterations than another one would cost."""
+        return self._newton.too_slow
 
     @property
     def linear_solver_failed(self) -> bool:
@@ -295,7 +303,7 @@ class Stepper:
         self._system.residual(v, rate, out)
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
-        self._system.first_guess(u.getArray().reshape(self._shape))
+        first_guess(self._system, u.getArray().reshape(self._shape))
 
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat

@@ -212,11 +212,15 @@ class ReducedSystem:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
         return self._vs[: self.points.n_owned]
 
-    def first_guess(self, v: Array) -> None:
-        """Overwrite v (n_owned, 3) by where Newton starts: prescribed coordinates exactly."""
-        v[:] = 0.0 if self.scheme.explicit else self.v[: self.points.n_owned]
+    def prescribe(self, v: Array) -> None:
+        """Overwrite the prescribed coordinates of v (n_owned, 3) by their velocities at the stage."""
         if self.held:
             np.copyto(v, self._prescribed.velocity, where=~self._prescribed.free)
+
+    def velocity_of_staying(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
+        n = self.points.n_owned
+        return (self.x[:n] - self._xh[:n]) / self.stage.reach
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""

@@ -1,0 +1,28 @@
+"""Where Newton starts: with the velocities of the last step, or at rest where it stands.
+
+The former is right where the motion is smooth. In stiff sheets that turn, going on along the tangents
+stretches the sheet by far more than the step will, and staying is nearer; the objective tells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.system import ReducedSystem
+
+Array = NDArray[np.float64]
+
+
+def first_guess(system: ReducedSystem, out: Array) -> None:
+    """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
+    n = system.points.n_owned
+    if system.scheme.explicit:
+        out[:] = 0.0
+        system.prescribe(out)
+        return
+    going_on, staying = system.v[:n].copy(), system.velocity_of_staying()
+    system.prescribe(going_on)
+    system.prescribe(staying)
+    less = system.objective(staying)[0] < system.objective(going_on)[0]
+    out[:] = staying if less else going_on
