@@ -17,7 +17,7 @@ SMALLEST = 1e-3
 CLOSE = 0.7
 """Fraction of one that was enough up to which less is tried."""
 
-FORGET = 0.7
+FORGET = 0.3
 """By how much what was too little falls in an iteration, so that less is tried again."""
 
 CUT = 0.5
