@@ -93,7 +93,6 @@ class Stepper:
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
-        self._left_at: Array | None = None
         self._shape = (system.points.n_owned, 3)
         self._create()
 
@@ -259,8 +258,6 @@ class Stepper:
                 return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
         else:
             words = reasons.in_words(self.snes, self.ksp)
-            if self._newton.too_slow:  # the next linear solver goes on from there
-                self._left_at = self.snes.getSolution().getArray().copy()
             self._linear_failed = self._newton.too_slow or reasons.preconditioner_failed(self.ksp)
         stuck = self._trace.stuck()
         self.ts.setTime(t0)
@@ -306,10 +303,6 @@ class Stepper:
         self._system.residual(v, rate, out)
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
-        if self._left_at is not None:
-            u.setArray(self._left_at)
-            self._left_at = None
-            return
         first_guess(self._system, u.getArray().reshape(self._shape))
 
     def _ijacobian(
