@@ -228,7 +228,8 @@ class Simulation:
             if following is not None:
                 why = "took too many iterations" if slow else "broke down"
                 self.notes.append(
-                    f"step {self.step_number + 1}: linear solver '{previous}' {why}, going on with '{following}'"
+                    f"step {self.step_number + 1}: linear solver '{previous}' {why}, "
+                    f"going on with '{following}'"
                 )
                 return
         if not self.control.failed():

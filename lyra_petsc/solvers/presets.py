@@ -50,14 +50,19 @@ FACTOR_COST = 10.0
 """A factorisation costs as much as this times √vertices iterations of conjugate gradients."""
 
 
-def candidates(n_vertices: int, ranks: int, *, static: bool = False) -> list[str]:
-    """Presets to try in order; only ``user`` when the user chose the preconditioner."""
+def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations: float = 0.0) -> list[str]:
+    """Presets to try in order; only ``user`` when the user chose the preconditioner.
+
+    ``iterations`` is what conjugate gradients with block Jacobi are expected to take.
+    """
     if is_set("pc_type"):
         return ["user"]
     if static and n_vertices <= DIRECT_UNTIL:
         return ["direct", "gamg", "block-jacobi"]
     factor = "cholesky" if ranks == 1 else "direct"
     if n_vertices < MULTIGRID_FROM:
+        if iterations > FACTOR_COST * math.sqrt(n_vertices):
+            return [factor, "block-jacobi", "gamg"]
         return ["block-jacobi", factor, "gamg"]
     return ["gamg", factor, "block-jacobi"] if n_vertices <= DIRECT_UNTIL else ["gamg", "block-jacobi"]
 

@@ -184,7 +184,9 @@ class Newton:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
         if iteration > 0:
-            self._increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
+            self._increment = (
+                snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
+            )
         spent = snes.getLinearSolveIterations() + self.more_linear
         self._spent.append(spent)
         if iteration >= JUDGED and spent - self._spent[-1 - JUDGED] > JUDGED * self._linear_limit:

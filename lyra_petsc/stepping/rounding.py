@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lyra_petsc.stepping.conditioning import vertex_scales
 from lyra_petsc.stepping.system import ReducedSystem
 
 
@@ -12,10 +13,5 @@ def residual_roundoff(system: ReducedSystem, size: float) -> float:
 
     ``size`` [m] is the largest coordinate: differences of such numbers make the strains.
     """
-    points = system.points
-    scale = np.zeros(points.n_local)
-    for term in system.elastic:
-        amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
-        scale += np.bincount(term.stencil.ravel(), amount, points.n_local)
-    square = float(np.sum(scale[: points.n_owned] ** 2))
-    return 10.0 * float(np.finfo(float).eps) * float(np.sqrt(points.comm.allreduce(square)))
+    square = float(np.sum(vertex_scales(system, size) ** 2))
+    return 10.0 * float(np.finfo(float).eps) * float(np.sqrt(system.points.comm.allreduce(square)))

@@ -19,6 +19,7 @@ from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.guess import first_guess
 from lyra_petsc.stepping.newton import Newton
@@ -88,7 +89,10 @@ class Stepper:
         self._spacing, self._floor = spacing, floor
         self._iterates = scene.time.scheme != "semi-implicit"
         points = system.points
-        self.presets = candidates(points.n_global, points.comm.size, static=scene.time.scheme == "static")
+        step = 0.0 if scene.time.step == "auto" else scene.time.step
+        static = scene.time.scheme == "static"
+        expected = 0.0 if static else expected_iterations(system, step)
+        self.presets = candidates(points.n_global, points.comm.size, static=static, iterations=expected)
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []

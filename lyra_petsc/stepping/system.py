@@ -65,8 +65,7 @@ class ReducedSystem:
     load_factor : float
         Factor on all loads (1 in a motion).
     unbalanced, given_loads : (n_owned, 3) or None
-        Of a static analysis: force [N] of the start shape, let go of with the load factor; loads to take
-        instead of those at the present shape.
+        Static: force [N] of the start shape, let go of with the load factor; loads in place of the present.
     """
 
     def __init__(
@@ -204,7 +203,7 @@ class ReducedSystem:
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free coordinates now, norm [N] of its largest part; collective."""
         parts = self._parts(self.x, self.v, np.zeros_like(self.history))
-        squares = self.points.comm.allreduce(np.array([self._norm(part) for part in parts.values()]))
+        squares = self.points.comm.allreduce(np.array([self._norm(p) for p in parts.values()]))
         return np.where(self._prescribed.free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
 
     @property
@@ -219,8 +218,7 @@ class ReducedSystem:
 
     def velocity_of_staying(self) -> Array:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
-        n = self.points.n_owned
-        return (self.x[:n] - self._xh[:n]) / self.stage.reach
+        return ((self.x - self._xh) / self.stage.reach)[: self.points.n_owned]
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
@@ -238,8 +236,7 @@ class ReducedSystem:
 
     def written_velocity(self) -> Array:
         """Velocities (n_owned, 3) to write out: those of prescribed coordinates are ẋ*(t)."""
-        velocity = self.v[: self.points.n_owned].copy()
-        self._prescribed.overwrite_with_rates(velocity)
+        self._prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
     # -- what Newton asks for ----------------------------------------------------------------------
@@ -295,9 +292,8 @@ class ReducedSystem:
 
         Its stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
         """
-        x = None if v is None else self._evaluate_at(v)[0].copy()
-        before = None if x is None else self._iterate
-        self._iterate = x
+        before = None if v is None else self._iterate
+        self._iterate = None if v is None else self._evaluate_at(v)[0].copy()
         for term in self.elastic:
             term.linearise_from(before)
 
