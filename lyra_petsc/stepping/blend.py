@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 
 FIRST = 0.05
-RAISE = 4.0
-LOWER = 0.25
+RAISE = 8.0
+LOWER = 0.5
 SMALLEST = 1e-3
-CLOSE = 0.7
+CLOSE = 0.85
 """Fraction of one that was enough up to which less is tried."""
 
 FORGET = 0.3

@@ -2,8 +2,8 @@
 
 A step of a stiff sheet along the tangents of its rotations stretches it by the square of their angles; the
 next step takes that back at once. A line search that insists on less energy in every step forbids it and
-creeps. So full steps are taken until the energy has not fallen below its best for ``PATIENCE`` iterations;
-then the solve goes back to the best iterate and searches along lines for some iterations.
+creeps. So full steps are taken until the energy has neither fallen below its best nor come halfway down to it
+for ``PATIENCE`` iterations; then the solve goes back to the best iterate and searches along lines for some iterations.
 
 Source: Chamberlain, Powell, Lemarechal & Pedersen, Math. Prog. Study 16 (1982) 1-17 (watchdog technique
 against the Maratos effect).
@@ -19,6 +19,7 @@ PATIENCE = 5
 """Iterations without less energy than ever before after which trust is lost."""
 
 HALVED = 0.5
+"""Of the energy above the best, what is left by then counts as progress."""
 
 PENALTY = 6
 """Iterations with line searches after trust was lost for the first time; doubled each time."""
