@@ -80,5 +80,6 @@ def options_of(name: str, chosen_pc: str) -> dict[str, Value]:
         return PRESETS[name]
     for preset in PRESETS.values():
         if preset["pc_type"] == chosen_pc:
-            return preset
+            # an ordering of ours would not go with every storage that a user may choose
+            return {k: v for k, v in preset.items() if k != "pc_factor_mat_ordering_type"}
     return {"mat_type": "baij" if chosen_pc in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}

@@ -2,8 +2,9 @@
 
 A step of a stiff sheet along the tangents of its rotations stretches it by the square of their angles; the
 next step takes that back at once. A line search that insists on less energy in every step forbids it and
-creeps. So full steps are taken until the energy has neither fallen below its best nor come halfway down to it
-for ``PATIENCE`` iterations; then the solve goes back to the best iterate and searches along lines for some iterations.
+creeps. So full steps are taken until the energy has neither fallen below its best nor come halfway down to
+it for ``PATIENCE`` iterations; then the solve goes back to the best iterate and searches along lines for some
+iterations.
 
 Source: Chamberlain, Powell, Lemarechal & Pedersen, Math. Prog. Study 16 (1982) 1-17 (watchdog technique
 against the Maratos effect).
