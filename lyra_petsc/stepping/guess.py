@@ -1,7 +1,8 @@
 """Where Newton starts: with the velocities of the last step, or at rest where it stands.
 
-The former is right where the motion is smooth. In stiff sheets that turn, going on along the tangents
-stretches the sheet by far more than the step will, and staying is nearer; the objective tells.
+The former is right where the motion is smooth, as those who choose a second-order scheme expect it to be.
+In stiff sheets that crumple, going on along the tangents stretches the sheet by far more than the step will,
+and staying is nearer; the objective tells.
 """
 
 from __future__ import annotations
@@ -21,8 +22,12 @@ def first_guess(system: ReducedSystem, out: Array) -> None:
         out[:] = 0.0
         system.prescribe(out)
         return
-    going_on, staying = system.v[:n].copy(), system.velocity_of_staying()
+    going_on = system.v[:n].copy()
     system.prescribe(going_on)
+    if system.scheme.order > 1:
+        out[:] = going_on
+        return
+    staying = system.velocity_of_staying()
     system.prescribe(staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]
     out[:] = staying if less else going_on

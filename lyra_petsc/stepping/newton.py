@@ -25,8 +25,8 @@ ENERGY_ROUNDOFF = 1e-14
 STALLED = 0.5
 """Fraction of the residual left by an iteration above which, at the round-off floor, it falls no more."""
 
-NEAR = 1e-3
-"""Last increment over element size below which the preconditioner is kept."""
+NEAR, FELL = 1e-3, 0.1
+"""Last increment over element size and fraction of the residual left below which the preconditioner stays."""
 
 JUDGED = 2
 """Newton iterations by whose linear iterations the linear solver is judged."""
@@ -96,6 +96,7 @@ class Newton:
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
         self._stalled, self.too_slow, self._increment = 0, False, np.inf
+        self._fell = self._kept = False
         self._spent: list[int] = [0]
         self._watchdog.begin()
         self.forcing.begin()
@@ -108,7 +109,8 @@ class Newton:
             self.forcing.before_solve(self.norm)
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         # near the solution the geometry hardly changes: what was set up an iteration ago still serves
-        if self._preconditioner is not self._matrix and not self._increment <= NEAR * self._spacing:
+        self._kept = self._increment <= NEAR * self._spacing and self._fell
+        if self._preconditioner is not self._matrix and not self._kept:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
 
     def remember(self, u: PETSc.Vec) -> None:
@@ -137,8 +139,11 @@ class Newton:
             self._system.new_iterate(None)
             return True
         residual = self._snes.getFunction()[0]
-        while self._useless(residual, y) and self._blend.raise_():
+        while self._useless(residual, y) and (self._kept or self._blend.raise_()):
             v = x.getArray(readonly=True).reshape(self._shape)
+            if self._kept:
+                self._preconditioner.set(self._system.jacobian(v, 1.0))
+                self._kept = False
             self._matrix.set(self._system.jacobian(v, self._blend.value))
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
@@ -177,6 +182,7 @@ class Newton:
         """SNES's reason to stop, in terms of the scene's tolerances and of the user's ``-snes_*tol``."""
         _, _, residual = norms
         before, self.norm = self.norm, residual
+        self._fell = residual < FELL * before
         if not np.isfinite(residual):
             return NOT_A_NUMBER
         self._stalled = self._stalled + 1 if STALLED * before < residual <= self._floor else 0
