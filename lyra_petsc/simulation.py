@@ -118,7 +118,7 @@ class Simulation:
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
         self.compression = Compression(self.model)
-        self._told_of_error = False
+        self._told_of_error = self._told_of_roundoff = False
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
@@ -187,6 +187,8 @@ class Simulation:
             note = self.compression.look(f"step {self.step_number} ({self._now()})")
         if note:
             self.notes.append(note)
+        if attempt.at_roundoff and not self._told_of_roundoff:
+            self._tell_of_roundoff(attempt.residual)
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
@@ -194,6 +196,17 @@ class Simulation:
         return StepReport(
             self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds, *stretches
         )
+
+    def _tell_of_roundoff(self, residual: float) -> None:
+        """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
+        loads = float(np.sum(self.model.system.loads_now**2))
+        driving = math.sqrt(self.comm.allreduce(loads))
+        if residual > self.scene.solver.force_tolerance * driving > 0.0:
+            self._told_of_roundoff = True
+            self.notes.append(
+                f"step {self.step_number} ({self._now()}) ended at round-off: double precision leaves a "
+                f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads"
+            )
 
     def _now(self) -> str:
         """The present time, or load factor, in words."""

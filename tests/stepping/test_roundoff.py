@@ -1,0 +1,49 @@
+"""Where stiffness leaves nothing but rounding of a residual, steps move all the same, and say so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.simulation import Simulation
+
+pytestmark = pytest.mark.parallel
+
+GRAVITY = 9.81
+
+
+def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
+    """Lowest z [m] of a light sheet after one step, and what was noted."""
+    c = 120.0 * stiffness
+    scene: dict[str, Any] = {
+        "mesh": grid(1.0, 1.0, 8, 8, "alternating"),
+        "material": CLOTH | {"density": 1.5e-4, "membrane": {"c11": c, "c22": c, "c12": c / 3, "c33": c / 4}},
+        "gravity": [0.0, 0.0, -GRAVITY],
+        "handles": [{"nodes": [0, 8]}],
+        "time": {"end": 0.005, "step": 0.005},
+    }
+    simulation = Simulation(comm, scene_of(scene))
+    while not simulation.finished:
+        simulation.step()
+    points = simulation.model.points
+    lowest = float(gathered(points, simulation.model.system.x)[:, 2].min())
+    notes = [note for note in simulation.notes if "round-off" in note]
+    simulation.destroy()
+    return lowest, notes
+
+
+def test_a_sheet_whose_weight_is_below_the_floor_still_falls(comm: MPI.Comm) -> None:
+    lowest, notes = after_a_step(1e9, comm)
+    assert lowest < -0.1 * GRAVITY * 0.005**2
+    assert len(notes) == 1
+    assert "of the loads" in notes[0]
+
+
+def test_soft_sheets_are_solved_and_say_nothing(comm: MPI.Comm) -> None:
+    lowest, notes = after_a_step(1.0, comm)
+    assert np.isclose(lowest, -GRAVITY * 0.005**2, rtol=0.05)
+    assert notes == []
