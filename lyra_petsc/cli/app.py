@@ -68,11 +68,19 @@ def run_command_line(argv: Sequence[str]) -> int:
         return _leave_together(comm, InputError.exit_code, line)
     except (Exception, KeyboardInterrupt) as error:
         _report_bug(comm, error)
-        traceback.clear_frames(error.__traceback__)  # without any memory left MPI could not even end the job
+        _let_go(error)  # without any memory left MPI could not even end the job
         if comm.size > 1:
             comm.Abort(BUG)
         return BUG
     return code if isinstance(code, int) else 0
+
+
+def _let_go(error: BaseException) -> None:
+    """Free what the frames of an exception, and of those it came from, still hold."""
+    chain: BaseException | None = error
+    while chain is not None:
+        traceback.clear_frames(chain.__traceback__)
+        chain = chain.__cause__ or chain.__context__
 
 
 def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+from pathlib import Path
 
 from mpi4py import MPI
 
@@ -17,6 +19,11 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def missing_folder(path: Path) -> str:
+    """Why a file cannot be written whose folder is gone, whatever HDF5 says of it; empty if it is there."""
+    return "" if path.parent.is_dir() else os.strerror(errno.ENOENT)
 
 
 def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:

@@ -11,12 +11,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import LyraError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, raise_together, reason
+from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, raise_together, reason
 from lyra_petsc.output.h5py_loader import import_h5py
 
 
 def cannot_write(path: Path, error: BaseException) -> OutputError:
-    return OutputError(f"{path}: cannot be written: {reason(error)}")
+    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
 
 
 def _write_rows(dataset: Any, start: int, slab: NDArray[Any], transfer: Any) -> None:

@@ -94,7 +94,7 @@ def test_an_exception(tmp_path: Path, place: str, rank: int, ranks: int) -> None
 @pytest.mark.parametrize(("place", "rank"), [("distributing", 1), ("residual", 0), ("jacobian", 1)])
 def test_no_memory_left(tmp_path: Path, place: str, rank: int) -> None:
     left = job(tmp_path, place, "out_of_memory()", rank, 2)
-    assert left.code not in (0, 2, 3)
+    assert left.code != 0  # MPI without memory may leave with a code of its own
     assert f"out of memory on rank {rank}: MemoryError" in left.err
 
 
