@@ -37,7 +37,8 @@ def announced(out: Path) -> list[float]:
                 assert file[path].shape == tuple(map(int, item.attrib["Dimensions"].split()))
     with meshio.xdmf.TimeSeriesReader(out / "states.xdmf") as reader:
         reader.read_points_cells()
-        assert [reader.read_data(k)[0] for k in range(reader.num_steps)] == times
+        read = [reader.read_data(k)[0] for k in range(reader.num_steps)]
+        assert read[: len(times)] == times  # a run that goes on may have announced more
     assert times == sorted(set(times))
     return times
 
