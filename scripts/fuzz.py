@@ -13,16 +13,11 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
-
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import seed as seeded
-from hypothesis import strategies as st
 
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "tests" / "fuzz")]
 
-from all_cases import KINDS  # noqa: E402
+from all_cases import KINDS, for_each  # noqa: E402
 from judge import Case, judge, warm  # noqa: E402
 
 
@@ -54,24 +49,6 @@ class Tally:
         print(self.failures[-1], flush=True)
 
 
-def cases(strategy: st.SearchStrategy[Case], number: int, seed: int, run: Callable[[Case], None]) -> None:
-    """Give ``number`` cases, those of ``seed``, to ``run``."""
-
-    @seeded(seed)
-    @settings(
-        max_examples=number,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(case=strategy)
-    def draw(case: Case) -> None:
-        run(case)
-
-    draw()
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -89,7 +66,7 @@ def main() -> int:
             if asked.only not in (None, name):
                 continue
             wanted = asked.cases if asked.only else max(1, asked.cases * share // 100)
-            cases(strategy, wanted, asked.seed * len(KINDS) + number, tally.run)
+            for_each(strategy, wanted, asked.seed * len(KINDS) + number, tally.run)
             print(f"{name} done, {time.monotonic() - started:.0f} s", flush=True)
     for kind, count in sorted(tally.codes.items()):
         print(f"{count:7d}  {kind}")

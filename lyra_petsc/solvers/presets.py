@@ -61,7 +61,7 @@ def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations:
         return ["direct", "gamg", "block-jacobi"]
     factor = "cholesky" if ranks == 1 else "direct"
     if n_vertices < MULTIGRID_FROM:
-        if iterations > FACTOR_COST * math.sqrt(n_vertices):
+        if iterations > _factor_cost(n_vertices):
             return [factor, "block-jacobi", "gamg"]
         return ["block-jacobi", factor, "gamg"]
     return ["gamg", factor, "block-jacobi"] if n_vertices <= DIRECT_UNTIL else ["gamg", "block-jacobi"]
@@ -70,8 +70,13 @@ def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations:
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in ("cholesky", "direct"):
-        return FACTOR_COST * math.sqrt(n_vertices)
+        return _factor_cost(n_vertices)
     return math.inf
+
+
+def _factor_cost(n_vertices: int) -> float:
+    """Iterations of conjugate gradients that cost as much as a factorisation."""
+    return FACTOR_COST * math.sqrt(n_vertices)
 
 
 def options_of(name: str, chosen_pc: str) -> dict[str, Value]:

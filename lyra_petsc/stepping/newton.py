@@ -109,8 +109,9 @@ class Newton:
             self.forcing.before_solve(self.norm)
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         # near the solution the geometry hardly changes: what was set up an iteration ago still serves
-        self._kept = self._increment <= NEAR * self._spacing and self._fell
-        if self._preconditioner is not self._matrix and not self._kept:
+        separate = self._preconditioner is not self._matrix
+        self._kept = separate and self._fell and self._increment <= NEAR * self._spacing
+        if separate and not self._kept:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
 
     def remember(self, u: PETSc.Vec) -> None:

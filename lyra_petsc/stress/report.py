@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.report.closing import PLOTS, close, lacking
 from lyra_petsc.report.document import Report
-from lyra_petsc.report.extras import missing, remedy
 from lyra_petsc.report.numbers import seconds
 from lyra_petsc.report.shapes import Curve, over_time, surface
 from lyra_petsc.stress.case import Setting
 from lyra_petsc.stress.runner import Outcome
 from lyra_petsc.stress.table import cells, headings
-
-PLOTS = "plots"
-"""Folder of the figures."""
-
-PACKAGES = ("matplotlib", "jinja2")
 
 PICTURES = 6
 """Of the worst cases."""
@@ -39,7 +32,7 @@ def write_report(
     str
         What is missing and how to get it; empty if nothing is.
     """
-    lacking = missing(PACKAGES)
+    drawn = not lacking()
     run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=badness, reverse=True)
     passed = sum(outcome.passed for outcome in run)
     report = Report("Stress: stiff and extreme cases")
@@ -65,7 +58,7 @@ def write_report(
         )
     report.heading("The worst cases")
     for outcome in run[:PICTURES]:
-        _case(report, outcome, pictures=not lacking)
+        _case(report, outcome, pictures=drawn)
     report.heading("What was judged")
     report.table(
         ["case", "what", "verdict"],
@@ -79,16 +72,7 @@ def write_report(
     if left_out:
         report.heading("Left out")
         report.bullets([f"{outcome.case.name}: {outcome.left_out}" for outcome in left_out])
-    report.heading("Versions")
-    report.table(["package", "version"], [list(pair) for pair in versions.items()])
-    report.paragraph("To repeat it:")
-    report.code(shlex.join(command))
-    if lacking:
-        replace_text(folder / "report.md", report.markdown())
-        return f"no pictures and no report.html: {remedy(lacking)}"
-    (folder / PLOTS).mkdir(exist_ok=True)
-    report.write(folder)
-    return ""
+    return close(report, folder, versions, command, pictures="pictures")
 
 
 def badness(outcome: Outcome) -> tuple[float, ...]:

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.report.closing import PLOTS, close, lacking
 from lyra_petsc.report.document import Report
-from lyra_petsc.report.extras import missing, remedy
 from lyra_petsc.report.numbers import seconds
 from lyra_petsc.report.plots import Series, convergence, work_precision
 from lyra_petsc.verification.claims import Row
 from lyra_petsc.verification.runner import Outcome
 
 COLUMNS = ("n", "h", "value", "exact", "error", "order", "steps", "run time [s]")
-PLOTS = "plots"
-"""Folder of the figures."""
-
-PACKAGES = ("matplotlib", "jinja2")
 
 
 def cells(row: Row) -> list[str]:
@@ -52,7 +46,7 @@ def write_report(
     str
         What is missing and how to get it; empty if nothing is.
     """
-    lacking = missing(PACKAGES)
+    drawn = not lacking()
     report = Report("Verification: exact and published answers")
     passed = sum(outcome.passed for outcome in outcomes)
     report.paragraph(
@@ -70,17 +64,8 @@ def write_report(
         marked=[not o.passed for o in outcomes],
     )
     for outcome in outcomes:
-        _case(report, outcome, plots=not lacking)
-    report.heading("Versions")
-    report.table(["package", "version"], [list(pair) for pair in versions.items()])
-    report.paragraph("To repeat it:")
-    report.code(shlex.join(command))
-    if lacking:
-        replace_text(folder / "report.md", report.markdown())
-        return f"no plots and no report.html: {remedy(lacking)}"
-    (folder / PLOTS).mkdir(exist_ok=True)
-    report.write(folder)
-    return ""
+        _case(report, outcome, plots=drawn)
+    return close(report, folder, versions, command, pictures="plots")
 
 
 def _case(report: Report, outcome: Outcome, *, plots: bool) -> None:

@@ -125,6 +125,26 @@ def lyra(
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 
+def without_pictures(arguments: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run the program on one rank as if matplotlib and Jinja were not installed."""
+    program = (
+        "import sys;"
+        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
+        "import importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
+        "from lyra_petsc.cli.app import run_command_line;"
+        f"sys.exit(run_command_line({['lyra-petsc', *arguments]!r}))"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
 def done(
     arguments: Sequence[object],
     folder: Path,

@@ -5,13 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from launch import environment, lyra, start, write_scene
+from launch import lyra, start, without_pictures, write_scene
 
 from lyra_petsc.stress.registry import families
 from lyra_petsc.stress.table import COLUMNS
@@ -66,22 +64,7 @@ def test_the_page_holds_pictures(tmp_path: Path) -> None:
 
 
 def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
-    program = (
-        "import sys;"
-        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
-        "import importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
-        "from lyra_petsc.cli.app import run_command_line;"
-        "sys.exit(run_command_line(['lyra-petsc', 'stress', '--quick', '--only', 'free', '--out', 'out']))"
-    )
-    left = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    left = without_pictures(["stress", "--quick", "--only", "free", "--out", "out"], tmp_path)
     assert left.returncode == 0, left.stderr
     assert "1 of 1 cases passed" in left.stdout
     assert "pip install 'lyra-petsc[study]'" in left.stdout

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as seeded
 from hypothesis import strategies as st
 from judge import Case
 from mesh_cases import geo_cases, mesh_cases
@@ -15,3 +19,23 @@ KINDS: dict[str, tuple[int, st.SearchStrategy[Case]]] = {
     "meshes": (30, mesh_cases()),
     "scripts": (4, geo_cases()),
 }
+
+
+def for_each(
+    strategy: st.SearchStrategy[Case], number: int, seed: int, run: Callable[[Case], object]
+) -> None:
+    """Give ``number`` cases, the same for the same seed, to ``run``."""
+
+    @seeded(seed)
+    @settings(
+        max_examples=number,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=strategy)
+    def draw(case: Case) -> None:
+        run(case)
+
+    draw()

@@ -221,3 +221,14 @@ def emit(value: Any) -> str:
 def document(blocks: dict[str, Any]) -> str:
     """A scene file: one top-level key a line."""
     return "".join(f"{key}: {emit(value)}\n" for key, value in blocks.items())
+
+
+def places_of(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Paths of all entries below ``value``."""
+    found = []
+    entries = (
+        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    )
+    for key, entry in entries:
+        found += [(*path, key), *places_of(entry, (*path, key))]
+    return found

@@ -7,7 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
-from odd_values import Raw, magnitude, signed, usual, vector
+from odd_values import Raw, magnitude, places_of, signed, usual, vector
 from scene_cases import SHEET
 from text_damage import damaged
 
@@ -122,16 +122,6 @@ def originals(draw: Draw) -> dict[str, Any]:
     return data
 
 
-def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    found = []
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    for key, entry in entries:
-        found += [(*path, key), *_places(entry, (*path, key))]
-    return found
-
-
 @st.composite
 def original_cases(draw: Draw) -> Case:
     """A conf.json with its mesh and a material table."""
@@ -139,7 +129,7 @@ def original_cases(draw: Draw) -> Case:
     kind = draw(st.sampled_from(["sound", "mutated", "mutated", "damaged"]))
     if kind == "mutated":
         for _ in range(draw(st.integers(1, 2))):
-            *path, last = draw(st.sampled_from(_places(data)))
+            *path, last = draw(st.sampled_from(places_of(data)))
             block = data
             for key in path:
                 block = block[key]

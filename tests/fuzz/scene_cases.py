@@ -8,7 +8,19 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
-from odd_values import NUMBERS, Raw, anything, document, emit, magnitude, raw, signed, usual, vector
+from odd_values import (
+    NUMBERS,
+    Raw,
+    anything,
+    document,
+    emit,
+    magnitude,
+    places_of,
+    raw,
+    signed,
+    usual,
+    vector,
+)
 from text_damage import damaged
 
 from lyra_petsc.scene.control import FIELDS, INTEGRATORS
@@ -282,23 +294,12 @@ def _petsc(draw: Draw) -> dict[str, Any]:
     return draw(st.dictionaries(st.sampled_from(names), values, max_size=2))
 
 
-def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths of all entries below ``value``."""
-    found = []
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    for key, entry in entries:
-        found += [(*path, key), *_places(entry, (*path, key))]
-    return found
-
-
 @st.composite
 def mutated(draw: Draw) -> dict[str, Any]:
     """Blocks of a scene with one to three entries that are out of place."""
     blocks = draw(scenes())
     for _ in range(draw(st.integers(1, 3))):
-        places = _places(blocks)
+        places = places_of(blocks)
         if not places:
             break
         *path, last = draw(st.sampled_from(places))

@@ -15,9 +15,7 @@ import pytest
 
 pytest.importorskip("hypothesis")
 
-from all_cases import KINDS
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import seed as seeded
+from all_cases import KINDS, for_each
 from judge import Case, Outcome, complaint, judge, listing, warm
 from launch import lyra
 from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
@@ -42,20 +40,7 @@ def fresh() -> Iterator[Path]:
 def drawn(kind: str, number: int, seed: int) -> list[Case]:
     """``number`` cases of a kind, the same for the same seed."""
     cases: list[Case] = []
-
-    @seeded(seed)
-    @settings(
-        max_examples=number,
-        deadline=None,
-        database=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
-    @given(case=KINDS[kind][1])
-    def draw(case: Case) -> None:
-        cases.append(case)
-
-    draw()
+    for_each(KINDS[kind][1], number, seed, cases.append)
     return cases
 
 

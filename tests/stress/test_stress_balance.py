@@ -98,9 +98,8 @@ def test_forces_that_are_no_gradient_break_the_identity(
     assert "energy" in run(comm, initial={"noise": 0.01}, **stiff).failures
 
 
-def test_forces_that_do_not_add_up_break_the_momentum(
-    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def add_a_net_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the membrane's forces not add up to zero."""
     real = Membrane.add_gradient
 
     def add_gradient(self: Membrane, x: Array, out: Array) -> None:
@@ -108,6 +107,12 @@ def test_forces_that_do_not_add_up_break_the_momentum(
         out[20, 0] += 1e-3
 
     monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
+
+
+def test_forces_that_do_not_add_up_break_the_momentum(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_a_net_force(monkeypatch)
     assert "momentum" in run(comm).failures
 
 
@@ -169,13 +174,7 @@ def test_a_broken_kernel_shows_in_other_integrators(
 def test_an_unbalanced_force_shows_in_other_integrators(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Membrane.add_gradient
-
-    def add_gradient(self: Membrane, x: Array, out: Array) -> None:
-        real(self, x, out)
-        out[20, 0] += 1e-3
-
-    monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
+    add_a_net_force(monkeypatch)
     assert "momentum" in stepped_by(comm, "midpoint").failures
 
 
