@@ -125,7 +125,7 @@ class Simulation:
         self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
-            self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, floor)
+            self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
 
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
@@ -245,7 +245,8 @@ class Simulation:
                     f"going on with '{following}'"
                 )
                 return
-        if not self.control.failed():
+        in_vain = isinstance(self._seek, Equilibrium) and self._seek.in_vain
+        if in_vain or not self.control.failed():
             self.failure = self._explain(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
 

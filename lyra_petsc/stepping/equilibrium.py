@@ -28,6 +28,18 @@ Array = NDArray[np.float64]
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""
 
+PATIENCE, LESS = 15, 0.9
+"""Proximal steps after which it is given up if none left less than this part of the least force so far."""
+
+AT_FIRST = 8
+"""Proximal steps after which it is given up if Newton found none."""
+
+FAR = 1e3
+"""Sizes of the mesh from where the load step began beyond which there is no rest."""
+
+MOST_IN_VAIN = 60
+"""Proximal steps no nearer since the last equilibrium, after which a smaller increment is no help."""
+
 EASY, FAIR = 6, 15
 """Newton iterations up to which Δτ grows fast, and up to which it grows."""
 
@@ -49,19 +61,26 @@ class Equilibrium:
         With the scheme `Static`; its positions are the start shape.
     stepper : Stepper
     tolerances : Solver
-    spacing : float
-        Mean edge length [m].
+    spacing, size : float
+        Mean edge length [m] and diagonal of the bounding box [m].
     floor : float
         Norm [N] of the residual's round-off.
     """
 
     def __init__(
-        self, system: ReducedSystem, stepper: Stepper, tolerances: Solver, spacing: float, floor: float
+        self,
+        system: ReducedSystem,
+        stepper: Stepper,
+        tolerances: Solver,
+        spacing: float,
+        size: float,
+        floor: float,
     ) -> None:
         assert isinstance(system.scheme, Static)
         self._system, self._stepper, self._scheme = system, stepper, system.scheme
-        self._tolerances, self._spacing, self._floor = tolerances, spacing, floor
+        self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest = LONGEST
+        self._in_vain = 0
         self._follows = bool(system.viscous) or any(load.follows for load in system.loads)
         system.load_factor = 0.0
         system.begin_step(0.0, 0.0)
@@ -80,13 +99,18 @@ class Equilibrium:
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
-        while solves < MOST_SOLVES:
+        while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
             anchored = anchored if solves else system.anchored
             history.append(_row(force, attempt if solves else None))
             if arrived and force <= self._allowed():
                 system.anchored = anchored
+                self._in_vain = 0
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
+            lessened = _last_lessened([each.residual for each in history])
+            words = self._hopeless(solves, lessened, x, arrived=arrived)
+            if words:
+                break
             if force > WORSE * last:
                 self._scheme.pseudo *= SHRINK
             last = force
@@ -105,6 +129,7 @@ class Equilibrium:
                 break
             else:
                 self._scheme.pseudo *= SHRINK
+        self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
@@ -113,9 +138,26 @@ class Equilibrium:
             converged=False,
             newton_iterations=newton,
             linear_iterations=linear,
-            words=attempt.words or f"no equilibrium within {MOST_SOLVES} proximal steps",
+            words=attempt.words or words,
             stuck=stuck,
         )
+
+    @property
+    def in_vain(self) -> bool:
+        """Whether so much led nowhere since the last equilibrium that a smaller increment is no help."""
+        return self._in_vain >= MOST_IN_VAIN
+
+    def _hopeless(self, solves: int, lessened: int, before: Array, *, arrived: bool) -> str:
+        """Why no more proximal steps are taken, or nothing; ``before`` is where they began; collective."""
+        if not arrived:
+            return "no proximal step was found" if solves >= AT_FIRST else ""
+        moved = float(np.abs(self._system.x[: len(before)] - before).max(initial=0.0))
+        moved = self._system.points.comm.allreduce(moved, MPI.MAX)
+        if moved > FAR * self._size:
+            return f"no equilibrium within {moved:.1g} m of the start, as if nothing held the sheet"
+        if solves - lessened >= PATIENCE:
+            return f"no equilibrium: the last {solves - lessened} of {solves} proximal steps came no nearer"
+        return f"no equilibrium within {solves} proximal steps" if solves >= MOST_SOLVES else ""
 
     def _off_balance(self, before: float, factor: float, history: list[Iteration], x: Array) -> Stuck:
         """Where so many proximal steps led that began at positions x."""
@@ -164,6 +206,15 @@ class Equilibrium:
 def _row(force: float, attempt: Attempt | None) -> Iteration:
     """The out-of-balance force [N] after a proximal step, or before the first."""
     return Iteration(force, attempt.linear_iterations if attempt else 0, 0, 1.0 if attempt else None)
+
+
+def _last_lessened(forces: list[float]) -> int:
+    """Which was the last of these forces that was markedly less than all before."""
+    last, least = 0, np.inf
+    for number, force in enumerate(forces):
+        if force < LESS * least:
+            last, least = number, force
+    return last
 
 
 def growth(iterations: int) -> float:

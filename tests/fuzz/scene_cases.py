@@ -195,7 +195,8 @@ def _load(draw: Draw) -> dict[str, Any]:
 
 
 def _time(draw: Draw) -> dict[str, Any]:
-    # no static analyses: one that has no equilibrium says so only after minutes
+    if draw(st.integers(0, 5)) == 0:
+        return {"analysis": "static", **({"step": draw(usual(0.01, 1.0))} if draw(st.booleans()) else {})}
     block: dict[str, Any] = {"end": draw(usual(0.02, 1.0)), "step": draw(usual(0.001, 0.1))}
     block["integrator"] = draw(st.sampled_from(INTEGRATORS))
     if draw(st.integers(0, 5)) == 0:

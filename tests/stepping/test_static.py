@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
+from lyra_petsc.errors import SolverError
 from lyra_petsc.simulation import Simulation
 
 Array = NDArray[np.float64]
@@ -141,3 +142,31 @@ def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
     increments = np.diff([0.0, *factors])
     assert increments.max() >= 2.0 * increments[0]
     assert len(factors) < 20
+
+
+NOWHERE: dict[str, tuple[dict[str, Any], str]] = {
+    "nothing holds it": ({"handles": []}, "m of the start, as if nothing held the sheet"),
+    "held along x": (
+        {"handles": [{"nodes": [0, 1, 2], "axes": ["x"]}]},
+        "m of the start, as if nothing held the sheet",
+    ),
+    "blown around a corner": (
+        {"handles": [{"nodes": [0]}], "loads": [{"pressure": 10.0}]},
+        "proximal steps came no nearer",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NOWHERE)
+def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> None:
+    content, words = NOWHERE[name]
+    time = {"time": {"analysis": "static"}}
+    with motion(comm, mesh=grid(1.0, 1.0, 2, 2, "diagonal"), **content, **time) as simulation:
+        start = shape(simulation)
+        with pytest.raises(SolverError, match=words):
+            simulation.step()
+        assert simulation.failure is not None
+        tried = simulation.failure.tried
+        assert words in tried[-1].words
+        assert sum(each.newton_iterations for each in tried) < 2500  # it took 36,780
+        assert np.array_equal(shape(simulation), start)
