@@ -15,7 +15,7 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.signals import take_back_from_petsc
-from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.errors import InputError, LyraError, SolverError
 from lyra_petsc.nearest import nearest
 
 BUG = 70
@@ -23,6 +23,9 @@ BUG = 70
 
 PETSC_OUT_OF_MEMORY = 55
 """PETSc's error code PETSC_ERR_MEM."""
+
+RESERVE = 4 * 2**20
+"""Bytes of address space kept back: a rank without memory needs some to say so, and MPI to end the job."""
 
 LATER = {
     "render": "pictures and films",
@@ -53,6 +56,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         return InputError.exit_code
 
     comm = MPI.COMM_WORLD
+    reserve = [bytes(RESERVE)]
     # a number that overflows makes a step fail, which is told once and in words
     np.seterr(over="ignore", invalid="ignore")
     try:
@@ -67,11 +71,12 @@ def run_command_line(argv: Sequence[str]) -> int:
         _say(comm, line)
         return _leave_together(comm, InputError.exit_code, line)
     except (Exception, KeyboardInterrupt) as error:
-        _report_bug(comm, error)
-        _let_go(error)  # without any memory left MPI could not even end the job
+        reserve.clear()  # Open MPI without memory leaves with a code of its own
+        code = _report_unexpected(comm, error)
+        _let_go(error)
         if comm.size > 1:
-            comm.Abort(BUG)
-        return BUG
+            comm.Abort(code)
+        return code
     return code if isinstance(code, int) else 0
 
 
@@ -102,25 +107,22 @@ def _leave_together(comm: Any, code: int, line: str) -> int:
     return code
 
 
-def _report_bug(comm: Any, error: BaseException) -> None:
+def _report_unexpected(comm: Any, error: BaseException) -> int:
+    """Say on this rank what happened to it alone, perhaps; the exit code."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
-    text = " ".join(str(error).split()) or "no message"
-    name = type(error).__name__
+    what = f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'} ({where})"
     if isinstance(error, MemoryError) or getattr(error, "ierr", 0) == PETSC_OUT_OF_MEMORY:
-        line = (
-            f"lyra-petsc: out of memory on rank {comm.rank}: {name}: {text} ({where}); "
-            "take more memory, more machines or a coarser mesh"
-        )
+        code, kind = SolverError.exit_code, "out of memory"
+        remedy = "take more memory, more machines or a coarser mesh"
     else:
-        line = (
-            f"lyra-petsc: internal error on rank {comm.rank}: {name}: {text} ({where}); "
-            "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
-        )
+        code, kind = BUG, "internal error"
+        remedy = "this is a bug, please report it with the scene; LYRA_TRACEBACK=1 shows where it happened"
     with suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
+        print(f"lyra-petsc: {kind} on rank {comm.rank}: {what}; {remedy}", file=sys.stderr, flush=True)
     if os.environ.get("LYRA_TRACEBACK"):
         traceback.print_exception(error)
+    return code
 
 
 def _in_one_line(error: click.ClickException) -> str:

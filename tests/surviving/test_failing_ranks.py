@@ -27,7 +27,12 @@ calls = 0
 def out_of_memory():
     now = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (now, now))
-    hoard = [np.ones(2**18) for _ in range(10**6)]
+    crumbs = []
+    try:
+        while True:
+            crumbs.append(bytearray(2**12))
+    except MemoryError:
+        hoard = [np.ones(2**18) for _ in range(10**6)]
 
 def wrong(*arguments, **keywords):
     global calls
@@ -94,8 +99,10 @@ def test_an_exception(tmp_path: Path, place: str, rank: int, ranks: int) -> None
 @pytest.mark.parametrize(("place", "rank"), [("distributing", 1), ("residual", 0), ("jacobian", 1)])
 def test_no_memory_left(tmp_path: Path, place: str, rank: int) -> None:
     left = job(tmp_path, place, "out_of_memory()", rank, 2)
-    assert left.code != 0  # MPI without memory may leave with a code of its own
-    assert f"out of memory on rank {rank}: MemoryError" in left.err
+    assert left.code == 3, left.err
+    (line,) = left.ours
+    assert line.startswith(f"lyra-petsc: out of memory on rank {rank}: MemoryError")
+    assert line.endswith("take more memory, more machines or a coarser mesh")
 
 
 def test_an_error_of_ours_on_one_rank_only(tmp_path: Path) -> None:
