@@ -11,12 +11,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from petsc4py import PETSc
+
 from lyra_petsc.solvers.options import Value, is_set
 
 PRESETS: dict[str, dict[str, Value]] = {
     # what an equilibrium without inertia's help asks for: bending is a millionth of the membrane
-    "direct": {"mat_type": "aij", "ksp_type": "cg", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
-    # on one rank: half the work, and without optimised BLAS faster than multifrontal codes
+    "direct": {
+        "mat_type": "aij",
+        "ksp_type": "cg",
+        "pc_type": "cholesky",
+        "pc_factor_mat_solver_type": "mumps",
+    },
+    # on one rank, with SuiteSparse: supernodal, and quick to solve with
+    "cholmod": {
+        "mat_type": "aij",
+        "ksp_type": "cg",
+        "pc_type": "cholesky",
+        "pc_factor_mat_solver_type": "cholmod",
+    },
+    # on one rank, without
     "cholesky": {
         "mat_type": "aij",
         "ksp_type": "cg",
@@ -36,6 +50,8 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
+FACTORISATIONS = ("direct", "cholmod", "cholesky")
+
 MULTIGRID_FROM = 4000
 """Vertices from which multigrid is tried first."""
 
@@ -46,7 +62,7 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor"})
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
 
-FACTOR_COST = 10.0
+FACTOR_COST = 5.0
 """A factorisation costs as much as this times √vertices iterations of conjugate gradients."""
 
 
@@ -59,7 +75,7 @@ def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations:
         return ["user"]
     if static and n_vertices <= DIRECT_UNTIL:
         return ["direct", "gamg", "block-jacobi"]
-    factor = "cholesky" if ranks == 1 else "direct"
+    factor = _factorisation(ranks)
     if n_vertices < MULTIGRID_FROM:
         if iterations > _factor_cost(n_vertices):
             return [factor, "block-jacobi", "gamg"]
@@ -67,9 +83,15 @@ def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations:
     return ["gamg", factor, "block-jacobi"] if n_vertices <= DIRECT_UNTIL else ["gamg", "block-jacobi"]
 
 
+def _factorisation(ranks: int) -> str:
+    if ranks > 1:
+        return "direct"
+    return "cholmod" if PETSc.Sys.hasExternalPackage("suitesparse") else "cholesky"
+
+
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
-    if len(presets) > 1 and presets[1] in ("cholesky", "direct"):
+    if len(presets) > 1 and presets[1] in FACTORISATIONS:
         return _factor_cost(n_vertices)
     return math.inf
 
@@ -79,12 +101,15 @@ def _factor_cost(n_vertices: int) -> float:
     return FACTOR_COST * math.sqrt(n_vertices)
 
 
-def options_of(name: str, chosen_pc: str) -> dict[str, Value]:
+def options_of(name: str, ranks: int) -> dict[str, Value]:
     """The options of a preset; ``user`` adds what goes with the ``-pc_type`` that was chosen."""
     if name != "user":
         return PRESETS[name]
-    for preset in PRESETS.values():
-        if preset["pc_type"] == chosen_pc:
-            # an ordering of ours would not go with every storage that a user may choose
-            return {k: v for k, v in preset.items() if k != "pc_factor_mat_ordering_type"}
-    return {"mat_type": "baij" if chosen_pc in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}
+    chosen = PETSc.Options().getString("pc_type", "")
+    if chosen in ("lu", "cholesky") and not is_set("mat_type"):
+        preset = _factorisation(ranks) if chosen == "cholesky" else "direct"
+        return PRESETS[preset] | {"pc_type": chosen}
+    for preset in ("block-jacobi", "gamg"):
+        if PRESETS[preset]["pc_type"] == chosen:
+            return PRESETS[preset]
+    return {"mat_type": "baij" if chosen in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}

@@ -106,7 +106,7 @@ class Stepper:
         system, scene = self._system, self._scene
         points = system.points
         self.preset = self.presets[0]
-        self._fill(options_of(self.preset, PETSc.Options().getString("pc_type", "")))
+        self._fill(options_of(self.preset, points.comm.size))
         self.matrix = SystemMatrix(points, self._pattern, "baij")
         self.preconditioner = self.matrix
         if self._separate():
