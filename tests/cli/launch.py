@@ -22,6 +22,8 @@ LAUNCHER = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
+    # more ranks than cores: one that waits leaves its core to those it waits for
+    "OMPI_MCA_mpi_yield_when_idle": "1",
 }
 
 SCENE = """\
