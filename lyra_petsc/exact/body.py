@@ -86,7 +86,7 @@ class Body:
         if len(found.stencil) == 0:
             return False
         angles = np.empty(len(found.stencil))
-        bending.angles(self.mesh.positions, found.stencil, len(angles), angles)
+        bending.angles(self.mesh.positions, found.stencil, angles)
         return bool(np.abs(angles - found.data["rest_angle"]).max() > 1e-7)
 
     # -- assumptions that solutions share ----------------------------------------------------------------

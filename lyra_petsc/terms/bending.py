@@ -6,6 +6,7 @@ Per hinge with rest edge length l, rest areas A0 and A1, rest angle θ̄::
 
 Source: Grinspun et al., Discrete Shells, SCA 2003, with the stiffness calibrated so that B [N·m] is
 the cylindrical bending stiffness on meshes whose lines run along the bend (k ‖ē‖/h̄ with k = B/6).
+Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy``.
 """
 
 from __future__ import annotations
@@ -15,7 +16,14 @@ from numpy.typing import NDArray
 
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
+from lyra_petsc.terms.hinge import angle, point
+from lyra_petsc.terms.hinge_energy import (
+    fading_limit,
+    hinge_energy,
+    hinge_gradient,
+    hinge_hessian,
+    hinge_weight,
+)
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
@@ -24,48 +32,49 @@ Array = NDArray[np.float64]
 
 
 @kernel()
-def angles(x, s, n, out):  # type: ignore[no-untyped-def]
-    """Dihedral angle [rad] of the first n hinges into out (n,)."""
-    for e in range(n):
-        out[e] = angle(point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3]))
+def angles(x, s, out):  # type: ignore[no-untyped-def]
+    """Dihedral angle [rad] of the first len(out) hinges."""
+    for e in range(out.shape[0]):
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
+        out[e] = angle(x0, x1, x2, x3)[0]
 
 
 @kernel()
-def add_gradient(x, s, k, rest, out):  # type: ignore[no-untyped-def]
+def weights(x, s, limit, out):  # type: ignore[no-untyped-def]
+    """Part of its energy that each hinge has left, 1 but for collapsed triangles, into out (E,)."""
+    for e in range(s.shape[0]):
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
+        _, square1, square2 = angle(x0, x1, x2, x3)
+        out[e] = hinge_weight(square1, square2, limit[e, 0], limit[e, 1])
+
+
+@kernel()
+def energies(x, s, k, rest, limit, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of the first len(out) hinges."""
+    for e in range(out.shape[0]):
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
+        out[e] = hinge_energy(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1])
+
+
+@kernel()
+def add_gradient(x, s, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        theta = angle_gradient(x0, x1, x2, x3, g)
-        moment = 2.0 * k[e] * (theta - rest[e])
+        moment = hinge_gradient(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], g)
         for a in range(4):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
 
 
 @kernel()
-def hessians(x, s, lo, hi, blend, k, rest, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
-    g = np.empty((4, 3))
-    h = np.empty((4, 4, 3, 3))
+    g, h = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        theta = angle_gradient(x0, x1, x2, x3, g)
-        stiffness = 2.0 * k[e]
-        o = out[e - lo]
-        for a in range(4):
-            for b in range(4):
-                for i in range(3):
-                    for j in range(3):
-                        o[a, b, i, j] = stiffness * g[a, i] * g[b, j]
-        if blend < 1.0:
-            moment = (1.0 - blend) * stiffness * (theta - rest[e])
-            angle_hessian(x0, x1, x2, x3, h)
-            for a in range(4):
-                for b in range(4):
-                    for i in range(3):
-                        for j in range(3):
-                            o[a, b, i, j] += moment * h[a, b, i, j]
+        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], blend, g, h, out[e - lo])
 
 
 class Bending(Elastic):
@@ -76,22 +85,26 @@ class Bending(Elastic):
     elements : Elements
         Stencil (E, 4) as in ``hinge``; data ``k`` (E,) [N·m], ``rest_angle`` (E,) [rad],
         ``rest_height`` (E,) sum of the two heights on the edge [m], ``length`` (E,) of the rest edge [m],
-        ``damping`` (E,) [s].
+        ``limit`` (E, 2) of |n|² of both triangles [m⁴], ``damping`` (E,) [s].
     """
 
     name = "bending"
 
     def __init__(self, elements: Elements) -> None:
         super().__init__(elements)
-        self._k, self._rest = elements.data["k"], elements.data["rest_angle"]
+        data = elements.data
+        self._constants = data["k"], data["rest_angle"], data["limit"]
 
     def angles(self, x: Array) -> Array:
         """Dihedral angles of all hinges of this rank [rad], (E,)."""
-        return self._angles(x, self.n_elements)
+        out = np.empty(self.n_elements)
+        angles(x, self.stencil, out)
+        return out
 
-    def _angles(self, x: Array, n: int) -> Array:
-        out = np.empty(n)
-        angles(x, self.stencil, n, out)
+    def weights(self, x: Array) -> Array:
+        """Part of its energy that each hinge of this rank has left, (E,): 1 but for collapsed triangles."""
+        out = np.empty(self.n_elements)
+        weights(x, self.stencil, self.elements.data["limit"], out)
         return out
 
     def energies(self, x: Array) -> Array:
@@ -99,17 +112,18 @@ class Bending(Elastic):
 
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
-        change: Array = self._angles(x, n) - self._rest[:n]
-        return self._k[:n] * change * change
+        out = np.empty(n)
+        energies(x, self.stencil, *self._constants, out)
+        return out
 
     def add_gradient(self, x: Array, out: Array) -> None:
-        add_gradient(x, self.stencil, self._k, self._rest, out)
+        add_gradient(x, self.stencil, *self._constants, out)
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, self._k, self._rest, out)
+        hessians(x, self.stencil, lo, hi, blend, *self._constants, out)
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = self._k * size / self.elements.data["rest_height"] ** 2
+        scale: Array = self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2
         return scale
 
 
@@ -216,7 +230,7 @@ def elements(rest: RestShape) -> Elements:
     rest_angle = np.zeros(len(quad))
     surface = ~rest.mesh.flat_rest[faces].all(axis=1)
     of_surface = np.empty(int(surface.sum()))
-    angles(rest.mesh.rest, quad[surface], len(of_surface), of_surface)
+    angles(rest.mesh.rest, quad[surface], of_surface)
     rest_angle[surface] = of_surface
     if any(shell.rest_curvature for shell in rest.shells):
         rest_angle += _angles_from_curvature(rest, quad, faces)
@@ -226,6 +240,7 @@ def elements(rest: RestShape) -> Elements:
         "rest_angle": rest_angle,
         "rest_height": 2.0 * areas / length,
         "length": length,
+        "limit": fading_limit(rest.area[faces]),
         "damping": damping,
     }
     return Elements(quad[bends], {name: values[bends] for name, values in data.items()})

@@ -5,7 +5,8 @@ Per held boundary edge of rest length l with a triangle of rest area A, φ its r
     energy = ½ B l² (2φ − 2φ̄)² / (2 · 2A) = k (φ − φ̄)²,   k = B l² / (2 A)
 
 that is, half a hinge against the mirror image of the triangle, which moves with the handle; φ̄ comes from
-the material's rest curvature.
+the material's rest curvature. Below a tenth of its rest area a triangle's energy fades out, see
+``hinge_energy``; the rigid mirror image does not.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from lyra_petsc.meshing.topology import boundary_edges
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import edge_in_material, mirrored_angles
-from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, point
+from lyra_petsc.terms.hinge import point
+from lyra_petsc.terms.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
@@ -27,41 +29,38 @@ from lyra_petsc.terms.term import Elastic
 Array = NDArray[np.float64]
 
 
+NO_LIMIT = 0.0
+"""Of the mirror image, which is rigid."""
+
+
 @kernel()
-def angles(x, s, mirror, out):  # type: ignore[no-untyped-def]
-    """Rotation φ [rad] of the first len(out) triangles about their held edge."""
+def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of the first len(out) edges."""
     for e in range(out.shape[0]):
-        out[e] = angle(point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e))
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
+        out[e] = hinge_energy(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT)
 
 
 @kernel()
-def add_gradient(x, s, mirror, k, rest, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
-        x0, x1, x2 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
-        moment = 2.0 * k[e] * (angle_gradient(x0, x1, x2, point(mirror, e), g) - rest[e])
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
+        moment = hinge_gradient(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, g)
         for a in range(3):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
 
 
 @kernel()
-def hessians(x, s, lo, hi, blend, mirror, k, rest, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
-    g = np.empty((4, 3))
-    h = np.zeros((4, 4, 3, 3))
+    g, h, o = np.empty((4, 3)), np.empty((4, 4, 3, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
-        x0, x1, x2 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2])
-        phi = angle_gradient(x0, x1, x2, point(mirror, e), g) - rest[e]
-        phi *= 1.0 - blend
-        if blend < 1.0:
-            angle_hessian(x0, x1, x2, point(mirror, e), h)
-        for a in range(3):
-            for b in range(3):
-                for i in range(3):
-                    for j in range(3):
-                        out[e - lo, a, b, i, j] = 2.0 * k[e] * (g[a, i] * g[b, j] + phi * h[a, b, i, j])
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
+        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, blend, g, h, o)
+        out[e - lo] = o[:3, :3]
 
 
 class Clamp(Elastic):
@@ -71,7 +70,8 @@ class Clamp(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3): edge's tail and head, opposite vertex; data ``k`` (E,) [N·m], ``rest_angle`` (E,)
-        [rad], ``height`` (E,) [m], ``handle`` (E,) number of the handle, ``damping`` (E,) [s].
+        [rad], ``height`` (E,) [m], ``limit`` (E,) of |n|² [m⁴], ``handle`` (E,) number of the handle,
+        ``damping`` (E,) [s].
     handles : mapping of handle number → (Motion, Window)
     """
 
@@ -84,7 +84,7 @@ class Clamp(Elastic):
         self._start = np.zeros((self.n_elements, 3))
         self._mirror = np.zeros((self.n_elements, 3))
         self._k = np.zeros(self.n_elements)
-        self._rest = elements.data["rest_angle"]
+        self._rest, self._limit = elements.data["rest_angle"], elements.data["limit"]
 
     def begin(self, time: float, x: Array) -> None:
         for number, (_, window) in self._handles.items():
@@ -106,16 +106,17 @@ class Clamp(Elastic):
 
     def energies(self, x: Array) -> Array:
         out = np.empty(self.n_owned)
-        angles(x, self.stencil, self._mirror, out)
-        k, change = self._k[: self.n_owned], out - self._rest[: self.n_owned]
-        return np.where(k > 0.0, k * change * change, 0.0)
+        energies(x, self.stencil, self._mirror, self._k, self._rest, self._limit, out)
+        return np.where(self._k[: self.n_owned] > 0.0, out, 0.0)
 
     def add_gradient(self, x: Array, out: Array) -> None:
         held = self._k > 0.0
-        add_gradient(x, self.stencil[held], self._mirror[held], self._k[held], self._rest[held], out)
+        constants = self._mirror[held], self._k[held], self._rest[held], self._limit[held]
+        add_gradient(x, self.stencil[held], *constants, out)
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, self._mirror, self._k, self._rest, out)
+        constants = self._mirror, self._k, self._rest, self._limit
+        hessians(x, self.stencil, lo, hi, blend, *constants, out)
         out[self._k[lo:hi] == 0.0] = 0.0
 
     def force_scale(self, size: float) -> Array:
@@ -143,6 +144,7 @@ def elements(rest: RestShape) -> Elements:
         "k": b[row] * squared[row] / (2.0 * area),
         "rest_angle": mirrored_angles(rest, np.column_stack([edges[row], opposite[row]]), faces[row]),
         "height": 2.0 * area / np.sqrt(squared[row]),
+        "limit": fading_limit(area),
         "handle": np.concatenate(numbers),
         "damping": rest.per_triangle("damping")[faces[row]],
     }

@@ -38,21 +38,24 @@ def minus(a, b):  # type: ignore[no-untyped-def]
 
 @kernel()
 def angle(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
-    """Dihedral angle θ [rad] in (−π, π]."""
+    """Dihedral angle θ [rad] in (−π, π], 0 where a triangle has no normal; |n1|² and |n2|² [m⁴]."""
     e = minus(x1, x0)
     n1 = cross(e, minus(x2, x0))
     n2 = cross(minus(x3, x0), e)
-    return math.atan2(dot(cross(n1, n2), e) / math.sqrt(dot(e, e)), dot(n1, n2))
+    length = math.sqrt(dot(e, e))
+    theta = math.atan2(dot(cross(n1, n2), e) / length if length > 0.0 else 0.0, dot(n1, n2))
+    return theta, dot(n1, n1), dot(n2, n2)
 
 
 @kernel()
 def angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
-    """θ [rad], and its gradient [1/m] into g (4, 3)."""
+    """θ [rad], |n1|² and |n2|² [m⁴]; the gradient of θ [1/m] into g (4, 3)."""
     e, a, b = minus(x1, x0), minus(x2, x0), minus(x3, x0)
     n1, n2 = cross(e, a), cross(b, e)
     length = math.sqrt(dot(e, e))
     theta = math.atan2(dot(cross(n1, n2), e) / length, dot(n1, n2))
-    w1, w2 = 1.0 / dot(n1, n1), 1.0 / dot(n2, n2)
+    square1, square2 = dot(n1, n1), dot(n2, n2)
+    w1, w2 = 1.0 / square1, 1.0 / square2
     ae, be = dot(a, e) / length, dot(b, e) / length
     l1, l2 = length * w1, length * w2
     g[2, 0], g[2, 1], g[2, 2] = -l1 * n1[0], -l1 * n1[1], -l1 * n1[2]
@@ -61,7 +64,7 @@ def angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     for i in range(3):
         g[1, i] = a1 * n1[i] + a2 * n2[i]
         g[0, i] = -g[1, i] - g[2, i] - g[3, i]
-    return theta
+    return theta, square1, square2
 
 
 @kernel(inline="always")

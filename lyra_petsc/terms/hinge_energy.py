@@ -1,0 +1,196 @@
+"""The bending energy of one hinge, its gradient and Hessian: pure functions on four points.
+
+    energy = k (θ − θ̄)² w(a1) w(a2)
+    a_t = (A_t / 0.1 A0_t)²,   w(a) = a³ (10 − 15 a + 6 a²), 1 from a = 1 on
+
+with the areas A and the rest areas A0 of the hinge's two triangles. A triangle without an area has no
+normal, hence no dihedral angle: as it loses its last tenth the energy fades out, with two continuous
+derivatives, where the angle's own gradient would grow like one over the height. A membrane of St.
+Venant-Kirchhoff's softens long before, at 1/√3 of a length.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, cross, dot, minus
+from lyra_petsc.terms.kernel import kernel
+
+FADES_BELOW = 0.1
+"""Part of a triangle's rest area below which the hinges on its edges fade."""
+
+GONE = 1e-30
+"""a below which nothing is left: w is 0 beside 1, and the divisions of the angle's derivatives end in inf."""
+
+
+def fading_limit(area: NDArray[np.float64]) -> NDArray[np.float64]:
+    """|n|² [m⁴] of the normal n = 2A from which triangles of these rest areas [m²] count in full."""
+    limit: NDArray[np.float64] = (FADES_BELOW * 2.0 * area) ** 2
+    return limit
+
+
+@kernel()
+def _fade(square, limit):  # type: ignore[no-untyped-def]
+    """w of one triangle, and its first two derivatives with respect to |n|² [1/m⁴, 1/m⁸].
+
+    Without a limit (0) a triangle counts in full as long as it has an area.
+    """
+    if square <= GONE * limit:
+        return 0.0, 0.0, 0.0
+    if square >= limit:
+        return 1.0, 0.0, 0.0
+    a = square / limit
+    left = 1.0 - a
+    first = 30.0 * (a * left) ** 2 / limit
+    second = 60.0 * a * left * (1.0 - 2.0 * a) / limit / limit
+    return a * a * a * (10.0 - 15.0 * a + 6.0 * a * a), first, second
+
+
+@kernel()
+def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-def]
+    """w(a1) w(a2): 1 unless a triangle has lost nearly all its area."""
+    return _fade(square1, limit1)[0] * _fade(square2, limit2)[0]
+
+
+@kernel(inline="always")
+def hinge_energy(x0, x1, x2, x3, k, rest, limit1, limit2):  # type: ignore[no-untyped-def]
+    """Energy [J] of stiffness k [N·m] and rest angle [rad]."""
+    theta, square1, square2 = angle(x0, x1, x2, x3)
+    full = k * (theta - rest) * (theta - rest)
+    if square1 > limit1 and square2 > limit2:
+        return full
+    return full * hinge_weight(square1, square2, limit1, limit2)
+
+
+@kernel(inline="always")
+def hinge_gradient(x0, x1, x2, x3, k, rest, limit1, limit2, g):  # type: ignore[no-untyped-def]
+    """A moment [N·m] by which g (4, 3) [1/m] is to be multiplied: the energy's gradient [N]."""
+    theta, square1, square2 = angle_gradient(x0, x1, x2, x3, g)
+    change = theta - rest
+    if not (square1 > limit1 and square2 > limit2):
+        change = _fade_gradient(x0, x1, x2, x3, square1, square2, limit1, limit2, change, g)
+    return 2.0 * k * change
+
+
+@kernel(inline="always")
+def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, h, out):  # type: ignore[no-untyped-def]
+    """Hessian blocks [N/m] into out (4, 4, 3, 3).
+
+    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w w; g (4, 3) and h (4, 4, 3, 3) are
+    overwritten.
+    """
+    theta, square1, square2 = angle_gradient(x0, x1, x2, x3, g)
+    change = theta - rest
+    stiffness = 2.0 * k
+    for a in range(4):
+        for b in range(4):
+            for i in range(3):
+                for j in range(3):
+                    out[a, b, i, j] = stiffness * g[a, i] * g[b, j]
+    if blend < 1.0:
+        moment = (1.0 - blend) * stiffness * change
+        angle_hessian(x0, x1, x2, x3, h)
+        for a in range(4):
+            for b in range(4):
+                for i in range(3):
+                    for j in range(3):
+                        out[a, b, i, j] += moment * h[a, b, i, j]
+    if not (square1 > limit1 and square2 > limit2):
+        _fade_hessian(x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out)
+
+
+@kernel()
+def _normals(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
+    """Normals [m²] of triangles (0, 1, 2) and (1, 0, 3), each twice as long as its area."""
+    e = minus(x1, x0)
+    return cross(e, minus(x2, x0)), cross(minus(x3, x0), e)
+
+
+@kernel()
+def _slopes(x0, x1, x2, x3, out):  # type: ignore[no-untyped-def]
+    """∇|n|² [m³] of both triangles into out (2, 4, 3): 2 ε × n with the edge ε opposite each corner."""
+    n1, n2 = _normals(x0, x1, x2, x3)
+    out[:] = 0.0
+    _set_row(out[0, 0], cross(minus(x1, x2), n1))
+    _set_row(out[0, 1], cross(minus(x2, x0), n1))
+    _set_row(out[0, 2], cross(minus(x0, x1), n1))
+    _set_row(out[1, 0], cross(minus(x3, x1), n2))
+    _set_row(out[1, 1], cross(minus(x0, x3), n2))
+    _set_row(out[1, 3], cross(minus(x1, x0), n2))
+    out *= 2.0
+
+
+@kernel(inline="always")
+def _set_row(row, values):  # type: ignore[no-untyped-def]
+    row[0], row[1], row[2] = values
+
+
+@kernel()
+def _fade_gradient(  # type: ignore[no-untyped-def]
+    x0, x1, x2, x3, square1, square2, limit1, limit2, change, g
+):
+    """Turn ∇θ in g (4, 3) into W ∇θ + ½ (θ − θ̄) ∇W, W = w(a1) w(a2); what θ − θ̄ counts as then."""
+    w1, d1, _ = _fade(square1, limit1)
+    w2, d2, _ = _fade(square2, limit2)
+    if w1 * w2 == 0.0:  # where θ itself may be no number
+        g[:] = 0.0
+        return 0.0
+    slopes = np.empty((2, 4, 3))
+    _slopes(x0, x1, x2, x3, slopes)
+    for a in range(4):
+        for i in range(3):
+            slope = d1 * w2 * slopes[0, a, i] + w1 * d2 * slopes[1, a, i]
+            g[a, i] = w1 * w2 * g[a, i] + 0.5 * change * slope
+    return change
+
+
+@kernel()
+def _add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
+    """Add scale ∂²|n|²/∂y² of a triangle's corners y, points ``at`` of the hinge, to out (4, 4, 3, 3).
+
+    Of corners c and d with opposite edges ε: 2 ((ε_c·ε_d) I − ε_d ε_cᵀ − σ [n]×), σ = 1 if d follows c,
+    −1 if c follows d, 0 if they are the same.
+    """
+    sides = minus(y[1], y[2]), minus(y[2], y[0]), minus(y[0], y[1])
+    for c in range(3):
+        for d in range(3):
+            block = out[at[c], at[d]]
+            turn = 0.0 if c == d else (1.0 if d == (c + 1) % 3 else -1.0)
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] -= 2.0 * scale * sides[d][i] * sides[c][j]
+                block[i, i] += 2.0 * scale * dot(sides[c], sides[d])
+                j, k = (i + 1) % 3, (i + 2) % 3
+                block[i, j] += 2.0 * scale * turn * n[k]
+                block[j, i] -= 2.0 * scale * turn * n[k]
+
+
+@kernel()
+def _fade_hessian(  # type: ignore[no-untyped-def]
+    x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out
+):
+    """Turn the Hessian of f = k (θ − θ̄)² in out (4, 4, 3, 3) into that of f W, W = w(a1) w(a2)."""
+    w1, d1, dd1 = _fade(square1, limit1)
+    w2, d2, dd2 = _fade(square2, limit2)
+    if w1 * w2 == 0.0:
+        out[:] = 0.0
+        return
+    out *= w1 * w2
+    # of the rest, the regularised Hessian has nothing
+    force, value = (1.0 - blend) * 2.0 * k * change, (1.0 - blend) * k * change * change
+    n1, n2 = _normals(x0, x1, x2, x3)
+    slopes, bent = np.empty((2, 4, 3)), np.zeros((4, 4, 3, 3))
+    _slopes(x0, x1, x2, x3, slopes)
+    _add_square_hessian((x0, x1, x2), n1, (0, 1, 2), d1 * w2, bent)
+    _add_square_hessian((x1, x0, x3), n2, (1, 0, 3), w1 * d2, bent)
+    for a in range(4):
+        for b in range(4):
+            for i in range(3):
+                for j in range(3):
+                    p, q, r, s = slopes[0, a, i], slopes[1, a, i], slopes[0, b, j], slopes[1, b, j]
+                    # ∇f ∇Wᵀ + ∇W ∇fᵀ + f ∂²W
+                    w_a, w_b = d1 * w2 * p + w1 * d2 * q, d1 * w2 * r + w1 * d2 * s
+                    w_ab = dd1 * w2 * p * r + w1 * dd2 * q * s + d1 * d2 * (p * s + q * r)
+                    out[a, b, i, j] += force * (g[a, i] * w_b + w_a * g[b, j])
+                    out[a, b, i, j] += value * (w_ab + bent[a, b, i, j])

@@ -1,0 +1,237 @@
+"""Hinges of collapsed triangles: the energy fades out smoothly, and nothing is left that is no number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.handles.motion import STILL, Window
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.clamp import Clamp
+from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
+from lyra_petsc.terms.term import Elastic
+
+Array = NDArray[np.float64]
+
+EDGE = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
+FULL = np.array([[0.3, 0.8, 0.1], [0.6, -0.7, 0.3]])
+"""Opposite vertices of the hinge before anything collapses."""
+
+
+def areas(x: Array) -> Array:
+    """Of the hinge's two triangles [m²]."""
+    e = x[1] - x[0]
+    return 0.5 * np.array([np.linalg.norm(np.cross(e, x[k] - x[0])) for k in (2, 3)])
+
+
+def hinge(*left: float) -> Array:
+    """Points (4, 3) whose two triangles have these parts of their rest areas."""
+    x = np.vstack([EDGE, FULL])
+    e = x[1] - x[0]
+    for row, part in zip((2, 3), left, strict=True):
+        foot = x[0] + e * ((x[row] - x[0]) @ e) / (e @ e)
+        x[row] = foot + part * (x[row] - foot)
+    return x
+
+
+REST_AREAS = areas(hinge(1.0, 1.0))
+
+
+def bending() -> Bending:
+    data = {
+        "k": np.array([0.7]),
+        "rest_angle": np.array([-0.4]),
+        "limit": fading_limit(REST_AREAS)[None],
+        "rest_height": np.array([1.0]),
+    }
+    return Bending(Elements(np.array([[0, 1, 2, 3]]), data))
+
+
+def clamp() -> Clamp:
+    data = {
+        "k": np.array([0.7]),
+        "rest_angle": np.array([-0.4]),
+        "limit": fading_limit(REST_AREAS[:1]),
+        "height": np.array([1.0]),
+        "handle": np.array([0.0]),
+    }
+    term = Clamp(Elements(np.array([[0, 1, 2]]), data), {0: (STILL, Window(0.0, np.inf))})
+    turned = hinge(1.0, 1.0)
+    turned[2] += [0.1, 0.0, 0.5]
+    term.begin(0.0, turned)
+    term.prepare(0.0, 1.0, 1.0)
+    return term
+
+
+def total(term: Elastic) -> Callable[[Array], float]:
+    return lambda x: float(term.energies(x).sum())
+
+
+def gradient(term: Elastic, x: Array) -> Array:
+    out = np.zeros_like(x)
+    term.add_gradient(x, out)
+    return out
+
+
+def hessian(term: Elastic, x: Array, blend: float = 0.0) -> Array:
+    """(3 n, 3 n) of the single element."""
+    n = term.stencil.shape[1]
+    out = np.full((1, n, n, 3, 3), np.nan)
+    term.hessians(x, 0, 1, blend, out)
+    return np.asarray(out[0].transpose(0, 2, 1, 3).reshape(3 * n, 3 * n))
+
+
+def differences(f: Callable[[Array], Array | float], x: Array, n: int, h: float) -> Array:
+    """Derivative of f with respect to the first n points, fourth-order central differences, (3 n, …)."""
+    rows = []
+    for index in np.ndindex(n, 3):
+        d = np.zeros_like(x)
+        d[index] = h
+        rows.append((8.0 * (f(x + d) - f(x - d)) - (f(x + 2 * d) - f(x - 2 * d))) / (12.0 * h))
+    return np.array(rows)
+
+
+def part(a: float) -> float:
+    """Part of the rest area at which a triangle has come down to a."""
+    return FADES_BELOW * float(np.sqrt(a))
+
+
+CASES = {
+    "first": (part(0.6), 1.0),
+    "first, nearly gone": (part(0.2), 1.0),
+    "second": (1.0, part(0.4)),
+    "second, hardly": (0.7, part(0.9)),
+    "both": (part(0.3), part(0.7)),
+    "both, alike": (part(0.5), part(0.5)),
+    "one faded, one collapsed": (part(0.4), part(0.01)),
+}
+both_terms = pytest.mark.parametrize("make", [bending, clamp])
+every_case = pytest.mark.parametrize("left", CASES.values(), ids=CASES)
+
+
+@both_terms
+@every_case
+def test_derivatives_while_it_fades(make: Callable[[], Elastic], left: tuple[float, float]) -> None:
+    term, x = make(), hinge(*left)
+    n, h = term.stencil.shape[1], 1e-4 * min(left)
+    force = gradient(term, x)
+    numeric = differences(total(term), x, n, h)
+    assert np.abs(force).max() > 0.0
+    np.testing.assert_allclose(force[:n].ravel(), numeric, rtol=0.0, atol=1e-7 * np.abs(force).max())
+    exact = hessian(term, x)
+    numeric = differences(lambda y: gradient(term, y)[:n].ravel(), x, n, h)
+    np.testing.assert_allclose(exact, numeric, rtol=0.0, atol=1e-7 * np.abs(exact).max())
+    np.testing.assert_allclose(exact, exact.T, rtol=0.0, atol=1e-13 * np.abs(exact).max())
+
+
+@both_terms
+@every_case
+def test_regularised_hessian_while_it_fades(make: Callable[[], Elastic], left: tuple[float, float]) -> None:
+    term, x = make(), hinge(*left)
+    exact, regularised, mixed = (hessian(term, x, blend) for blend in (0.0, 1.0, 0.3))
+    np.testing.assert_allclose(mixed, 0.7 * exact + 0.3 * regularised, atol=1e-12 * np.abs(exact).max())
+    values = np.linalg.eigvalsh(regularised)
+    assert values[0] >= -1e-12 * values[-1]
+    # of rank one, 2 k ∇θ ∇θᵀ w w
+    assert values[-1] > 0.0
+    assert np.abs(values[:-1]).max() <= 1e-12 * values[-1]
+
+
+def test_the_energy_is_the_angle_s_times_what_is_left() -> None:
+    term = bending()
+    k, rest = 0.7, -0.4
+    for left in CASES.values():
+        x = hinge(*left)
+        change = float(term.angles(x)[0]) - rest
+        a = np.minimum((areas(x) / (FADES_BELOW * REST_AREAS)) ** 2, 1.0)
+        w = np.prod(a**3 * (10.0 - 15.0 * a + 6.0 * a**2))
+        assert total(term)(x) == pytest.approx(k * change**2 * w, rel=1e-12)
+        assert term.weights(x)[0] == pytest.approx(w, rel=1e-12)
+
+
+@both_terms
+def test_two_derivatives_are_continuous_where_it_begins(make: Callable[[], Elastic]) -> None:
+    term = make()
+    just_below, just_above = hinge(part(1.0 - 1e-7), 1.0), hinge(part(1.0 + 1e-7), 1.0)
+    for of in (total(term), lambda x: gradient(term, x), lambda x: hessian(term, x)):
+        above = np.asarray(of(just_above))
+        np.testing.assert_allclose(of(just_below), above, rtol=0.0, atol=1e-4 * np.abs(above).max())
+
+
+@pytest.mark.parametrize("left", [1.0, part(1.001)])
+def test_nothing_fades_before(left: float) -> None:
+    term, x = bending(), hinge(left, 0.5)
+    full = bending()
+    full.elements.data["limit"][:] = 0.0
+    assert term.weights(x)[0] == 1.0
+    np.testing.assert_array_equal(term.energies(x), full.energies(x))
+    np.testing.assert_array_equal(gradient(term, x), gradient(full, x))
+    for blend in (0.0, 0.4, 1.0):
+        np.testing.assert_array_equal(hessian(term, x, blend), hessian(full, x, blend))
+
+
+def flattened() -> dict[str, Array]:
+    """Shapes of which at least the first triangle has no area, or next to none."""
+    shapes = {
+        "no height": hinge(0.0, 1.0),
+        "both": hinge(0.0, 0.0),
+        "no edge": hinge(1.0, 1.0),
+        "one point": np.ones((4, 3)),
+        "opposite on a corner": hinge(1.0, 1.0),
+        "next to none": hinge(1e-17, 1.0),
+        "least of all": hinge(1.0, 1.0),
+    }
+    shapes["no edge"][1] = shapes["no edge"][0]
+    shapes["opposite on a corner"][2] = shapes["opposite on a corner"][0]
+    shapes["least of all"][:, 1:] *= 1e-160
+    return shapes
+
+
+@both_terms
+@pytest.mark.parametrize("shape", flattened())
+def test_a_triangle_without_area_has_no_energy_and_no_force(make: Callable[[], Elastic], shape: str) -> None:
+    term, x = make(), flattened()[shape]
+    assert total(term)(x) == 0.0
+    assert not gradient(term, x).any()
+    for blend in (0.0, 0.5, 1.0):
+        assert not hessian(term, x, blend).any()
+    if isinstance(term, Bending):
+        assert np.isfinite(term.angles(x)).all()
+        assert term.weights(x)[0] == 0.0
+
+
+def test_what_is_no_number_stays_none() -> None:
+    x = hinge(1.0, 1.0)
+    x[2, 1] = np.nan
+    assert np.isnan(total(bending())(x))
+    assert np.isnan(gradient(bending(), x)).any()
+
+
+def test_a_pressed_triangle_pushes_less_and_less() -> None:
+    # the angle's own gradient grows like one over the height
+    term = bending()
+    pushes = [np.abs(gradient(term, hinge(left, 1.0))).max() for left in np.geomspace(0.05, 1e-5, 20)]
+    assert np.all(np.diff(pushes) < 0.0)
+    assert pushes[-1] < 1e-12 * np.abs(gradient(term, hinge(1.0, 1.0))).max()
+
+
+def test_forces_of_a_fading_hinge_balance() -> None:
+    term, x = bending(), hinge(part(0.3), part(0.7))
+    force = gradient(term, x)
+    largest = np.abs(force).max()
+    np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12 * largest)
+    np.testing.assert_allclose(np.cross(x, force).sum(axis=0), 0.0, atol=1e-12 * largest)
+
+
+def test_the_rigid_mirror_of_a_clamp_does_not_fade() -> None:
+    term = clamp()
+    full, small = hinge(1.0, 1.0), hinge(1.0, 1.0)
+    small[2] = hinge(0.02, 1.0)[2]
+    term.begin(0.0, small)  # a mirror image of 2 % of the rest area
+    term.prepare(0.0, 1.0, 1.0)
+    change = 0.7 * (0.0 - -0.4) ** 2
+    assert total(term)(full) == pytest.approx(change, rel=1e-12)
