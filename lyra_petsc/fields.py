@@ -51,8 +51,10 @@ def _bending_energy(model: Model) -> Array:
 
 
 def _curvature(model: Model) -> Array:
-    bending = model.bending
-    return _to_vertices(model, -bending.elements.data["length"] * bending.angles(model.system.x))
+    bending, x = model.bending, model.system.x
+    # what a collapsed triangle has for an angle says nothing
+    angles = bending.weights(x) * bending.angles(x)
+    return _to_vertices(model, -bending.elements.data["length"] * angles)
 
 
 def _rank(model: Model) -> Array:

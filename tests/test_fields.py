@@ -38,6 +38,17 @@ def test_curvature_of_a_cylinder(sign: float) -> None:
     np.testing.assert_allclose(curvature, sign / radius, rtol=2e-3)
 
 
+def test_collapsed_triangles_have_no_curvature() -> None:
+    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+        flat, noise = simulation.x, np.random.default_rng(3).normal(0.0, 1e-9, simulation.x.shape)
+        simulation.set_state(x=flat * [0.0, 1.0, 1.0] + noise)
+        angles = simulation.model.bending.angles(simulation.system.x)
+        curvature, energy = value(simulation, "curvature"), value(simulation, "bending_energy")
+    assert np.abs(angles).max() > 1.0
+    assert not np.any(np.abs(curvature) > 1e-30)
+    assert not np.any(energy > 1e-30)
+
+
 def test_energy_densities_add_up() -> None:
     with Simulation(ALL, MPI.COMM_SELF) as simulation:
         simulation.set_state(x=simulation.x + np.random.default_rng(3).normal(0.0, 0.01, simulation.x.shape))

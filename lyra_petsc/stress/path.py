@@ -21,7 +21,8 @@ MOST_PANELS = 16
 
 SAMPLES, WIDEST_TURN = 9, 1.0
 """Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
-passes 180°, or whose triangle is turned over in its plane, changes its energy without a force."""
+passes 180° changes its energy without a force, one whose triangle is turned over in its plane loses it and
+has it back within a short way."""
 
 
 def gradient(terms: Sequence[Elastic], x: Array) -> Array:

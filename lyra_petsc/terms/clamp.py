@@ -93,7 +93,8 @@ class Clamp(Elastic):
             mine = self._handle == number
             tail, head, opposite = x[self.stencil[mine].T]
             edge = head - tail
-            along = ((opposite - tail) * edge).sum(axis=1) / (edge * edge).sum(axis=1)
+            square = (edge * edge).sum(axis=1)
+            along = ((opposite - tail) * edge).sum(axis=1) / np.where(square > 0.0, square, 1.0)
             self._start[mine] = 2.0 * (tail + along[:, None] * edge) - opposite
 
     def prepare(self, t0: float, t1: float, at: float) -> None:

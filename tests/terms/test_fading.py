@@ -192,6 +192,20 @@ def flattened() -> dict[str, Array]:
 
 
 @both_terms
+@pytest.mark.parametrize("a", [1e-29, 1e-20, 1e-10])
+def test_what_is_nearly_gone_is_a_number(make: Callable[[], Elastic], a: float) -> None:
+    term, x = make(), hinge(part(a), 1.0)
+    assert 0.0 < total(term)(x) < 1e-25
+    force = gradient(term, x)
+    assert np.isfinite(force).all()
+    assert np.abs(force).max() < 1e-20
+    for blend in (0.0, 0.5, 1.0):
+        stiffness = hessian(term, x, blend)
+        assert np.isfinite(stiffness).all()
+        assert np.abs(stiffness).max() < 1e-12
+
+
+@both_terms
 @pytest.mark.parametrize("shape", flattened())
 def test_a_triangle_without_area_has_no_energy_and_no_force(make: Callable[[], Elastic], shape: str) -> None:
     term, x = make(), flattened()[shape]
@@ -225,6 +239,15 @@ def test_forces_of_a_fading_hinge_balance() -> None:
     largest = np.abs(force).max()
     np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12 * largest)
     np.testing.assert_allclose(np.cross(x, force).sum(axis=0), 0.0, atol=1e-12 * largest)
+
+
+def test_a_clamp_may_set_out_from_an_edge_without_length() -> None:
+    term, x = clamp(), flattened()["no edge"]
+    term.begin(0.0, x)
+    term.prepare(0.0, 1.0, 1.0)
+    assert total(term)(x) == 0.0
+    assert not gradient(term, x).any()
+    assert not hessian(term, x).any()
 
 
 def test_the_rigid_mirror_of_a_clamp_does_not_fade() -> None:
