@@ -77,6 +77,24 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     assert outcome.failures == {}
 
 
+@pytest.mark.parallel
+def test_every_balance_holds_where_triangles_collapse(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = [1.0]
+    real = Bending.energies
+
+    def energies(self: Bending, x: Array) -> Array:
+        left.append(float(self.weights(x).min(initial=1.0)))
+        return real(self, x)
+
+    monkeypatch.setattr(Bending, "energies", energies)
+    [(family, case)] = selected(["wind-200"], Level.QUICK)
+    outcome = run_case(comm, case, family.name, Setting(sheet(CELLS), False, Level.QUICK))
+    assert comm.allreduce(min(left), op=MPI.MIN) < 0.1
+    assert outcome.failures == {}
+
+
 def broken(term: type, factor: float) -> Callable[[Any, Array, Array], None]:
     """A gradient that is not quite that of the energy."""
     real = term.add_gradient
