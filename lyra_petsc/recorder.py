@@ -286,9 +286,9 @@ class Recorder:
         simulation, failure = self._simulation, self._simulation.failure
         assert failure is not None
         system, n, stuck = simulation.model.system, simulation.model.points.n_owned, failure.stuck
-        # a converged state leaves no residual; a number that is not finite has no place in space
-        before = {"velocity": system.v[:n], "residual": np.zeros_like(stuck.residual)}
+        before = {"velocity": system.v[:n]}  # the equations of the failed step say nothing of it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
+        # a number that is not finite has no place in space
         position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])
         write_failure(
             self._folder,

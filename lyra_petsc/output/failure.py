@@ -35,7 +35,7 @@ class Moment:
     position : (n_owned, 3) float64
         [m], finite.
     fields : mapping of str to (n_owned, 3) float64
-        The same names for all moments.
+        The same names on all ranks.
     """
 
     time: float
