@@ -43,7 +43,7 @@ SMALLEST_ADAPTED = 1e-6
 
 @dataclass
 class StepReport:
-    """One accepted step."""
+    """One accepted step; ``increment`` [m] is what the last Newton iteration still moved."""
 
     step: int
     time: float
@@ -55,6 +55,7 @@ class StepReport:
     wall_seconds: float
     smallest_stretch: float = 1.0
     largest_stretch: float = 1.0
+    increment: float = math.inf
 
 
 def _positive(name: str, seconds: float) -> float:
@@ -192,9 +193,18 @@ class Simulation:
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
-        stretches = self.compression.smallest, self.compression.largest
         return StepReport(
-            self.step_number, self.time, dt, newton, linear, rejected, attempt.residual, seconds, *stretches
+            self.step_number,
+            self.time,
+            dt,
+            newton,
+            linear,
+            rejected,
+            attempt.residual,
+            seconds,
+            self.compression.smallest,
+            self.compression.largest,
+            attempt.increment,
         )
 
     def _tell_of_roundoff(self, residual: float) -> None:

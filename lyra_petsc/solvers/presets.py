@@ -62,8 +62,8 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor"})
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
 
-FACTOR_COST = 5.0
-"""A factorisation costs as much as this times √vertices iterations of conjugate gradients."""
+FACTOR_COST = 20.0, 5.0
+"""Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
 
 def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations: float = 0.0) -> list[str]:
@@ -98,7 +98,7 @@ def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
 
 def _factor_cost(n_vertices: int) -> float:
     """Iterations of conjugate gradients that cost as much as a factorisation."""
-    return FACTOR_COST * math.sqrt(n_vertices)
+    return FACTOR_COST[0] + FACTOR_COST[1] * math.sqrt(n_vertices)
 
 
 def options_of(name: str, ranks: int) -> dict[str, Value]:

@@ -59,6 +59,8 @@ class Newton:
         Last residual norm [N].
     at_roundoff : bool
         Whether the solve ended because only round-off was left.
+    increment : float
+        Largest change of a coordinate [m] in the last iteration.
     more_linear : int
         Linear iterations of directions that were solved for again.
     too_slow : bool
@@ -95,7 +97,7 @@ class Newton:
         self._length = self._first_norm = self._at_norm = 0.0
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
-        self._stalled, self.too_slow, self._increment = 0, False, np.inf
+        self._stalled, self.too_slow, self.increment = 0, False, np.inf
         self._fell = self._kept = False
         self._spent: list[int] = [0]
         self._watchdog.begin()
@@ -110,7 +112,7 @@ class Newton:
         self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
         # near the solution the geometry hardly changes: what was set up an iteration ago still serves
         separate = self._preconditioner is not self._matrix
-        self._kept = separate and self._fell and self._increment <= NEAR * self._spacing
+        self._kept = separate and self._fell and self.increment <= NEAR * self._spacing
         if separate and not self._kept:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
 
@@ -186,14 +188,13 @@ class Newton:
         self._fell = residual < FELL * before
         if not np.isfinite(residual):
             return NOT_A_NUMBER
-        self._stalled = self._stalled + 1 if STALLED * before < residual <= self._floor else 0
+        if iteration > 0:
+            self.increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
+        stalls = iteration > 0 and STALLED * before < residual <= self._floor
+        self._stalled = self._stalled + 1 if stalls else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
-        if iteration > 0:
-            self._increment = (
-                snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
-            )
         spent = snes.getLinearSolveIterations() + self.more_linear
         self._spent.append(spent)
         if iteration >= JUDGED and spent - self._spent[-1 - JUDGED] > JUDGED * self._linear_limit:
@@ -211,9 +212,9 @@ class Newton:
         scale = float(np.sqrt(forces.max()))
         if (
             residual <= self._tolerances.force_tolerance * scale
-            and self._increment <= self._tolerances.step_tolerance * self._spacing
+            and self.increment <= self._tolerances.step_tolerance * self._spacing
         ):
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < self._increment <= stol * self._spacing:
+        if 0.0 < self.increment <= stol * self._spacing:
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -37,6 +38,7 @@ class Attempt:
     newton_iterations: int
     linear_iterations: int
     residual: float
+    increment: float = math.inf
     words: str = ""
     at_roundoff: bool = False
     stuck: Stuck | None = None
@@ -259,7 +261,14 @@ class Stepper:
                 self.velocity.setArray(system.v[: self._shape[0]].ravel())
                 self.ts.setTime(t1)
                 self.ts.setTimeStep(t1 - t0)
-                return Attempt(True, newton, linear, self._newton.norm, at_roundoff=self._newton.at_roundoff)
+                return Attempt(
+                    True,
+                    newton,
+                    linear,
+                    self._newton.norm,
+                    self._newton.increment,
+                    at_roundoff=self._newton.at_roundoff,
+                )
         else:
             words = reasons.in_words(self.snes, self.ksp)
             self._linear_failed = self._newton.too_slow or reasons.preconditioner_failed(self.ksp)
@@ -268,7 +277,7 @@ class Stepper:
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        return Attempt(False, newton, linear, self._newton.norm, words, stuck=stuck)
+        return Attempt(False, newton, linear, self._newton.norm, words=words, stuck=stuck)
 
     def _linear_iterations(self) -> int:
         return int(self.snes.getLinearSolveIterations()) + self._newton.more_linear

@@ -55,6 +55,8 @@ class Balance:
         Norm of the forces left on free coordinates, what the solver promised, and its round-off.
     driving : float
         Norm of the largest of the other forces there, those within the sheet left out.
+    push : float
+        How far those forces moved the sheet [m]: largest change of a free coordinate beyond Δt v.
     momentum, momentum_tolerance : float
         Largest component of Δ(Σ m v) − Δt Σ forces from outside.
     spin, spin_tolerance : float
@@ -75,6 +77,7 @@ class Balance:
     promised: float
     floor: float
     driving: float
+    push: float
     momentum: float
     momentum_tolerance: float
     spin: float
@@ -85,6 +88,11 @@ class Balance:
     def moved(self) -> float:
         """Energy [J] that the step turned over."""
         return abs(self.change) + self.numerical + abs(self.viscous) + abs(self.bracket) + abs(self.work)
+
+
+def largest(comm: MPI.Comm, values: Array) -> float:
+    """Largest size of all values on all ranks."""
+    return float(comm.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX))
 
 
 class Accountant:
@@ -157,7 +165,7 @@ class Accountant:
         )
         (kinetic0, kinetic1, elastic, turn, stored, fallen0, fallen1, numerical, viscous, inner, outer,
          left, free_way, way, energy_noise, forces, powers, heights) = map(float, sums)  # fmt: skip
-        reach = float(comm.allreduce(float(np.abs(x1).max(initial=0.0)), op=MPI.MAX))
+        reach = largest(comm, x1)
         promised, floor, driving = self._promise(parts, reach)
         residual = float(np.sqrt(left))
         solved = residual * np.sqrt(free_way) + floor * np.sqrt(way)
@@ -186,6 +194,7 @@ class Accountant:
             promised=promised,
             floor=floor,
             driving=driving,
+            push=largest(comm, np.where(free, moved - dt * v0[:n], 0.0)),
             momentum=p,
             momentum_tolerance=p_tol,
             spin=spin,

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.simulation import StepReport
-from lyra_petsc.stress.balance import Accountant, Balance
+from lyra_petsc.stress.balance import Accountant, Balance, largest
 from lyra_petsc.stress.path import EPSILON, energy, force_along
 
 
@@ -49,7 +48,7 @@ class StageAccountant(Accountant):
             )
         )
         left, change, noise, forces, way = map(float, sums[:5])
-        reach = float(comm.allreduce(float(np.abs(x1).max(initial=0.0)), op=MPI.MAX))
+        reach = largest(comm, x1)
         promised, floor, driving = self._promise(parts, reach)
         residual = math.sqrt(left)
         tolerance = EPSILON * (noise + forces * reach) + floor * math.sqrt(way)
@@ -68,6 +67,7 @@ class StageAccountant(Accountant):
             promised=promised,
             floor=floor,
             driving=driving,
+            push=largest(comm, np.where(free, (x1 - x0 - dt * self._v)[:n], 0.0)),
             momentum=dt * float(np.abs(sums[5:]).max()),
             momentum_tolerance=dt * ((residual + floor) * math.sqrt(count) + EPSILON * forces),
             spin=0.0,

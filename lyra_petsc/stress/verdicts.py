@@ -12,7 +12,7 @@ from lyra_petsc.terms.stretch import SOFTENS_BELOW
 from lyra_petsc.verification.claims import Verdict
 
 RESOLVED = 0.1
-"""Part of the forces that move a sheet that may be left unbalanced before its motion means nothing."""
+"""Part of the forces that move a sheet, or of how far they do, that may be left before it means nothing."""
 
 MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
 """Newton iterations a step of a stiff sheet may take, in the median and at worst."""
@@ -48,12 +48,23 @@ def solved(record: Record) -> Verdict:
 
 
 def resolved(record: Record) -> Verdict:
-    """The forces left are far below those that move the sheet: at the floor of round-off they may not be."""
-    number, worst = _worst(record, lambda b: _over(b.residual, RESOLVED * b.driving))
-    words = f"worst in step {number}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
+    """The forces left are far below those that move the sheet, or what they still move is.
+
+    At the floor of round-off stiff forces may be left that are as large as the weight, and move nothing.
+    """
+    steps = zip(record.balances, record.reports, strict=True)
+    by_force = [_over(balance.residual, RESOLVED * balance.driving) for balance in record.balances]
+    by_way = [_over(report.increment, RESOLVED * balance.push) for balance, report in steps]
+    number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_way[i]))
+    worst, last = record.balances[number], record.reports[number].increment
+    words = (
+        f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
+    )
     if worst.promised <= worst.floor:
         words += "; round-off at this stiffness allows no better"
-    return Verdict(worst.residual <= RESOLVED * worst.driving, words)
+    if by_way[number] < by_force[number]:
+        words += f"; they still move it by {short(last)} m, and the step's forces by {short(worst.push)} m"
+    return Verdict(min(by_force[number], by_way[number]) <= 1.0, words)
 
 
 def identity(record: Record) -> Verdict:

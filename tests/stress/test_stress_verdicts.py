@@ -14,7 +14,7 @@ from lyra_petsc.stress.verdicts import of_physics, speed
 
 GOOD = Balance(
     energy=1.0, change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
-    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, momentum=1e-8,
+    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, push=1e-3, momentum=1e-8,
     momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
 )  # fmt: skip
 STEP = StepReport(1, 0.01, 0.01, 5, 100, 0, 1e-6, 0.1, 0.9, 1.1)
@@ -69,6 +69,13 @@ def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: s
     assert set(broken) <= {name, "no gain", "resolved" if name == "equations" else name}
     if name != "no gain":
         assert "step 2" in broken[name]
+
+
+@pytest.mark.parametrize(("increment", "good"), [(0.9e-4, True), (1.1e-4, False), (math.nan, False)])
+def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(increment: float, good: bool) -> None:
+    stiff = replace(GOOD, residual=1e-6, driving=1e-6, promised=1e-9, floor=2e-6)
+    found = failures(record(stiff, replace(STEP, increment=increment)))
+    assert ("resolved" in found) is not good
 
 
 def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
