@@ -16,21 +16,16 @@ from petsc4py import PETSc
 from lyra_petsc.solvers.options import Value, is_set
 
 PRESETS: dict[str, dict[str, Value]] = {
-    # what an equilibrium without inertia's help asks for: bending is a millionth of the membrane
+    # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last option
+    # has all pivots counted
     "direct": {
         "mat_type": "aij",
         "ksp_type": "cg",
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "mumps",
+        "mat_mumps_icntl_13": 1,
     },
-    # on one rank, with SuiteSparse: supernodal, and quick to solve with
-    "cholmod": {
-        "mat_type": "aij",
-        "ksp_type": "cg",
-        "pc_type": "cholesky",
-        "pc_factor_mat_solver_type": "cholmod",
-    },
-    # on one rank, without
+    # where PETSc was built without MUMPS; one rank
     "cholesky": {
         "mat_type": "aij",
         "ksp_type": "cg",
@@ -50,7 +45,7 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
-FACTORISATIONS = ("direct", "cholmod", "cholesky")
+FACTORISATIONS = ("direct", "cholesky")
 
 MULTIGRID_FROM = 4000
 """Vertices from which multigrid is tried first."""
@@ -73,20 +68,21 @@ def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations:
     """
     if is_set("pc_type"):
         return ["user"]
-    if static and n_vertices <= DIRECT_UNTIL:
-        return ["direct", "gamg", "block-jacobi"]
-    factor = _factorisation(ranks)
-    if n_vertices < MULTIGRID_FROM:
-        if iterations > _factor_cost(n_vertices):
-            return [factor, "block-jacobi", "gamg"]
-        return ["block-jacobi", factor, "gamg"]
-    return ["gamg", factor, "block-jacobi"] if n_vertices <= DIRECT_UNTIL else ["gamg", "block-jacobi"]
+    factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
+    if static:
+        return [*factors, "gamg", "block-jacobi"]
+    if n_vertices >= MULTIGRID_FROM:
+        return ["gamg", *factors, "block-jacobi"]
+    if iterations > _factor_cost(n_vertices):
+        return [*factors, "block-jacobi", "gamg"]
+    return ["block-jacobi", *factors, "gamg"]
 
 
-def _factorisation(ranks: int) -> str:
-    if ranks > 1:
-        return "direct"
-    return "cholmod" if PETSc.Sys.hasExternalPackage("suitesparse") else "cholesky"
+def _factorisations(ranks: int) -> list[str]:
+    """Those that this PETSc has."""
+    if PETSc.Sys.hasExternalPackage("mumps"):
+        return ["direct"]
+    return ["cholesky"] if ranks == 1 else []
 
 
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
@@ -107,8 +103,7 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
         return PRESETS[name]
     chosen = PETSc.Options().getString("pc_type", "")
     if chosen in ("lu", "cholesky") and not is_set("mat_type"):
-        preset = _factorisation(ranks) if chosen == "cholesky" else "direct"
-        return PRESETS[preset] | {"pc_type": chosen}
+        return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
     for preset in ("block-jacobi", "gamg"):
         if PRESETS[preset]["pc_type"] == chosen:
             return PRESETS[preset]

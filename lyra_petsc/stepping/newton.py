@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.solvers.inertia import negative_pivots, shows_negative_curvature
 from lyra_petsc.solvers.options import is_set
 from lyra_petsc.solvers.reasons import NOT_A_NUMBER
 from lyra_petsc.stepping.blend import Blend
@@ -98,7 +99,7 @@ class Newton:
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
         self._stalled, self.too_slow, self.increment = 0, False, np.inf
-        self._fell = self._kept = False
+        self._fell = self._kept = self._same = self._convex = False
         self._spent: list[int] = [0]
         self._watchdog.begin()
         self.forcing.begin()
@@ -109,11 +110,18 @@ class Newton:
         if self._iterates:
             self._system.new_iterate(v)
             self.forcing.before_solve(self.norm)
-        self._matrix.set(self._system.jacobian(v, self._blend.after(self._taken(u))))
+        values = self._system.jacobian(v, self._blend.after(self._taken(u)))
+        self._matrix.set(values)
         # near the solution the geometry hardly changes: what was set up an iteration ago still serves
         separate = self._preconditioner is not self._matrix
         self._kept = separate and self._fell and self.increment <= NEAR * self._spacing
-        if separate and not self._kept:
+        self._same = (
+            separate and self._convex and not self._kept and shows_negative_curvature(self._ksp.getPC())
+        )
+        if self._same:
+            # as long as it is positive definite there is no better preconditioner
+            self._preconditioner.set(values)
+        elif separate and not self._kept:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
 
     def remember(self, u: PETSc.Vec) -> None:
@@ -142,11 +150,12 @@ class Newton:
             self._system.new_iterate(None)
             return True
         residual = self._snes.getFunction()[0]
-        while self._useless(residual, y) and (self._kept or self._blend.raise_()):
+        self._convex = not self._useless(residual, y)
+        while self._useless(residual, y) and (self._kept or self._same or self._blend.raise_()):
             v = x.getArray(readonly=True).reshape(self._shape)
-            if self._kept:
+            if self._kept or self._same:
                 self._preconditioner.set(self._system.jacobian(v, 1.0))
-                self._kept = False
+                self._kept = self._same = False
             self._matrix.set(self._system.jacobian(v, self._blend.value))
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
@@ -163,7 +172,9 @@ class Newton:
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""
-        return self._ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0
+        if self._ksp.getConvergedReason() < 0 or not residual.dot(y) > 0.0:
+            return True
+        return self._same and negative_pivots(self._ksp.getPC()) > 0
 
     def objective(self, snes: PETSc.SNES, u: PETSc.Vec) -> float:
         """Energy of a trial point; where differences drown in round-off, judged by its residual."""

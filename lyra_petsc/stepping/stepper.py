@@ -244,10 +244,12 @@ class Stepper:
         try:
             self.ts.step()
         except PETSc.Error as error:
+            together = all_here(system.points.comm)
+            kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
-                f"the state before it is kept; check {culprits(error)}",
-                collective=all_here(system.points.comm),
+                f"{kept} is kept; check {culprits(error)}",
+                collective=together,
             ) from None
         newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
         words = "the velocities are not finite"

@@ -113,6 +113,19 @@ def test_an_error_of_ours_on_one_rank_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 1])
+def test_petsc_stops_on_one_rank_only(tmp_path: Path, rank: int) -> None:
+    """No state can be written then, and none is promised."""
+    left = job(tmp_path, "residual", "from petsc4py import PETSc; raise PETSc.Error(56)", rank, 2)
+    assert left.code == 3, left.err
+    (line,) = left.ours
+    assert "the last checkpoint (the other ranks work on) is kept" in line
+    before = announced(tmp_path / "out")
+    end = before[-1] + 0.04
+    done(["run", "--out", "out", "--resume", "--set", f"time.end={end:.3f}"], tmp_path)
+    assert announced(tmp_path / "out")[: len(before)] == before
+
+
+@pytest.mark.parametrize("rank", [0, 1])
 def test_killed_during_the_set_up(tmp_path: Path, rank: int) -> None:
     left = job(tmp_path, "assembly", "import os; os.kill(os.getpid(), 9)", rank, 2)
     assert left.code != 0

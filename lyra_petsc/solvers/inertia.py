@@ -1,0 +1,29 @@
+"""Whether a preconditioner that is built from the very matrix it is for lets negative curvature be seen.
+
+Conjugate gradients meet it with a preconditioner that only resembles the matrix. Exact factors are the
+matrix: the solve ends after an iteration, whatever its signs, and only their pivots tell.
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "gamg"})
+"""Preconditioners that leave conjugate gradients something to find."""
+
+
+def shows_negative_curvature(pc: PETSc.PC) -> bool:
+    """Whether it would be noticed, by conjugate gradients or by ``negative_pivots``."""
+    return pc.getType() in RESEMBLING or _counts_pivots(pc)
+
+
+def negative_pivots(pc: PETSc.PC) -> int:
+    """Negative pivots of the factors in use, by Sylvester's law the matrix's negative eigenvalues.
+
+    0 for what has no factors; collective.
+    """
+    return int(pc.getFactorMatrix().getMumpsInfog(12)) if _counts_pivots(pc) else 0
+
+
+def _counts_pivots(pc: PETSc.PC) -> bool:
+    return bool(pc.getType() == "cholesky" and pc.getFactorSolverType() == "mumps")
