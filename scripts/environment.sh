@@ -190,8 +190,9 @@ find_launcher() {
 }
 
 set_launcher_environment() {
-    # read by Open MPI alone, 4 and 5: more ranks than cores, and root inside a container
+    # read by Open MPI alone, 4 and 5: more ranks than cores, shared ones, and root inside a container
     export OMPI_MCA_rmaps_base_oversubscribe=${OMPI_MCA_rmaps_base_oversubscribe:-1}
+    export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-1} # cores may be shared
     export PRTE_MCA_rmaps_default_mapping_policy=${PRTE_MCA_rmaps_default_mapping_policy:-:oversubscribe}
     if ((EUID == 0)); then
         export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1
