@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
     {"errors", "nearest"},
-    {"parallel"},
+    {"parallel", "profiling"},
     {"materials"},
     {"scene"},
     {"meshing"},
@@ -36,8 +36,13 @@ LEVELS = [
 ]
 RANK = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 
-#: output knows arrays and files; of the rest of the house only the mesh as plain data
-OUTPUT_MAY_USE = {"lyra_petsc.errors", "lyra_petsc.parallel", "lyra_petsc.meshing.mesh"}
+#: output knows arrays and files; of the rest of the house only the mesh as plain data and the profile
+OUTPUT_MAY_USE = {
+    "lyra_petsc.errors",
+    "lyra_petsc.parallel",
+    "lyra_petsc.profiling",
+    "lyra_petsc.meshing.mesh",
+}
 
 LONGEST = 350
 """Lines of a module."""

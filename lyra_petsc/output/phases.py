@@ -1,10 +1,12 @@
-"""Wall time of a run, by phase."""
+"""Wall time of a run, by phase; each phase is a stage of PETSc's profile, too."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from lyra_petsc.profiling import stage
 
 
 class Phases:
@@ -33,7 +35,8 @@ class Phases:
         self._seconds.setdefault(name, 0.0)
         self._open.append(name)
         try:
-            yield
+            with stage(name):
+                yield
         finally:
             self._charge()
             self._open.pop()
