@@ -20,7 +20,10 @@ Result = TypeVar("Result")
 STAGES = {name: PETSc.Log.Stage(name) for name in ("mesh", "partition", "assembly", "solve", "output")}
 
 RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
-"""Names of events; PETSc's table has room for 16 letters."""
+"""Events, the latter once a Newton iteration; PETSc's table has room for names of 16 letters."""
+
+JACOBIAN_AGAIN = "AssembleAgain"
+"""The Jacobian with more regularisation, where the linear solve met negative curvature."""
 
 
 @contextmanager

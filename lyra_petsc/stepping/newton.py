@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.profiling import JACOBIAN, JACOBIAN_AGAIN, logged
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.solvers.inertia import negative_pivots, shows_negative_curvature
 from lyra_petsc.solvers.options import is_set
@@ -104,6 +105,7 @@ class Newton:
         self._watchdog.begin()
         self.forcing.begin()
 
+    @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
         """Jacobian, and preconditioning matrix, at velocities u."""
         v = u.getArray(readonly=True).reshape(self._shape)
@@ -152,11 +154,7 @@ class Newton:
         residual = self._snes.getFunction()[0]
         self._convex = not self._useless(residual, y)
         while self._useless(residual, y) and (self._kept or self._same or self._blend.raise_()):
-            v = x.getArray(readonly=True).reshape(self._shape)
-            if self._kept or self._same:
-                self._preconditioner.set(self._system.jacobian(v, 1.0))
-                self._kept = self._same = False
-            self._matrix.set(self._system.jacobian(v, self._blend.value))
+            self._assemble_again(x)
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
             self.more_linear += self._ksp.getIterationNumber()
@@ -169,6 +167,14 @@ class Newton:
         self._from, self._length = x.copy(), y.norm()
         self._slope = residual.dot(y)
         return changed
+
+    @logged(JACOBIAN_AGAIN)
+    def _assemble_again(self, u: PETSc.Vec) -> None:
+        v = u.getArray(readonly=True).reshape(self._shape)
+        if self._kept or self._same:
+            self._preconditioner.set(self._system.jacobian(v, 1.0))
+            self._kept = self._same = False
+        self._matrix.set(self._system.jacobian(v, self._blend.value))
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

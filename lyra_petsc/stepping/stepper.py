@@ -14,6 +14,7 @@ from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.parallel import all_here
+from lyra_petsc.profiling import RESIDUAL, logged
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
@@ -309,6 +310,7 @@ class Stepper:
 
     # -- callbacks ---------------------------------------------------------------------------------------
 
+    @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
         v, rate = (
             u.getArray(readonly=True).reshape(self._shape),
