@@ -25,6 +25,9 @@ RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
 JACOBIAN_AGAIN = "AssembleAgain"
 """The Jacobian with more regularisation, where the linear solve met negative curvature."""
 
+FROZEN = "AssembleFrozen"
+"""Once an attempt at a step: damping, loads and geometry that stay as they are during it."""
+
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
@@ -45,11 +48,8 @@ def logged(name: str) -> Callable[[Callable[Arguments, Result]], Callable[Argume
     def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
         @wraps(function)
         def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-            event.begin()
-            try:
+            with event:
                 return function(*args, **kwargs)
-            finally:
-                event.end()
 
         return call
 

@@ -14,7 +14,7 @@ from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.parallel import all_here
-from lyra_petsc.profiling import RESIDUAL, logged
+from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
@@ -232,7 +232,8 @@ class Stepper:
     def attempt(self, t0: float, t1: float) -> Attempt:
         """Try the step from t0 to t1 [s]; on success the system holds the new state; collective."""
         system = self._system
-        system.begin_step(t0, t1)
+        with PETSc.Log.Event(FROZEN):
+            system.begin_step(t0, t1)
         self.velocity.setArray(system.history.ravel())
         number = self.ts.getStepNumber()
         # a TS step that ends where its stage shall be, with the shift that the scheme wants
