@@ -1,0 +1,252 @@
+"""``scripts/bench``: how fast and how large, as ``bench.json`` and ``bench.md``; see docs/performance.md."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import measures
+import petsc4py
+from peers import parse
+from processes import Failed, Limits
+from tables import document
+
+from lyra_petsc.cli.arguments import split
+from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.study.launch import find_launcher
+
+DEFAULT = {"vertices": [1024, 10201, 50176], "weak": 25_000, "output": 200_000}
+QUICK = {"vertices": [1024, 4900], "weak": 2_500, "output": 10_201}
+GROWTH = [5_000, 10_201, 20_000, 50_176, 100_000, 200_000, 500_000]
+
+
+class Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; see --help")
+
+
+def flat(lists: Sequence[list[int]]) -> list[int]:
+    """The numbers of all words of an option."""
+    return [entry for each in lists for entry in each]
+
+
+def numbers(text: str) -> list[int]:
+    """Whole numbers from 1 on between commas."""
+    try:
+        found = [int(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        found = []
+    if not found or min(found) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} must be whole numbers from 1 on, as 1024,10201")
+    return found
+
+
+def read_arguments(words: Sequence[str]) -> argparse.Namespace:
+    parser = Parser(prog="scripts/bench", description=__doc__, allow_abbrev=False)
+    add = parser.add_argument
+    add("--quick", action="store_true", help="smaller and shorter, within two minutes")
+    add("--out", type=Path, default=Path("bench"), metavar="DIR", help="where the two files go (bench)")
+    add("--vertices", type=numbers, nargs="+", metavar="N", help="sizes of the rows (1024,10201,50176)")
+    add("--ranks", type=numbers, nargs="+", default=[[1, 2]], metavar="P", help="numbers of ranks (1,2)")
+    add("--steps", type=int, metavar="N", help="measured steps of a row, at most (10)")
+    add("--seconds", type=float, metavar="S", help="time after which a row measures no more steps (15)")
+    add("--limit", type=float, metavar="S", help="time after which a process is given up (600)")
+    add("--weak", type=int, metavar="N", help="vertices per rank of the weak scaling (25000); 0: none")
+    add("--growth", type=numbers, nargs="*", metavar="N", help=f"further sizes to fit growth ({GROWTH})")
+    add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
+    add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
+    add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
+    asked = parser.parse_args(list(words))
+    chosen = QUICK if asked.quick else DEFAULT
+    asked.vertices = flat(asked.vertices) if asked.vertices else chosen["vertices"]
+    asked.ranks = sorted(set(flat(asked.ranks)))
+    asked.growth = (flat(asked.growth) or GROWTH) if asked.growth is not None else []
+    asked.weak = chosen["weak"] if asked.weak is None else asked.weak
+    asked.output_vertices = chosen["output"]
+    asked.peers = [parse(text) for text in asked.peer]
+    asked.limits = Limits(
+        steps=asked.steps if asked.steps is not None else (5 if asked.quick else 10),
+        seconds=asked.seconds if asked.seconds is not None else (2.0 if asked.quick else 15.0),
+        process=asked.limit if asked.limit is not None else (60.0 if asked.quick else 600.0),
+    )
+    if asked.limits.steps < 1 or min(asked.limits.seconds, asked.limits.process) <= 0.0 or asked.weak < 0:
+        raise InputError("--steps must be at least 1, --seconds and --limit above 0, --weak at least 0")
+    if asked.presets is not None:
+        asked.presets = measures.preset_names(asked.presets)
+    return asked
+
+
+class Bench:
+    """Results as they come in; both files are complete after each measurement.
+
+    Parameters
+    ----------
+    asked : argparse.Namespace
+    petsc : sequence of str
+        PETSc's options, given to every measurement of ours.
+    words : sequence of str
+        The command line.
+    """
+
+    def __init__(self, asked: argparse.Namespace, petsc: Sequence[str], words: Sequence[str]) -> None:
+        self._asked, self._petsc, self._folder = asked, list(petsc), asked.out
+        self.results: dict[str, Any] = {
+            "format": 1,
+            "started": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+            "arguments": list(words),
+            "machine": measures.machine(),
+            "versions": {},
+            "rows": [],
+            "failures": [],
+        }
+
+    def _attempt(self, what: str, work: Any) -> Any:
+        """Measure; None, and one line for the user, where it fails."""
+        print(f"bench: {what}", file=sys.stderr, flush=True)
+        try:
+            return work()
+        except Failed as error:
+            line = f"{what}: {error}"
+            self.results["failures"].append(line)
+            print(f"bench: failed: {line}", file=sys.stderr, flush=True)
+            return None
+        finally:
+            self.save()
+
+    def _row(
+        self, vertices: int, method: str, ranks: int, petsc: Sequence[str] = (), **changes: float
+    ) -> Any:
+        what = f"{vertices} vertices, {method}, {ranks} rank(s)"
+        what += "".join(f", {name} {value:g}" for name, value in changes.items())
+        words = [*self._petsc, *petsc]
+        return self._attempt(
+            what, lambda: measures.row(vertices, method, ranks, words, self._asked.limits, **changes)
+        )
+
+    def save(self) -> None:
+        text = json.dumps(self.results, indent=1, ensure_ascii=False)
+        replace_text(self._folder / "bench.json", text + "\n")
+        replace_text(self._folder / "bench.md", document(self.results))
+
+    def go(self) -> None:
+        asked, results = self._asked, self.results
+        self._warm_up()
+        for vertices in asked.vertices:
+            for method in measures.METHODS:
+                for ranks in asked.ranks:
+                    self._add("rows", self._row(vertices, method, ranks))
+            for name, command in asked.peers:
+                self._peer(vertices, name, command)
+        self._growth()
+        if asked.presets is not None:
+            self._presets()
+        if not asked.only_rows:
+            self._weak()
+            self._rest()
+        for row in results["rows"]:
+            results["versions"] |= row.get("versions", {})
+        self.save()
+
+    def _add(self, where: str, found: Any) -> None:
+        if found is not None:
+            self.results.setdefault(where, []).append(found)
+            self.results["versions"] |= found.get("versions", {})
+            self.save()
+
+    def _warm_up(self) -> None:
+        """Fill numba's cache, that no row pays for compiling."""
+        for method in measures.METHODS:
+            self._attempt(
+                f"compiling, {method}",
+                lambda method=method: measures.row(36, method, 1, self._petsc, Limits(1, 1.0, 600.0)),
+            )
+
+    def _peer(self, vertices: int, name: str, command: str) -> None:
+        self._add(
+            "rows",
+            self._attempt(
+                f"{vertices} vertices, peer {name}",
+                lambda: measures.peer_row(name, command, vertices, self._folder, self._asked.limits),
+            ),
+        )
+
+    def _growth(self) -> None:
+        known = measures.first_method(self.results["rows"])
+        rows = list(known)
+        for vertices in self._asked.growth:
+            if measures.square_number(vertices) in [row["vertices"] for row in known]:
+                continue
+            found = self._row(vertices, measures.METHODS[0], 1)
+            self._add("growth_rows", found)
+            rows += [found] if found else []
+            self.results["growth"] = measures.growth(rows)
+        self.results["growth"] = measures.growth(rows)
+        self.save()
+
+    def _weak(self) -> None:
+        asked = self._asked
+        for ranks in asked.ranks if asked.weak else []:
+            self._add("weak", self._row(ranks * asked.weak, measures.METHODS[0], ranks))
+
+    def _presets(self) -> None:
+        for name in self._asked.presets:
+            for title, changes in measures.PROBLEM_CLASSES.items():
+                for vertices in self._asked.vertices:
+                    failures = len(self.results["failures"])
+                    found = self._row(
+                        vertices, measures.METHODS[0], 1, measures.preset_options(name), **changes
+                    )
+                    if found is None:
+                        failed = self.results["failures"][failures].rpartition(": ")[2]
+                        found = {"vertices": measures.square_number(vertices), "problem": failed}
+                    self._add("presets", found | {"preset": name, "problem_class": title})
+
+    def _rest(self) -> None:
+        asked, folder = self._asked, self._folder
+        single = {
+            "overhead": lambda: measures.overhead(self._petsc, asked.limits),
+            "output": lambda: measures.output(
+                asked.output_vertices, asked.ranks[-1], self._petsc, folder, asked.limits
+            ),
+            "default_scene": lambda: measures.default_scene(
+                asked.ranks[-1], self._petsc, folder, asked.limits, short=asked.quick
+            ),
+            "start_up": lambda: measures.start_up(self._petsc, folder, asked.limits),
+        }
+        for name, work in single.items():
+            found = self._attempt(name.replace("_", " "), work)
+            if found is not None:
+                self.results[name] = found
+                self.save()
+
+
+def main() -> int:
+    words, petsc = split(sys.argv[1:])
+    petsc4py.init([sys.argv[0]])  # PETSc must not take our arguments for its own
+    try:
+        asked = read_arguments(words)
+        find_launcher(max(asked.ranks))
+        try:
+            asked.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot be made: {error.strerror}", file=asked.out, key="--out") from None
+        bench = Bench(asked, petsc, sys.argv[1:])
+        bench.go()
+    except (InputError, OutputError) as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("bench: stopped; what was measured stands", file=sys.stderr)
+        return 130
+    print((asked.out / "bench.md").read_text(encoding="utf-8"))
+    return 1 if bench.results["failures"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""The single measurements of the bench, each returning plain data for its JSON file."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cases import METHODS, STEP, hanging_square, small_sheet, square_number
+from peers import measure_peer
+from processes import Limits, measure, run
+from tables import growth
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.nearest import nearest
+from lyra_petsc.solvers.presets import PRESETS
+from lyra_petsc.study.launch import find_launcher
+
+__all__ = ["METHODS", "growth", "square_number"]
+
+WARM_UP = 3
+"""Steps of a row before the first one that is measured."""
+
+REPEATS = 3
+STATES = 10
+"""States that are written to measure output."""
+
+PROBLEM_CLASSES: dict[str, dict[str, float]] = {
+    "soft, 5 ms": {},
+    "× 1000, 5 ms": {"stiffness": 1000.0},
+    "soft, 40 ms": {"step": 8 * STEP},
+}
+
+Result = dict[str, Any]
+
+
+def machine() -> Result:
+    """What the numbers were measured on."""
+    processor = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return {"processor": processor, "cores": os.cpu_count(), "load": os.getloadavg()[0]}
+
+
+def row(
+    vertices: int, method: str, ranks: int, petsc: Sequence[str], limits: Limits, **changes: float
+) -> Result:
+    """Set-up, steps and memory of the hanging square; ``changes`` as `hanging_square` takes them."""
+    found = measure(
+        "steps",
+        ranks,
+        petsc,
+        limits.process,
+        scene=hanging_square(vertices, method, **changes),
+        warm_up=WARM_UP,
+        steps=limits.steps,
+        seconds=limits.seconds,
+    )
+    return found | {"who": method}
+
+
+def first_method(rows: Sequence[Result]) -> list[Result]:
+    """The rows of the first method on one rank."""
+    return [found for found in rows if found["who"] == METHODS[0] and found["ranks"] == 1]
+
+
+def peer_row(name: str, command: str, vertices: int, folder: Path, limits: Limits) -> Result:
+    """Time per step of another program on the same scene; its files stay in ``folder``."""
+    size = square_number(vertices)
+    found = measure_peer(command, folder / "peers" / str(size), size, limits)
+    return {"vertices": size, "who": name, "ranks": 1, "command": command, **found}
+
+
+def preset_names(names: Sequence[str]) -> list[str]:
+    """The named presets, or all.
+
+    Raises
+    ------
+    InputError
+    """
+    for name in names:
+        if name not in PRESETS:
+            raise InputError(f"unknown preset {name!r}, {nearest(name, PRESETS)}", key="--presets")
+    return list(names) or list(PRESETS)
+
+
+def preset_options(name: str) -> list[str]:
+    """The options of a preset as words of a command line."""
+    words = []
+    for option, value in PRESETS[name].items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        words += [f"-{option}", *([] if text is None else [str(text)])]
+    return words
+
+
+def overhead(petsc: Sequence[str], limits: Limits) -> Result:
+    """Steps a second of 100 triangles."""
+    return measure(
+        "overhead", 1, petsc, limits.process, scene=small_sheet(), warm_up=100, steps=200, blocks=5
+    )
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """A folder beside the results, on the same file system, removed afterwards."""
+    scratch = (folder / "scratch").resolve()
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def output(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
+    """Speed of writing states (positions and velocities), beside that of plain files."""
+    scene = hanging_square(vertices) | {"output": {"every": STEP, "fields": ["velocity"]}}
+    with _scratch(folder) as scratch:
+        return measure(
+            "output", ranks, petsc, limits.process, scene=scene, folder=str(scratch), states=STATES
+        )
+
+
+def _program(ranks: int, *words: str) -> list[str]:
+    return [*find_launcher(ranks), sys.executable, "-m", "lyra_petsc", "run", *words]
+
+
+def default_scene(ranks: int, petsc: Sequence[str], folder: Path, limits: Limits, *, short: bool) -> Result:
+    """Time of the default scene, and the share of it that goes into output."""
+    shorter = ["--set", "time.end=0.2"] if short else []
+    with _scratch(folder) as scratch:
+        seconds = run([*_program(ranks, "--out", str(scratch / "run")), *shorter, *petsc], limits.process)
+        summary = json.loads((scratch / "run" / "summary.json").read_text(encoding="utf-8"))
+    phases = summary["wall_seconds"]
+    return {
+        "what": f"default scene{', its first 0.2 s' if short else ''}",
+        "ranks": ranks,
+        "seconds": seconds,
+        "phases": phases,
+        "output_share": phases.get("output", 0.0) / sum(phases.values()),
+    }
+
+
+def start_up(petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
+    """Time of a process that runs one step of the default scene and ends, with numba's cache filled."""
+    with _scratch(folder) as scratch:
+        words = _program(1, "--out", str(scratch / "run"), "--force")
+        times = [run([*words, "-ts_max_steps", "1", *petsc], limits.process) for _ in range(REPEATS + 1)]
+    return {"what": "one step of the default scene", "seconds": times[1:]}

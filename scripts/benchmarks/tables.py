@@ -1,0 +1,231 @@
+"""What was measured as Markdown, and the numbers derived from it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+Result = dict[str, Any]
+
+COUNTS_FROM = 4500
+"""Vertices from which a size counts for the exponent of growth."""
+
+PARTS = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
+COLUMNS = (
+    "vertices",
+    "who",
+    "ranks",
+    "ms a step",
+    "times the first",
+    "residual ms",
+    "Jacobian ms",
+    "frozen ms",
+    "energy ms",
+    "preconditioner ms",
+    "solve ms",
+    "rest ms",
+    "MatMult ms",
+    "assembly, MatMults",
+    "CG iterations",
+    "Newton iterations",
+    "preset",
+    "KB a vertex",
+    "set-up s",
+)
+
+
+def number(value: float, digits: int = 3) -> str:
+    """To so many significant digits, without an exponent where one can read it."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0.0 or 1e-4 <= abs(value) < 1e7:
+        places = digits - 1 - (math.floor(math.log10(abs(value))) if value else 0)
+        return f"{value:.{max(0, places)}f}"
+    return f"{value:.{digits - 1}e}"
+
+
+def spread(values: Sequence[float], factor: float = 1.0) -> str:
+    """Median (fastest-slowest)."""
+    low, middle, high = (factor * f(values) for f in (min, statistics.median, max))
+    return f"{number(middle)} ({number(low)}-{number(high)})"
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    names = list(head)
+    lines = [names, ["---"] * len(names), *(list(row) for row in rows)]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
+
+
+def median_of(row: Result, name: str) -> float:
+    """Median over the steps of a row."""
+    return float(statistics.median(step[name] for step in row["steps"]))
+
+
+def step_seconds(row: Result) -> list[float]:
+    """Seconds of each measured step, ours or a peer's."""
+    return row["step_seconds"] if "step_seconds" in row else [step["seconds"] for step in row["steps"]]
+
+
+def main_table(rows: Sequence[Result]) -> list[str]:
+    """Rows of ours and of peers, by size; ratios to the first method on one rank at that size."""
+    first = {}
+    for row in rows:
+        if "steps" in row:
+            first.setdefault(row["vertices"], row)
+    ordered = sorted(rows, key=lambda row: row["vertices"])
+    return table(COLUMNS, (_cells(row, first.get(row["vertices"])) for row in ordered))
+
+
+def _cells(row: Result, first: Result | None) -> list[str]:
+    times = step_seconds(row)
+    ratio = math.nan
+    if first is not None and median_of(first, "seconds") > 0.0:
+        ratio = statistics.median(times) / median_of(first, "seconds")
+    cells = [str(row["vertices"]), row["who"], str(row["ranks"]), spread(times, 1e3), number(ratio)]
+    if "step_seconds" in row:
+        return cells + ["–"] * (len(COLUMNS) - len(cells))
+    matmult = statistics.median(row["matmult_seconds"])
+    return [
+        *cells,
+        *(number(1e3 * median_of(row, part)) for part in PARTS),
+        spread(row["matmult_seconds"], 1e3),
+        spread([step["assembly"] / matmult for step in row["steps"]]),
+        number(median_of(row, "cg")),
+        number(median_of(row, "newton")),
+        row["preset"],
+        number(sum(row["peak_bytes"]) / row["vertices"] / 1000),
+        number(row["set_up_seconds"]),
+    ]
+
+
+def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
+    """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
+    x = np.log([row["vertices"] for row in rows])
+    y = np.log([cost(row) for row in rows])
+    if len(np.unique(x)) < 2 or not np.isfinite(y).all():
+        return math.nan
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def growth(rows: Sequence[Result]) -> Result:
+    """Exponents of growth of rows that differ in size alone, from `COUNTS_FROM` vertices on."""
+    counted = sorted((r for r in rows if r["vertices"] >= COUNTS_FROM), key=lambda r: r["vertices"])
+    costs: dict[str, Callable[[Result], float]] = {
+        "step": lambda row: median_of(row, "seconds"),
+        "assembly": lambda row: median_of(row, "assembly"),
+        "cg_iterations": lambda row: max(median_of(row, "cg"), 1.0),
+        "memory": lambda row: max(1.0, sum(row["peak_bytes"])),
+    }
+    return {
+        "vertices": [row["vertices"] for row in counted],
+        **{name: exponent(counted, cost) for name, cost in costs.items()},
+    }
+
+
+def growth_words(found: Result) -> list[str]:
+    if not math.isfinite(found["step"]):
+        return [f"Growth needs two sizes of {COUNTS_FROM} vertices or more: --vertices or --growth."]
+    sizes = ", ".join(map(str, found["vertices"]))
+    return [
+        f"Exponent of growth over {sizes} vertices, first method, one rank: time per step "
+        f"{number(found['step'])}, assembly {number(found['assembly'])}, CG iterations "
+        f"{number(found['cg_iterations'])}, memory {number(found['memory'])}."
+    ]
+
+
+def weak_table(rows: Sequence[Result]) -> list[str]:
+    """Weak scaling: vertices per rank stay the same."""
+    base = median_of(rows[0], "seconds")
+
+    def cells(row: Result) -> list[str]:
+        return [
+            str(row["ranks"]),
+            str(row["vertices"]),
+            spread(step_seconds(row), 1e3),
+            number(base / median_of(row, "seconds")),
+            number(median_of(row, "cg")),
+            number(max(row["peak_bytes"]) / 2**20),
+            number(row["set_up_seconds"]),
+        ]
+
+    head = (
+        "ranks",
+        "vertices",
+        "ms a step",
+        "efficiency",
+        "CG iterations",
+        "MiB on the fullest rank",
+        "set-up s",
+    )
+    return table(head, map(cells, rows))
+
+
+def presets_table(rows: Sequence[Result]) -> list[str]:
+    """CG iterations of one solve, and time, of each preset, cloth and Δt against size."""
+    sizes = sorted({row["vertices"] for row in rows})
+    cells: dict[tuple[str, str], dict[int, str]] = {}
+    for row in rows:
+        if "problem" in row:
+            shown = row["problem"]
+        else:
+            solves = [step["cg"] / max(1, step["solves"]) for step in row["steps"]]
+            shown = f"{number(statistics.median(solves))}, {number(1e3 * median_of(row, 'seconds'))} ms"
+        cells.setdefault((row["preset"], row["problem_class"]), {})[row["vertices"]] = shown
+    head = ("preset", "cloth and Δt", *(f"{size} vertices" for size in sizes))
+    return table(head, ([*key, *(found.get(size, "–") for size in sizes)] for key, found in cells.items()))
+
+
+def document(results: Result) -> str:
+    """The whole Markdown file."""
+    machine = results["machine"]
+    lines = [
+        f"# Bench of {results['started']}",
+        "",
+        f"{machine['processor']}, {machine['cores']} cores, load {number(machine['load'])} at the start; "
+        + ", ".join(f"{name} {version}" for name, version in results["versions"].items()),
+        "",
+        "Medians (fastest-slowest). docs/performance.md says what the columns mean.",
+        "",
+    ]
+    if results["rows"]:
+        lines += [*main_table(results["rows"]), ""]
+    if "growth" in results:
+        lines += [*growth_words(results["growth"]), ""]
+    if results.get("weak"):
+        lines += ["## Weak scaling", "", *weak_table(results["weak"]), ""]
+    if results.get("presets"):
+        lines += ["## CG iterations a solve, and time per step", "", *presets_table(results["presets"]), ""]
+    single = list(_single_numbers(results))
+    if single:
+        lines += ["## Single numbers", "", *table(("what", "measured"), single), ""]
+    if results["failures"]:
+        lines += ["## What failed", "", *(f"- {line}" for line in results["failures"]), ""]
+    return "\n".join(lines)
+
+
+def _single_numbers(results: Result) -> Iterable[tuple[str, str]]:
+    if "overhead" in results:
+        found = results["overhead"]
+        rates = found["steps_a_second"]
+        yield f"steps a second, {found['triangles']} triangles ({found['preset']})", spread(rates)
+        yield "ms a Newton iteration there", spread([1e3 / rate / found["newton"] for rate in rates])
+    if "output" in results:
+        found = results["output"]
+        ours, plain = found["states_bytes_a_second"], found["plain_bytes_a_second"]
+        size = f"{number(found['bytes'] / 1e6)} MB each, {found['ranks']} rank(s)"
+        yield f"states, MB/s ({size})", spread(ours, 1e-6)
+        yield "plain files of that size, MB/s", spread(plain, 1e-6)
+        ratios = [mine / theirs for mine, theirs in zip(ours, plain, strict=True)]
+        yield "states over plain files", spread(ratios)
+    if "default_scene" in results:
+        found = results["default_scene"]
+        yield f"{found['what']}, {found['ranks']} rank(s), s", number(found["seconds"])
+        yield "share of its output", f"{100 * found['output_share']:.2g} %"
+    if "start_up" in results:
+        found = results["start_up"]
+        yield f"{found['what']}, start to end of the process, s", spread(found["seconds"])

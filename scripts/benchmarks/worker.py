@@ -1,0 +1,232 @@
+"""One measurement, in a process (or an mpirun) of its own, so that nothing of another one is in its memory.
+
+    mpirun -n P python worker.py JOB.json RESULT.json [-petsc options]
+
+``JOB.json`` holds ``kind`` (a name in `KINDS`), ``scene`` and what else the kind takes; all times are in
+seconds of wall time, between barriers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+petsc4py.init([sys.argv[0], *sys.argv[3:]])
+
+import numpy as np  # noqa: E402
+from mpi4py import MPI  # noqa: E402
+from petsc4py import PETSc  # noqa: E402
+
+from lyra_petsc import profiling  # noqa: E402
+from lyra_petsc.errors import LyraError  # noqa: E402
+from lyra_petsc.output.summary import versions  # noqa: E402
+from lyra_petsc.recorder import Recorder  # noqa: E402
+from lyra_petsc.scene.schema import Scene  # noqa: E402
+from lyra_petsc.simulation import Simulation  # noqa: E402
+
+FEWEST = 2
+"""Steps that are measured however long they take."""
+
+PARTS = {
+    "residual": (profiling.RESIDUAL,),
+    "jacobian": (profiling.JACOBIAN,),
+    "frozen": (profiling.FROZEN,),
+    "energy": ("SNESObjectiveEval",),
+    "preconditioner": ("PCSetUp", "PCSetUpOnBlocks"),
+    "solve": ("KSPSolve",),
+}
+"""Parts of a step and the events of PETSc's log that make them up."""
+
+Comm = MPI.Intracomm
+Result = dict[str, Any]
+
+
+def now(comm: Comm) -> float:
+    comm.Barrier()
+    return time.perf_counter()
+
+
+def resident() -> tuple[int, int]:
+    """Bytes of memory of this process now, and at most so far (Linux)."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    now_and_peak = [re.search(rf"^{name}:\s+(\d+) kB", status, re.M) for name in ("VmRSS", "VmHWM")]
+    current, peak = (1024 * int(found[1]) if found else 0 for found in now_and_peak)
+    return current, peak
+
+
+def forget_peak() -> None:
+    """Let the peak begin anew: importing takes more than it keeps."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def events(comm: Comm) -> dict[str, tuple[float, int]]:
+    """Seconds (mean of the ranks) and calls of each of `PARTS` so far."""
+    stage = profiling.STAGES["solve"].id
+    found = {}
+    for part, names in PARTS.items():
+        infos = [PETSc.Log.Event(name).getPerfInfo(stage) for name in names]
+        seconds = comm.allreduce(sum(info["time"] for info in infos)) / comm.size
+        found[part] = (seconds, int(infos[0]["count"]))
+    return found
+
+
+def matrix_product(comm: Comm, matrix: PETSc.Mat) -> list[float]:
+    """Times of single products of the Jacobian with a vector, at least 20 and a fifth of a second."""
+    x, y = matrix.createVecs()
+    x.setRandom()
+    for _ in range(3):
+        matrix.mult(x, y)
+    times: list[float] = []
+    while len(times) < 20 or (sum(times) < 0.2 and len(times) < 2000):
+        began = now(comm)
+        matrix.mult(x, y)
+        times.append(comm.bcast(now(comm) - began))
+    x.destroy()
+    y.destroy()
+    return times
+
+
+def steps(comm: Comm, job: Result) -> Result:
+    """Set-up, steps and their parts, memory.
+
+    ``warm_up`` steps are taken first; then up to ``steps`` are measured, fewer when ``seconds`` are over.
+    """
+    PETSc.Log.begin()
+    forget_peak()
+    before, _ = resident()
+    began = now(comm)
+    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    simulation.model.release()
+    built = now(comm) - began
+    simulation.step()
+    set_up = now(comm) - began
+    for _ in range(job["warm_up"] - 1):
+        simulation.step()
+    rows: list[Result] = []
+    first, past = now(comm), events(comm)
+    while len(rows) < job["steps"]:
+        began = now(comm)
+        report = simulation.step()
+        seconds, after = now(comm) - began, events(comm)
+        row: Result = {"seconds": seconds, "newton": report.newton_iterations, "cg": report.linear_iterations}
+        spent = {part: after[part][0] - past[part][0] for part in PARTS}
+        calls = {part: after[part][1] - past[part][1] for part in PARTS}
+        row |= spent | {"rest": max(0.0, seconds - sum(spent.values()))}
+        # of one Newton iteration; what is frozen in a step serves all of its iterations
+        row["assembly"] = spent["residual"] / max(1, calls["residual"])
+        row["assembly"] += (spent["jacobian"] + spent["frozen"]) / max(1, calls["jacobian"])
+        row["solves"] = calls["solve"]
+        rows.append(row)
+        past = after
+        if comm.bcast(time.perf_counter() - first > job["seconds"] and len(rows) >= FEWEST):
+            break
+    _, peak = resident()
+    outline, stepper = simulation.model.outline, simulation.stepper
+    return {
+        "vertices": outline.n_vertices,
+        "triangles": outline.n_triangles,
+        "integer_bits": 8 * np.dtype(PETSc.IntType).itemsize,
+        "build_seconds": built,
+        "set_up_seconds": set_up,
+        "phases": simulation.phases.seconds(),
+        "peak_bytes": comm.allgather(peak - before),
+        "matmult_seconds": matrix_product(comm, stepper.matrix.mat),
+        "matrix_type": stepper.matrix.mat.getType(),
+        "preset": stepper.preset,
+        "petsc_options": PETSc.Options().getAll(),
+        "notes": simulation.notes,
+        "steps": rows,
+    }
+
+
+def overhead(comm: Comm, job: Result) -> Result:
+    """Steps a second in ``blocks`` blocks of ``steps``, nothing logged."""
+    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    for _ in range(job["warm_up"]):
+        simulation.step()
+    rates, newton = [], 0
+    for _ in range(job["blocks"]):
+        began = now(comm)
+        for _ in range(job["steps"]):
+            newton += simulation.step().newton_iterations
+        rates.append(job["steps"] / (now(comm) - began))
+    return {
+        "triangles": simulation.model.outline.n_triangles,
+        "preset": simulation.stepper.preset,
+        "newton": newton / (job["steps"] * job["blocks"]),
+        "steps_a_second": rates,
+    }
+
+
+def output(comm: Comm, job: Result) -> Result:
+    """States written by turns with plain files of the same size, both brought to the disk (fsync)."""
+    folder = Path(job["folder"])
+    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    recorder = Recorder(simulation)
+    recorder.begin(folder)
+    ours, raw, sizes = [], [], []
+    for number in range(1, job["states"] + 1):
+        simulation.step_number, simulation.time = number, number * simulation.control.step
+        began = now(comm)
+        recorder.write_state()
+        ours.append(now(comm) - began)
+        size = (folder / f"states-{number:04d}.h5").stat().st_size
+        block = os.urandom(size) if comm.rank == 0 else b""
+        began = now(comm)
+        if comm.rank == 0:
+            _write_plain(folder / f"plain-{number}", block)
+        raw.append(now(comm) - began)
+        sizes.append(size)
+    recorder.close()
+    return {
+        "vertices": simulation.model.outline.n_vertices,
+        "bytes": statistics.median(sizes),
+        "states_bytes_a_second": [size / seconds for size, seconds in zip(sizes, ours, strict=True)],
+        "plain_bytes_a_second": [size / seconds for size, seconds in zip(sizes, raw, strict=True)],
+    }
+
+
+def _write_plain(path: Path, block: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(block)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+KINDS = {"steps": steps, "overhead": overhead, "output": output}
+
+
+def main() -> None:
+    """Run the job on all ranks; rank 0 writes the result, or the line that says why there is none."""
+    comm = MPI.COMM_WORLD
+    job = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    try:
+        result = KINDS[job["kind"]](comm, job) | {"ranks": comm.size, "versions": versions()}
+    except LyraError as error:
+        if comm.rank == 0:
+            print(f"lyra-petsc: {error}", file=sys.stderr, flush=True)
+        sys.exit(error.exit_code)
+    if comm.rank == 0:
+        Path(sys.argv[2]).write_text(json.dumps(result), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except Exception:  # the other ranks wait
+        import traceback
+
+        traceback.print_exc()
+        sys.stderr.flush()
+        MPI.COMM_WORLD.Abort(1)
