@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
 Fill = Callable[[int, int, Array], None]
@@ -98,6 +99,12 @@ class BlockRows:
             blocks = buffer[: hi - lo]
             fill(lo, hi, blocks)
             _scatter(blocks, offsets[lo:hi], weights[lo:hi], values)
+
+    def add_stiffness(
+        self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
+    ) -> None:
+        """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
+        self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
 
     def add_diagonal(self, diagonal: Array, values: Array) -> None:
         """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.storage import KINDS, Storage
 from lyra_petsc.errors import InputError
 from lyra_petsc.partition.points import Points
 
@@ -36,6 +39,8 @@ class SystemMatrix:
         except PETSc.Error:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
+        self._pattern, self._n_owned = pattern, points.n_owned
+        self._storage: Storage | None = None
         self._indptr = pattern.indptr.astype(PETSc.IntType)
         self._columns = points.global_number[pattern.columns].astype(PETSc.IntType)
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
@@ -63,10 +68,16 @@ class SystemMatrix:
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+        if self._storage is not None:
+            self._storage.write(values)
+            return
         if self.kind == "sbaij":
             values = values[self._upper]
         self.mat.setValuesBlockedCSR(self._indptr, self._columns, values, PETSc.InsertMode.INSERT)
         self.mat.assemble()
+        if self.kind in KINDS:
+            with suppress(AttributeError, OSError):
+                self._storage = Storage(self.mat, self.kind, self._pattern, self._n_owned)
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

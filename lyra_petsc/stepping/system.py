@@ -17,13 +17,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
 from lyra_petsc.stepping.clamped import clamped_energy
+from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.departures import Departures
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
@@ -90,11 +90,7 @@ class ReducedSystem:
         self._events = events
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
-        self._damped = [
-            t for t in elastic if scheme.moves and t.damped and np.any(t.elements.data["damping"])
-        ]
-        self.damped = bool(points.comm.allreduce(len(self._damped), MPI.MAX))
-        self._damping = blocks.zeros() if self.damped else None
+        self._damping = Damping(points, blocks, elastic, moves=scheme.moves)
         self._values = blocks.zeros()
         n_local, n_owned = points.n_local, points.n_owned
         self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(5))
@@ -153,11 +149,8 @@ class ReducedSystem:
             self._load(at)
         else:
             self._force[:n] = self.given_loads
-        if self._damping is not None:
-            self._damping[:] = 0.0
-            for damped in self._damped:
-                weight = damped.elements.data["damping"]
-                self._add_stiffness(damped, self._frozen(at), 1.0, weight, self._damping)
+        if self._damping.acts:
+            self._damping.freeze(self._frozen(at))
 
     def _frozen(self, at: float) -> Array:
         """Positions (n_local, 3) whose geometry stays as it is during the step."""
@@ -261,8 +254,8 @@ class ReducedSystem:
             if terms:
                 parts[name] = self._sum(terms, x)
         parts["loads"] = -self._force[:n]
-        if self._damping is not None:
-            parts["damping"] = self._blocks.product(self._damping, vs)
+        if self._damping.acts:
+            parts["damping"] = self._damping.product(vs)
         if self.viscous and not self.scheme.explicit:
             parts["wind"] = self._sum(self.viscous, vs)
         return parts
@@ -304,9 +297,10 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         values = self._values
-        values[:] = 0.0 if self._damping is None else self._damping
-        for term in self.elastic:
-            self._add_stiffness(term, x, blend, self.stage.reach, values)
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, self.stage.reach, values):
+            self._damping.into(values)
+            for term in self.elastic:
+                self._blocks.add_stiffness(term, x, blend, self.stage.reach, values)
         if not self.scheme.explicit:
             for wind in self.viscous:
                 self._add_wind(wind, vs, values)
@@ -314,11 +308,6 @@ class ReducedSystem:
         if len(self._prescribed.rows):
             self._blocks.constrain(values, self.mask, self._prescribed.rows)
         return values
-
-    def _add_stiffness(
-        self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
-    ) -> None:
-        self._blocks.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
 
     def _add_wind(self, wind: Viscous, v: Array, values: Array) -> None:
         self._blocks.add(wind.name, lambda lo, hi, out: wind.hessians(v, lo, hi, out), 1.0, values)
@@ -341,8 +330,8 @@ class ReducedSystem:
             square += 2.0 * rate * rate * float(np.vdot(each, scale))
         work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
         parts = [inertia, *energies, -rate * work]
-        if self._damping is not None:
-            parts.append(0.5 * float(np.vdot(v, self._blocks.product(self._damping, vs))))
+        if self._damping.acts:
+            parts.append(0.5 * float(np.vdot(v, self._damping.product(vs))))
         if not self.scheme.explicit:
             parts += [float(wind.potentials(vs).sum()) for wind in self.viscous]
         local = np.array([sum(parts), sum(abs(part) for part in parts), square])
