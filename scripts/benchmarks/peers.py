@@ -104,4 +104,4 @@ def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> d
         short.append(run_for(WARM_UP))
         long.append(run_for(WARM_UP + steps))
     times = [max(0.0, after - before) / steps for before, after in zip(short, long, strict=True)]
-    return {"step_seconds": times, "short_seconds": short, "long_seconds": long, "steps": steps}
+    return {"step_seconds": times, "short_seconds": short, "long_seconds": long, "further_steps": steps}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from cases import METHODS
 
 Result = dict[str, Any]
 
@@ -75,7 +76,7 @@ def main_table(rows: Sequence[Result]) -> list[str]:
     """Rows of ours and of peers, by size; ratios to the first method on one rank at that size."""
     first = {}
     for row in rows:
-        if "steps" in row:
+        if row["who"] == METHODS[0]:
             first.setdefault(row["vertices"], row)
     ordered = sorted(rows, key=lambda row: row["vertices"])
     return table(COLUMNS, (_cells(row, first.get(row["vertices"])) for row in ordered))

@@ -1,0 +1,77 @@
+"""``-log_view`` shows our phases as stages and the assembly as events, with counts that are right."""
+
+from __future__ import annotations
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from launch import SCENE, done, environment, write_scene
+
+STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|output): +\S+ +[\d.]+%", re.M)
+
+
+def counts(log: str, name: str) -> list[int]:
+    """Calls of an event, one number for each stage in which it happened (largest number of any rank)."""
+    return [int(found) for found in re.findall(rf"^{name} +(\d+) 1\.0", log, re.M) if int(found)]
+
+
+def column(folder: Path, name: str) -> list[int]:
+    with (folder / "history.csv").open(encoding="utf-8") as file:
+        return [int(row[name]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint"])
+def test_stages_and_events(tmp_path: Path, integrator: str, ranks: int) -> None:
+    scene = write_scene(tmp_path, SCENE.replace("step: 0.01}", f"step: 0.01, integrator: {integrator}}}"))
+    left = done(["run", scene, "--out", "out", "-log_view"], tmp_path, ranks)
+    assert STAGE.findall(left.out) == ["mesh", "partition", "assembly", "solve", "output"]
+    newton, rejected = column(tmp_path / "out", "newton_iterations"), column(tmp_path / "out", "rejected")
+    steps = len(newton) - 1
+    assert steps == 5
+    assert sum(rejected) == 0
+    assert sum(newton) == steps if integrator == "semi-implicit" else sum(newton) > steps
+    assert counts(left.out, "AssembleJacobian") == [sum(newton)]
+    assert counts(left.out, "AssembleFrozen") == [steps]
+    (residuals,) = counts(left.out, "AssembleResidual")
+    assert residuals >= sum(newton)
+    assert counts(left.out, "AssembleAgain") == []
+
+
+def test_stages_are_balanced_when_exceptions_pass(tmp_path: Path) -> None:
+    program = """
+from petsc4py import PETSc
+from lyra_petsc.output.phases import Phases
+from lyra_petsc.profiling import STAGES, logged
+PETSc.Log.begin()
+
+@logged("Marker")
+def mark(fails=False):
+    if fails:
+        raise ValueError
+
+phases = Phases()
+for outer, inner in (("solve", "output"), ("mesh", "mesh"), ("solve", "a further one")):
+    try:
+        with phases(outer):
+            with phases(inner):
+                mark(fails=True)
+    except ValueError:
+        pass
+mark()
+event = PETSc.Log.Event("Marker")
+print([event.getPerfInfo(stage)["count"] for stage in (0, *(stage.id for stage in STAGES.values()))])
+print(list(STAGES))
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", program], env=environment(), capture_output=True, text=True, timeout=60
+    )
+    # once outside of all stages, once each in those that were innermost
+    assert told.stdout.splitlines() == [
+        "[1, 1, 0, 0, 0, 1, 1]",
+        "['mesh', 'partition', 'assembly', 'solve', 'output', 'a further one']",
+    ], told.stderr

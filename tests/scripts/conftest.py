@@ -1,0 +1,6 @@
+"""The modules of the bench stand beside each other in a folder of their own."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts" / "benchmarks"))

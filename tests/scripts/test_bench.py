@@ -1,0 +1,263 @@
+"""``scripts/bench``: whole files that say what was measured, peers beside, one line for each failure."""
+
+import json
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cases import corners, hanging_square, small_sheet, square_number
+from peers import write_files, write_scene
+from processes import Failed, run
+from tables import COLUMNS, document, exponent, growth, number, spread
+
+from lyra_petsc.materials.library import resolve
+from lyra_petsc.meshing.build import build_mesh
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.study.launch import environment
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+
+
+def bench(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(SCRIPTS / "benchmarks"), *words],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+
+
+def tables_of(markdown: str) -> list[list[list[str]]]:
+    """The cells of every table of a Markdown text, without the line of dashes."""
+    found: list[list[list[str]]] = [[]]
+    for line in markdown.splitlines():
+        if line.startswith("|"):
+            found[-1].append([cell.strip() for cell in line.strip("|").split(" | ")])
+        elif found[-1]:
+            found.append([])
+    return [[lines[0], *lines[2:]] for lines in found if lines]
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bench")
+    words = [
+        "--quick",
+        "--vertices",
+        "36",
+        "--ranks",
+        "1,2",
+        "--steps",
+        "3",
+        "--seconds",
+        "0.2",
+        "--weak",
+        "50",
+    ]
+    peers = [
+        "slow=for i in $(seq {steps}); do sleep 0.2; done",
+        "idle=true",
+        "bad=echo oh >&2; echo no >&2; exit 3",
+    ]
+    for peer in peers:
+        words += ["--peer", peer]
+    done = bench(folder, *words, "--presets", "block-jacobi", "-ksp_rtol", "1e-9")
+    return done, folder / "bench"
+
+
+@pytest.mark.slow
+def test_json_holds_every_measurement(measured):
+    done, folder = measured
+    results = json.loads((folder / "bench.json").read_text())
+    ours = [row for row in results["rows"] if "command" not in row]
+    assert [(row["who"], row["ranks"]) for row in ours] == [
+        ("semi-implicit", 1),
+        ("semi-implicit", 2),
+        ("beuler", 1),
+        ("beuler", 2),
+    ], done.stderr
+    for row in ours:
+        assert row["vertices"] == 36
+        assert len(row["peak_bytes"]) == row["ranks"]
+        assert min(row["peak_bytes"]) > 0
+        assert row["set_up_seconds"] > row["build_seconds"] > 0.0
+        assert row["petsc_options"]["ksp_rtol"] == "1e-9"
+        assert 2 <= len(row["steps"]) <= 3
+        for step in row["steps"]:
+            parts = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
+            assert sum(step[part] for part in parts) == pytest.approx(step["seconds"])
+            assert min(step["residual"], step["jacobian"], step["frozen"], step["solve"]) > 0.0
+            assert step["solves"] == step["newton"]
+            if row["who"] == "semi-implicit":
+                assert step["newton"] == 1
+                assert step["energy"] == 0.0
+            else:
+                assert step["newton"] > 1
+                assert step["energy"] > 0.0
+    assert results["overhead"]["triangles"] == 100
+    assert min(results["overhead"]["steps_a_second"]) > 0.0
+    assert len(results["output"]["states_bytes_a_second"]) == len(results["output"]["plain_bytes_a_second"])
+    assert results["output"]["bytes"] > 48 * results["output"]["vertices"]
+    assert 0.0 < results["default_scene"]["output_share"] < 1.0
+    assert len(results["start_up"]["seconds"]) == 3
+    assert [row["vertices"] for row in results["weak"]] == [square_number(50), square_number(100)]
+    assert len(results["presets"]) == 3
+    assert not (folder / "scratch").exists()
+
+
+@pytest.mark.slow
+def test_markdown_shows_them(measured):
+    done, folder = measured
+    text = (folder / "bench.md").read_text()
+    assert done.stdout.strip() == text.strip()
+    for lines in tables_of(text):
+        assert {len(line) for line in lines} == {len(lines[0])}
+        assert all(cell for line in lines for cell in line)
+    rows, weak, presets, single = tables_of(text)
+    assert tuple(rows[0]) == COLUMNS
+    assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
+    assert rows[1][4] == "1.00"
+    assert len(weak) == 3
+    assert len(presets) == 4
+    assert {line[0] for line in presets[1:]} == {"block-jacobi"}
+    assert len(single) == 9
+
+
+@pytest.mark.slow
+def test_peers_stand_beside_and_one_that_fails_is_one_line(measured):
+    done, folder = measured
+    results = json.loads((folder / "bench.json").read_text())
+    slow, idle = (row for row in results["rows"] if "command" in row)
+    assert np.median(slow["step_seconds"]) > 0.1
+    assert np.median(idle["step_seconds"]) < 0.1
+    said = "36 vertices, peer bad: ended with exit code 3: no"
+    assert results["failures"] == [said]
+    assert [line for line in done.stderr.splitlines() if "failed" in line] == [f"bench: failed: {said}"]
+    assert done.returncode == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--vertices", "1e3"], "'1e3' must be whole numbers from 1 on"),
+        (["--ranks", "0"], "'0' must be whole numbers from 1 on"),
+        (["--peer", "nothing"], "--peer: must be NAME='command"),
+        (["--presets", "magic"], "unknown preset 'magic'"),
+        (["--steps", "0"], "--steps must be at least 1"),
+        (["--nonsense"], "unrecognized arguments: --nonsense"),
+        (["--out", "taken/below"], "taken/below: --out: cannot be made"),
+    ],
+)
+def test_mistakes_are_one_line(tmp_path, words, says):
+    (tmp_path / "taken").write_text("a file")
+    done = bench(tmp_path, *words)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_files_for_peers_are_the_scene(tmp_path):
+    write_files(tmp_path, 100)
+    theirs = load_scene(write_scene(tmp_path, 100, 7), [])
+    ours = Scene.model_validate(hanging_square(100))
+    meshes = build_mesh(theirs.mesh, file=theirs.source), build_mesh(ours.mesh)
+    np.testing.assert_array_equal(meshes[0].positions, meshes[1].positions)
+    np.testing.assert_array_equal(meshes[0].triangles, meshes[1].triangles)
+    np.testing.assert_array_equal(meshes[0].triangle_uv, meshes[1].triangle_uv)
+    (shell, _), (expected, _) = resolve(theirs.material[0]), resolve(ours.material[0])
+    for name in ("density", "c11", "c22", "c33", "bending"):
+        assert getattr(shell, name) == pytest.approx(getattr(expected, name)), name
+    assert shell.c12 == 0.0  # as the original has it
+    assert theirs.time.step == ours.time.step
+    assert theirs.time.end == pytest.approx(7 * ours.time.step)
+    assert theirs.gravity == ours.gravity
+    assert list(theirs.handles[0].nodes) == corners(100)
+
+
+def test_corners_and_small_sheet():
+    for scene in (hanging_square(400), small_sheet()):
+        checked = Scene.model_validate(scene)
+        mesh = build_mesh(checked.mesh)
+        held = mesh.positions[list(checked.handles[0].nodes)]
+        top = mesh.positions[:, 1].max()
+        assert sorted(map(tuple, held)) == [(0.0, top, 0.0), (mesh.positions[:, 0].max(), top, 0.0)]
+    assert mesh.n_triangles == 100
+
+
+def row(vertices: int, seconds: float) -> dict:
+    step = {"seconds": seconds, "assembly": 1e-6 * vertices, "cg": 20, "newton": 1}
+    return {
+        "vertices": vertices,
+        "who": "semi-implicit",
+        "ranks": 1,
+        "peak_bytes": [vertices],
+        "steps": [step] * 3,
+    }
+
+
+def test_exponents_of_growth():
+    rows = [row(v, 1e-6 * v**1.5) for v in (100, 5000, 20_000, 80_000)]
+    found = growth(rows)
+    assert found["vertices"] == [5000, 20_000, 80_000]
+    assert found["step"] == pytest.approx(1.5)
+    assert found["assembly"] == pytest.approx(1.0)
+    assert found["cg_iterations"] == pytest.approx(0.0, abs=1e-12)
+    assert math.isnan(exponent(rows[:1], lambda each: 1.0))
+
+
+def test_a_file_without_any_row_is_still_whole():
+    results = {
+        "started": "now",
+        "machine": {"processor": "p", "cores": 1, "load": 0.0},
+        "versions": {},
+        "rows": [],
+        "growth": growth([]),
+        "failures": ["a line"],
+    }
+    assert document(results).rstrip().endswith("- a line")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0.00"), (1234.5, "1234"), (0.01234, "0.0123"), (9.996, "10.00"), (math.nan, "–")],
+)
+def test_numbers_have_three_digits(value, text):
+    assert number(value) == text
+
+
+def test_spread_is_median_and_extremes():
+    assert spread([3.0, 1.0, 2.0], 10.0) == "20.0 (10.0-30.0)"
+
+
+def test_a_process_that_takes_too_long_is_ended_with_its_children(tmp_path):
+    began = time.monotonic()
+    with pytest.raises(Failed, match=r"not done within 0\.5 s"):
+        run("sleep 60 & echo $! >child; wait", 0.5, tmp_path)
+    assert time.monotonic() - began < 30.0
+    child = Path("/proc", (tmp_path / "child").read_text().strip(), "stat")
+    while time.monotonic() - began < 40.0 and child.exists() and child.read_text().split()[2] != "Z":
+        time.sleep(0.1)
+    assert not child.exists() or child.read_text().split()[2] == "Z"
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (["/no/such/program"], "cannot be started"),
+        ("exit 7", "exit code 7$"),
+        ("kill -9 $$", "ended by SIGKILL"),
+    ],
+)
+def test_why_a_process_failed(command, says):
+    with pytest.raises(Failed, match=says):
+        run(command, 10.0)
