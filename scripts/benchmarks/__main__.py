@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import measures
-import petsc4py
 from peers import parse
 from processes import Failed, Limits
 from tables import document
@@ -227,8 +227,8 @@ class Bench:
 
 
 def main() -> int:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that what was started is ended
     words, petsc = split(sys.argv[1:])
-    petsc4py.init([sys.argv[0]])  # PETSc must not take our arguments for its own
     try:
         asked = read_arguments(words)
         find_launcher(max(asked.ranks))

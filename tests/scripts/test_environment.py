@@ -176,3 +176,14 @@ def test_a_layer_shows_the_packages_below_and_pins_them(environment, tmp_path):
 def test_shell_syntax(script):
     done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_bench_is_started_with_its_arguments_and_the_launcher(environment, tmp_path):
+    # the first module from outside the standard library speaks and ends the program
+    spy = "import os, sys\nprint(sys.argv, os.environ['MPIRUN'], os.getcwd())\nsys.exit(5)\n"
+    (site_packages(environment) / "numpy" / "__init__.py").write_text(spy)
+    done = call("bench", "--peer", "a=b {obj}", "-pc_type", "gamg", cwd=tmp_path, **activated(environment))
+    program = str(ROOT / "scripts" / "benchmarks")
+    words = [program, "--peer", "a=b {obj}", "-pc_type", "gamg"]
+    assert done.stdout.strip() == f"{words} {environment / 'bin' / 'mpirun'} {tmp_path}", done.stderr
+    assert done.returncode == 5
