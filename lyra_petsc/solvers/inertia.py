@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "gamg"})
+RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg"})
 """Preconditioners that leave conjugate gradients something to find."""
 
 
 def shows_negative_curvature(pc: PETSc.PC) -> bool:
     """Whether it would be noticed, by conjugate gradients or by ``negative_pivots``."""
-    return pc.getType() in RESEMBLING or _counts_pivots(pc)
+    kind = pc.getType()
+    if kind == "bjacobi":
+        kind = PETSc.Options().getString("sub_pc_type", "ilu")
+    return kind in RESEMBLING or _counts_pivots(pc)
 
 
 def negative_pivots(pc: PETSc.PC) -> int:

@@ -1,9 +1,6 @@
 """Named linear solvers, each a set of PETSc options, and which one a problem starts with.
 
 ``-pc_type`` on the command line replaces them. When a preset breaks down, the next takes over.
-
-Incomplete factors are not among them: zero-fill ones stop existing under load, and those of block
-storage came out wrong when factored again (PETSc 3.18, ``baij``, fill 1).
 """
 
 from __future__ import annotations
@@ -32,6 +29,16 @@ PRESETS: dict[str, dict[str, Value]] = {
         "pc_type": "cholesky",
         "pc_factor_mat_ordering_type": "qmd",
     },
+    # a fifteenth of the iterations of block Jacobi for a few times the price; on fine meshes under load the
+    # factors stop existing
+    "ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "ilu", "pc_factor_levels": 1},
+    "block-ilu": {
+        "mat_type": "baij",
+        "ksp_type": "cg",
+        "pc_type": "bjacobi",
+        "sub_pc_type": "ilu",
+        "sub_pc_factor_levels": 1,
+    },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
     # symmetric sweeps instead of PETSc's Chebyshev default, whose bounds age within a step. No
@@ -47,10 +54,10 @@ PRESETS: dict[str, dict[str, Value]] = {
 
 FACTORISATIONS = ("direct", "cholesky")
 
-MULTIGRID_FROM = 4000
-"""Vertices from which multigrid is tried first."""
+ILU_FROM, ILU_UNTIL = 2000, 30_000
+"""Vertices between which incomplete factors are tried first; from 0 on where a step is one linear solve."""
 
-BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor"})
+BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 """What is used with block storage; every other ``-pc_type`` gets ``aij``."""
 
 
@@ -60,22 +67,32 @@ DIRECT_UNTIL = 30_000
 FACTOR_COST = 20.0, 5.0
 """Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
+WORTH_OF_ILU, PRICE_OF_ILU = 4.0, 3.0
+"""How many iterations of block Jacobi one with incomplete factors is worth, at the least, and costs."""
 
-def candidates(n_vertices: int, ranks: int, *, static: bool = False, iterations: float = 0.0) -> list[str]:
+
+def candidates(
+    n_vertices: int, ranks: int, *, static: bool = False, newton: bool = True, iterations: float = 0.0
+) -> list[str]:
     """Presets to try in order; only ``user`` when the user chose the preconditioner.
 
-    ``iterations`` is what conjugate gradients with block Jacobi are expected to take.
+    ``newton`` says that a step is more than one linear solve; ``iterations`` is what conjugate gradients
+    with block Jacobi are expected to take.
     """
     if is_set("pc_type"):
         return ["user"]
     factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
     if static:
         return [*factors, "gamg", "block-jacobi"]
-    if n_vertices >= MULTIGRID_FROM:
+    if n_vertices > ILU_UNTIL:
         return ["gamg", *factors, "block-jacobi"]
-    if iterations > _factor_cost(n_vertices):
-        return [*factors, "block-jacobi", "gamg"]
-    return ["block-jacobi", *factors, "gamg"]
+    incomplete = "ilu" if ranks == 1 else "block-ilu"
+    small = n_vertices < ILU_FROM
+    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH_OF_ILU):
+        return [*factors, incomplete, "gamg", "block-jacobi"]
+    if small and newton:
+        return ["block-jacobi", *factors, "gamg"]
+    return [incomplete, *factors, "gamg", "block-jacobi"]
 
 
 def _factorisations(ranks: int) -> list[str]:
@@ -88,7 +105,7 @@ def _factorisations(ranks: int) -> list[str]:
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        return _factor_cost(n_vertices)
+        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE_OF_ILU)
     return math.inf
 
 

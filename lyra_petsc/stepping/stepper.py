@@ -95,7 +95,9 @@ class Stepper:
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
         expected = 0.0 if static else expected_iterations(system, step)
-        self.presets = candidates(points.n_global, points.comm.size, static=static, iterations=expected)
+        self.presets = candidates(
+            points.n_global, points.comm.size, static=static, newton=self._iterates, iterations=expected
+        )
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
