@@ -71,10 +71,10 @@ def add_gradient(x, s, k, rest, limit, out):  # type: ignore[no-untyped-def]
 @kernel()
 def hessians(x, s, lo, hi, blend, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
-    g, h = np.empty((4, 3)), np.empty((4, 4, 3, 3))
+    g = np.empty((4, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], blend, g, h, out[e - lo])
+        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], blend, g, out[e - lo])
 
 
 class Bending(Elastic):

@@ -56,10 +56,10 @@ def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-
 @kernel()
 def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of edges lo..hi into out (hi − lo, 3, 3, 3, 3)."""
-    g, h, o = np.empty((4, 3)), np.empty((4, 4, 3, 3)), np.empty((4, 4, 3, 3))
+    g, o = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, blend, g, h, o)
+        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, blend, g, o)
         out[e - lo] = o[:3, :3]
 
 

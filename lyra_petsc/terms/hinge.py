@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from lyra_petsc.terms.kernel import kernel
 
 
@@ -68,58 +66,76 @@ def angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _add_skew_product(q, w, scale, out):  # type: ignore[no-untyped-def]
-    """out += scale · Q [w]×, Q symmetric (3, 3), [w]× u = w × u."""
+def _add_outer(a, b, scale, out):  # type: ignore[no-untyped-def]
+    """out += scale · a bᵀ."""
     for i in range(3):
-        out[i, 0] += scale * (q[i, 1] * w[2] - q[i, 2] * w[1])
-        out[i, 1] += scale * (q[i, 2] * w[0] - q[i, 0] * w[2])
-        out[i, 2] += scale * (q[i, 0] * w[1] - q[i, 1] * w[0])
+        s = scale * a[i]
+        out[i, 0] += s * b[0]
+        out[i, 1] += s * b[1]
+        out[i, 2] += s * b[2]
+
+
+@kernel(inline="always")
+def _combined(p, u, q, w):  # type: ignore[no-untyped-def]
+    return p * u[0] + q * w[0], p * u[1] + q * w[1], p * u[2] + q * w[2]
 
 
 @kernel()
-def angle_hessian(x0, x1, x2, x3, h):  # type: ignore[no-untyped-def]
-    """Hessian of θ [1/m²] into h (4, 4, 3, 3): [a, b, i, j] = ∂²θ / ∂x_a,i ∂x_b,j."""
+def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-def]
+    """Add scale times the Hessian of θ [1/m²] to out (4, 4, 3, 3): [a, b, i, j] = ∂²θ / ∂x_a,i ∂x_b,j.
+
+    Of each triangle with unit normal n, barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the normal turns by
+    −Σ ∇b_d (n · δx_d), so that ∂²θ/∂x_c∂x_d = n (∂ω_c/∂x_d)ᵀ − ω_c ∇b_d nᵀ, with all but n in its plane.
+    """
     e = minus(x1, x0)
     length = math.sqrt(dot(e, e))
-    unit = e[0] / length, e[1] / length, e[2] / length
-    h[:] = 0.0
-    inverse = np.empty((3, 3))
-    # the two triangles enter alike: side +1 with n = e × p, side −1 with n = p × e
+    u = e[0] / length, e[1] / length, e[2] / length
     for side in range(2):
-        opposite = 2 + side
         p = minus(x2, x0) if side == 0 else minus(x3, x0)
-        sign = 1.0 if side == 0 else -1.0
-        m = cross(e, p)
-        n = sign * m[0], sign * m[1], sign * m[2]
-        w = 1.0 / dot(n, n)
-        q = n[0] * w, n[1] * w, n[2] * w
-        along = dot(p, unit)
-        # d(n/|n|²) = inverse · dn
-        for i in range(3):
-            for j in range(3):
-                inverse[i, j] = -2.0 * w * n[i] * n[j] * w
-            inverse[i, i] += w
-        # ∂θ/∂x_k = weight_k q with weights: opposite −L, x1 along, x0 L − along
-        # dn = sign ([e]× dp − [p]× de),  de = dx1 − dx0,  dp = dx_opposite − dx0
-        for k in range(3):
-            row = opposite if k == 2 else k
-            weight = -length if k == 2 else (along if k == 1 else length - along)
-            scale = sign * weight
-            _add_skew_product(inverse, e, scale, h[row, opposite])
-            _add_skew_product(inverse, p, -scale, h[row, 1])
-            _add_skew_product(inverse, e, -scale, h[row, 0])
-            _add_skew_product(inverse, p, scale, h[row, 0])
-        for j in range(3):
-            d_length = unit[j]  # ∂L/∂x1, its negative ∂L/∂x0
-            d_opposite = unit[j]  # ∂along/∂x_opposite
-            d_one = (p[j] - along * unit[j]) / length  # ∂along/∂x1
-            d_zero = -d_opposite - d_one
-            for i in range(3):
-                h[opposite, 1, i, j] -= q[i] * d_length
-                h[opposite, 0, i, j] += q[i] * d_length
-                h[1, opposite, i, j] += q[i] * d_opposite
-                h[1, 1, i, j] += q[i] * d_one
-                h[1, 0, i, j] += q[i] * d_zero
-                h[0, opposite, i, j] -= q[i] * d_opposite
-                h[0, 1, i, j] += q[i] * (d_length - d_one)
-                h[0, 0, i, j] += q[i] * (-d_length - d_zero)
+        m = cross(e, p) if side == 0 else cross(p, e)
+        double = math.sqrt(dot(m, m))
+        n = m[0] / double, m[1] / double, m[2] / double
+        height, foot = double / length, dot(p, u)
+        # up: the direction of the height, from the edge to the opposite corner
+        up = _combined(1.0 / height, p, -foot / height, u)
+        part = foot / length
+        # how height and foot change along u and up with x0, x1 and the opposite corner
+        dh0, dh1, dh2 = part - 1.0, -part, 1.0
+        r = height / length
+        # ω = (1/h − f/(L h), f/(L h), −1/h) of x0, x1, opposite; ∂f/∂x0 = −u − r·up, ∂x1: r·up, opposite: u
+        w1 = part / height
+        w0, w2 = 1.0 / height - w1, -1.0 / height
+        k, inverse = 1.0 / (length * height), 1.0 / height
+        # ∂ω1 = ∂f/(L h) − ω1 ∂L/L − ω1 ∂h/h
+        d10 = _combined(w1 / length - k, u, -k * r - w1 * inverse * dh0, up)
+        d11 = _combined(-w1 / length, u, k * r - w1 * inverse * dh1, up)
+        d12 = _combined(k, u, -w1 * inverse * dh2, up)
+        # ∂ω2 = ∂h/h², ∂ω0 = −∂ω2 − ∂ω1
+        square = inverse * inverse
+        d20 = _combined(0.0, u, square * dh0, up)
+        d21 = _combined(0.0, u, square * dh1, up)
+        d22 = _combined(0.0, u, square, up)
+        d00, d01 = _combined(-1.0, d20, -1.0, d10), _combined(-1.0, d21, -1.0, d11)
+        d02 = _combined(-1.0, d22, -1.0, d12)
+        b0 = _combined(-1.0 / length, u, inverse * dh0, up)
+        b1 = _combined(1.0 / length, u, inverse * dh1, up)
+        b2 = _combined(0.0, u, inverse, up)
+        o = 2 + side
+        _add_outer(n, d00, scale, out[0, 0])
+        _add_outer(b0, n, -scale * w0, out[0, 0])
+        _add_outer(n, d01, scale, out[0, 1])
+        _add_outer(b1, n, -scale * w0, out[0, 1])
+        _add_outer(n, d02, scale, out[0, o])
+        _add_outer(b2, n, -scale * w0, out[0, o])
+        _add_outer(n, d10, scale, out[1, 0])
+        _add_outer(b0, n, -scale * w1, out[1, 0])
+        _add_outer(n, d11, scale, out[1, 1])
+        _add_outer(b1, n, -scale * w1, out[1, 1])
+        _add_outer(n, d12, scale, out[1, o])
+        _add_outer(b2, n, -scale * w1, out[1, o])
+        _add_outer(n, d20, scale, out[o, 0])
+        _add_outer(b0, n, -scale * w2, out[o, 0])
+        _add_outer(n, d21, scale, out[o, 1])
+        _add_outer(b1, n, -scale * w2, out[o, 1])
+        _add_outer(n, d22, scale, out[o, o])
+        _add_outer(b2, n, -scale * w2, out[o, o])

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.hinge import angle, angle_gradient, angle_hessian, cross, dot, minus
+from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_gradient, cross, dot, minus
 from lyra_petsc.terms.kernel import kernel
 
 FADES_BELOW = 0.1
@@ -74,11 +74,10 @@ def hinge_gradient(x0, x1, x2, x3, k, rest, limit1, limit2, g):  # type: ignore[
 
 
 @kernel(inline="always")
-def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, h, out):  # type: ignore[no-untyped-def]
+def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] into out (4, 4, 3, 3).
 
-    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w w; g (4, 3) and h (4, 4, 3, 3) are
-    overwritten.
+    ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w w; g (4, 3) is overwritten.
     """
     theta, square1, square2 = angle_gradient(x0, x1, x2, x3, g)
     change = theta - rest
@@ -89,13 +88,7 @@ def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, h, out):  #
                 for j in range(3):
                     out[a, b, i, j] = stiffness * g[a, i] * g[b, j]
     if blend < 1.0:
-        moment = (1.0 - blend) * stiffness * change
-        angle_hessian(x0, x1, x2, x3, h)
-        for a in range(4):
-            for b in range(4):
-                for i in range(3):
-                    for j in range(3):
-                        out[a, b, i, j] += moment * h[a, b, i, j]
+        add_angle_hessian(x0, x1, x2, x3, (1.0 - blend) * stiffness * change, out)
     if not (square1 > limit1 and square2 > limit2):
         _fade_hessian(x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out)
 
