@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from cases import CLOTH, DAMPING, GRAVITY, STEP, corners, hanging_square
-from processes import Limits, run
+from processes import Limits, Spent, run
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.materials.tables import ClothTable, entries
@@ -77,7 +77,7 @@ def write_scene(folder: Path, vertices: int, steps: int) -> Path:
 
 
 def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> dict[str, Any]:
-    """Seconds per step of a command: a run of `WARM_UP` steps taken from one of more.
+    """Wall and CPU seconds per step of a command: a run of `WARM_UP` steps taken from one of more.
 
     So start-up, reading and the first steps, which ours are not charged with either, drop out.
 
@@ -88,7 +88,7 @@ def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> d
     folder = folder.resolve()
     write_files(folder, vertices)
 
-    def run_for(steps: int) -> float:
+    def run_for(steps: int) -> Spent:
         told = {"obj": folder / OBJ_FILE, "json": write_scene(folder, vertices, steps), "steps": steps}
         line = command
         for name, value in told.items():
@@ -98,10 +98,16 @@ def measure_peer(command: str, folder: Path, vertices: int, limits: Limits) -> d
     began = time.perf_counter()
     run_for(WARM_UP)  # its caches
     short = [run_for(WARM_UP)]
-    steps = int(np.clip(limits.seconds * WARM_UP / max(short[0], 1e-9), 2, limits.steps))
+    steps = int(np.clip(limits.seconds * WARM_UP / max(short[0].wall, 1e-9), 2, limits.steps))
     long = [run_for(WARM_UP + steps)]
     while len(long) < PAIRS and time.perf_counter() - began < limits.seconds:
         short.append(run_for(WARM_UP))
         long.append(run_for(WARM_UP + steps))
-    times = [max(0.0, after - before) / steps for before, after in zip(short, long, strict=True)]
-    return {"step_seconds": times, "short_seconds": short, "long_seconds": long, "further_steps": steps}
+    pairs = list(zip(short, long, strict=True))
+    return {
+        "step_seconds": [max(0.0, after.wall - before.wall) / steps for before, after in pairs],
+        "cpu_seconds": [max(0.0, after.cpu - before.cpu) / steps for before, after in pairs],
+        "short_seconds": [each.wall for each in short],
+        "long_seconds": [each.wall for each in long],
+        "further_steps": steps,
+    }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lyra_petsc.study.launch import environment, find_launcher
 
@@ -46,8 +47,15 @@ class Limits:
     process: float
 
 
-def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> float:
-    """Run a command, a list of words or one line for the shell; the seconds [s] it took.
+class Spent(NamedTuple):
+    """Wall time [s] of a process, and CPU time [s] of it and of those that it has started."""
+
+    wall: float
+    cpu: float
+
+
+def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> Spent:
+    """Run a command, a list of words or one line for the shell; what it took.
 
     Raises
     ------
@@ -55,7 +63,7 @@ def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> 
         If it cannot be started, takes longer than ``limit`` [s] or ends with another exit code than 0.
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as heard:
-        began = time.perf_counter()
+        began, cpu = time.perf_counter(), _cpu_of_children()
         try:
             process = subprocess.Popen(
                 command,
@@ -75,11 +83,16 @@ def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> 
             raise Failed(f"not done within {limit:g} s") from None
         finally:
             _end(process)
-        seconds = time.perf_counter() - began
+        spent = Spent(time.perf_counter() - began, _cpu_of_children() - cpu)
         heard.seek(0)
         if code != 0:
             raise Failed(_last_words(heard.read(), code))
-    return seconds
+    return spent
+
+
+def _cpu_of_children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

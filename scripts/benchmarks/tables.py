@@ -21,6 +21,7 @@ COLUMNS = (
     "who",
     "ranks",
     "ms a step",
+    "CPU ms",
     "times the first",
     "residual ms",
     "Jacobian ms",
@@ -87,7 +88,9 @@ def _cells(row: Result, first: Result | None) -> list[str]:
     ratio = math.nan
     if first is not None and median_of(first, "seconds") > 0.0:
         ratio = statistics.median(times) / median_of(first, "seconds")
-    cells = [str(row["vertices"]), row["who"], str(row["ranks"]), spread(times, 1e3), number(ratio)]
+    cpu = statistics.median(row["cpu_seconds"]) if "cpu_seconds" in row else median_of(row, "cpu")
+    cells = [str(row["vertices"]), row["who"], str(row["ranks"])]
+    cells += [spread(times, 1e3), number(1e3 * cpu), number(ratio)]
     if "step_seconds" in row:
         return cells + ["–"] * (len(COLUMNS) - len(cells))
     matmult = statistics.median(row["matmult_seconds"])

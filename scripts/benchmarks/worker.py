@@ -115,10 +115,15 @@ def steps(comm: Comm, job: Result) -> Result:
     rows: list[Result] = []
     first, past = now(comm), events(comm)
     while len(rows) < job["steps"]:
-        began = now(comm)
+        began, cpu = now(comm), time.process_time()
         report = simulation.step()
-        seconds, after = now(comm) - began, events(comm)
-        row: Result = {"seconds": seconds, "newton": report.newton_iterations, "cg": report.linear_iterations}
+        seconds, cpu, after = now(comm) - began, comm.allreduce(time.process_time() - cpu), events(comm)
+        row: Result = {
+            "seconds": seconds,
+            "cpu": cpu,
+            "newton": report.newton_iterations,
+            "cg": report.linear_iterations,
+        }
         spent = {part: after[part][0] - past[part][0] for part in PARTS}
         calls = {part: after[part][1] - past[part][1] for part in PARTS}
         row |= spent | {"rest": max(0.0, seconds - sum(spent.values()))}

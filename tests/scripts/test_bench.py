@@ -93,6 +93,7 @@ def test_json_holds_every_measurement(measured):
         assert row["petsc_options"]["ksp_rtol"] == "1e-9"
         assert 2 <= len(row["steps"]) <= 3
         for step in row["steps"]:
+            assert step["cpu"] > 0.0
             parts = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
             assert sum(step[part] for part in parts) == pytest.approx(step["seconds"])
             assert min(step["residual"], step["jacobian"], step["frozen"], step["solve"]) > 0.0
@@ -125,7 +126,7 @@ def test_markdown_shows_them(measured):
     rows, weak, presets, single = tables_of(text)
     assert tuple(rows[0]) == COLUMNS
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
-    assert rows[1][4] == "1.00"
+    assert rows[1][5] == "1.00"
     assert len(weak) == 3
     assert len(presets) == 4
     assert {line[0] for line in presets[1:]} == {"block-jacobi"}
@@ -139,6 +140,7 @@ def test_peers_stand_beside_and_one_that_fails_is_one_line(measured):
     slow, idle = (row for row in results["rows"] if "command" in row)
     assert np.median(slow["step_seconds"]) > 0.1
     assert np.median(idle["step_seconds"]) < 0.1
+    assert np.median(slow["cpu_seconds"]) < 0.1
     said = "36 vertices, peer bad: ended with exit code 3: no"
     assert results["failures"] == [said]
     assert [line for line in done.stderr.splitlines() if "failed" in line] == [f"bench: failed: {said}"]
@@ -237,6 +239,13 @@ def test_numbers_have_three_digits(value, text):
 
 def test_spread_is_median_and_extremes():
     assert spread([3.0, 1.0, 2.0], 10.0) == "20.0 (10.0-30.0)"
+
+
+def test_cpu_time_counts_what_a_process_has_started():
+    program = "import time\nwhile time.process_time() < 0.3: pass"
+    spent = run(f"{sys.executable} -c '{program}'; true", 60.0)
+    assert spent.cpu >= 0.3
+    assert run("sleep 0.3", 60.0).cpu < 0.3 <= spent.wall
 
 
 def test_a_process_that_takes_too_long_is_ended_with_its_children(tmp_path):
