@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.assembly.pattern import BlockPattern
@@ -92,6 +95,9 @@ class Model:
     def release(self) -> None:
         """Let go of the whole mesh; from here on no rank holds a global array."""
         self.mesh = None
+        # a library of PETSc's (SuperLU_dist) tells malloc to keep all that is freed
+        with suppress(AttributeError, OSError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)
 
     @property
     def membrane(self) -> Membrane:
@@ -202,6 +208,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         if isinstance(term, Elastic) or (isinstance(term, Viscous) and not scheme.explicit)
     }
     pattern = BlockPattern(coupling, points.n_owned, points.n_local, points.global_number)
+    _check_indices(points, pattern.n_blocks)
     held = Held(
         scene,
         {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
@@ -230,6 +237,20 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Model(
         scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner, data.get("tag")
+    )
+
+
+def _check_indices(points: Points, n_blocks: int) -> None:
+    """Refuse more unknowns, or more entries on a rank, than PETSc's integers count; collective."""
+    largest = int(np.iinfo(PETSc.IntType).max)
+    most_entries = 9 * points.comm.allreduce(n_blocks, MPI.MAX)
+    if 3 * points.n_global <= largest and most_entries <= largest:
+        return
+    remedy = "a PETSc with 64-bit indices" if 3 * points.n_global > largest else "more ranks"
+    raise InputError(
+        f"{points.n_global} vertices make {3 * points.n_global} unknowns and up to {most_entries} matrix "
+        f"entries on a rank, of which this PETSc counts {largest}; take {remedy}, or make the mesh coarser",
+        key="mesh",
     )
 
 

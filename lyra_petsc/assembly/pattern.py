@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
-Offsets = NDArray[np.int32]
+Offsets = NDArray[np.int32] | NDArray[np.int64]
+
+LARGEST_INT32 = 2**31 - 1
 
 
 class BlockPattern:
@@ -29,7 +31,7 @@ class BlockPattern:
         Local column of each block.
     diagonal : (n_owned,) int64
         Index of each row's diagonal block.
-    offsets : dict of name → (E, n, n) int32
+    offsets : dict of name → (E, n, n) int32, int64 where there are too many blocks
         Index of the block that element e's coupling (a, b) adds to; −1 for rows of other ranks.
     """
 
@@ -41,11 +43,10 @@ class BlockPattern:
         position[order] = np.arange(n_local)
         own = np.arange(n_owned, dtype=np.int64)
         diagonal_keys = own * n_local + position[own]
-        keys = np.unique(
-            np.concatenate(
-                [diagonal_keys, *(_keys(s, n_owned, n_local, position) for s in stencils.values())]
-            )
-        )
+        keys = np.sort(diagonal_keys)
+        for stencil in stencils.values():
+            for a in range(stencil.shape[1]):  # one after the other: all couplings at once take much memory
+                keys = _union(keys, *_row_keys(stencil, a, n_owned, n_local, position))
         rows, places = np.divmod(keys, max(n_local, 1))
         self.columns: Ints = order[places]
         self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
@@ -65,19 +66,23 @@ def _pair_keys(stencil: NDArray[np.int32], a: int, b: int, n_local: int, positio
     return key
 
 
-def _keys(stencil: NDArray[np.int32], n_owned: int, n_local: int, position: Ints) -> Ints:
-    """Sorted keys row · n_local + column place of the couplings in owned rows, each once."""
-    n = stencil.shape[1]
-    parts = []
-    for a in range(n):
-        mine = stencil[stencil[:, a] < n_owned]
-        parts += [_pair_keys(mine, a, b, n_local, position) for b in range(n)]
-    return np.unique(np.concatenate(parts))
+def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int, position: Ints) -> list[Ints]:
+    """Keys row · n_local + column place of the couplings of each element's vertex a, where that is owned."""
+    mine = stencil[stencil[:, a] < n_owned]
+    return [_pair_keys(mine, a, b, n_local, position) for b in range(stencil.shape[1])]
+
+
+def _union(*parts: Ints) -> Ints:
+    """All numbers, ascending, each once; as ``np.unique``, with one copy less."""
+    numbers = np.concatenate(parts)
+    numbers.sort()
+    return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers
 
 
 def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int, position: Ints) -> Offsets:
     n = stencil.shape[1]
-    out = np.empty((len(stencil), n, n), dtype=np.int32)
+    kind = np.dtype("int32" if len(keys) <= LARGEST_INT32 else "int64")
+    out: Offsets = np.empty((len(stencil), n, n), dtype=kind)
     for a in range(n):
         mine = stencil[:, a] < n_owned
         for b in range(n):

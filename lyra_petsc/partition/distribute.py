@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
+from mpi4py.util import pkl5
 from numpy.typing import NDArray
 
 from lyra_petsc.partition.elements import Elements
@@ -89,6 +90,7 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
     graph = vertex_graph([whole.triangles], n_vertices) if whole else None
     owner, name = partition(comm, graph, n_vertices)
+    post = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
     if comm.rank == 0:
         assert whole is not None
         assert owner is not None
@@ -101,10 +103,10 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
             if rank == 0:
                 own = piece
             else:
-                comm.send(piece, dest=rank)
+                post.send(piece, dest=rank)
         piece = own
     else:
-        piece = comm.recv(source=0)
+        piece = post.recv(source=0)
     bounds, ghosts, original, elements, vertex_data = piece
     return Part(Points(comm, bounds, ghosts, original), elements, vertex_data, name)
 
