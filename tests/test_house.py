@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
     {"errors", "nearest"},
-    {"parallel", "profiling"},
+    {"kernel_cache", "parallel", "profiling"},
     {"materials"},
     {"scene"},
     {"meshing"},

@@ -1,77 +1,13 @@
-"""How element kernels are compiled: cached on disk, contractions allowed, division by zero gives inf.
+"""How element kernels are compiled: cached, contractions allowed, division by zero gives inf.
 
 Not the whole of ``fastmath``: NaN must survive, since it is how a collapsed element is noticed.
-
-Numba keeps what it compiled beside the source, in the user's cache where that cannot be written, or in
-``NUMBA_CACHE_DIR``; where it finds no place, every run compiles anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
-from functools import cache
-from hashlib import sha256
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-from numba import njit
-from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.registry import cpu_target
-from numba.core.sigutils import normalize_signature
+from lyra_petsc.kernel_cache import cached
 
-# what the first kernel would load: so all ranks do it at once, none while the others wait for its mesh
-cpu_target.target_context.refresh()
-
-
-@cache
-def sources() -> str:
-    """Digest of all modules of this package.
-
-    A kernel contains those of other modules that it calls, of which numba looks only at its own.
-    """
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    return sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()[:16]
-
-
-class KernelCache(FunctionCache):
-    """Numba's cache of one function, safe with many ranks on one file system and on one that fails.
-
-    The digest stands in the file names: numba announces an entry before it writes it, and what an older
-    source left under the same name would be taken for it.
-    """
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)  # type: ignore[no-untyped-call]
-        name = f"{self._impl.filename_base}-{sources()}"
-        self._cache_file = IndexDataCacheFile(self._cache_path, name, sources())  # type: ignore[no-untyped-call]
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What was compiled for the argument types ``sig``; None if there is nothing sound."""
-        try:
-            found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        except Exception:  # whatever reading half a file may raise
-            with suppress(OSError):
-                self.flush()  # type: ignore[no-untyped-call]
-            return None
-        # ranks that compile for different types at the same time may choose the same name
-        types = normalize_signature(sig)[0]  # type: ignore[no-untyped-call]
-        return found if found is not None and found.signature.args == types else None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep it, if the disk can."""
-        with suppress(OSError):
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-
-
-def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of an element kernel; ``options`` are further ones of numba."""
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        flags = {"contract", "nsz", "arcp"}
-        dispatcher = njit(error_model="numpy", fastmath=flags, **options)(function)
-        with suppress(RuntimeError):  # numba's word for no place to keep it
-            dispatcher._cache = KernelCache(function)
-        return dispatcher
-
-    return compiled
+kernel: Any = partial(cached, error_model="numpy", fastmath={"contract", "nsz", "arcp"})

@@ -12,10 +12,10 @@ import pytest
 from numba import config
 from numba.core.caching import CacheImpl
 
-from lyra_petsc.terms import kernel as room
-from lyra_petsc.terms.kernel import KernelCache, kernel
+from lyra_petsc import kernel_cache
+from lyra_petsc.kernel_cache import KernelCache, cached, digest
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def twice(x):  # type: ignore[no-untyped-def]
@@ -30,7 +30,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def compiled(x: Any) -> tuple[Any, int]:
     """Result of a new dispatcher, as of a new process, and how many types it found in the cache."""
-    dispatcher = kernel()(twice)
+    dispatcher = cached()(twice)
     result = dispatcher(x)
     return result, sum(dispatcher.stats.cache_hits.values())
 
@@ -45,9 +45,9 @@ def test_what_was_compiled_is_found_again(place: Path) -> None:
     assert len(files(place, "nbi")) == len(files(place, "nbc")) == 1
 
 
-def test_a_change_of_any_module_of_the_room_counts(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_change_of_any_module_of_the_package_counts(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled(2.5)
-    monkeypatch.setattr(room, "sources", lambda: "changed")
+    monkeypatch.setattr(kernel_cache, "digest", lambda room: "changed")
     assert compiled(2.5) == (5.0, 0)
     assert len(files(place, "nbc")) == 2
 
@@ -141,7 +141,13 @@ print(sorted(name.split(".")[-1] for name in sys.modules if name.startswith("lyr
     assert not loaded & {"bending", "hinge", "clamp", "spring", "gravity", "wind", "pressure", "force"}
 
 
-def test_kernels_that_call_those_of_other_modules_know_their_sources() -> None:
+def test_the_digest_is_that_of_all_modules(tmp_path: Path) -> None:
     from lyra_petsc.terms import bending
 
-    assert room.sources() in bending.hessians._cache._cache_file._index_name
+    assert digest(REPOSITORY / "lyra_petsc" / "terms") in bending.hessians._cache._cache_file._index_name
+    (tmp_path / "one.py").write_text("1")
+    (tmp_path / "two.py").write_text("2")
+    before = digest(tmp_path)
+    digest.cache_clear()
+    (tmp_path / "two.py").write_text("3")
+    assert digest(tmp_path) != before
