@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.kernel_cache import cached
+from lyra_petsc.terms.term import Elastic, Viscous
 
 Array = NDArray[np.float64]
 Fill = Callable[[int, int, Array], None]
@@ -18,7 +18,7 @@ CHUNK_VALUES = 32_768
 """Scalars of element blocks computed before they are scattered: they stay in cache."""
 
 
-@njit(cache=True)
+@cached()
 def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
     """values[offsets[e, a, b]] += weight[e] blocks[e, a, b]."""
     for e in range(offsets.shape[0]):
@@ -32,7 +32,7 @@ def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
                             values[k, i, j] += w * blocks[e, a, b, i, j]
 
 
-@njit(cache=True)
+@cached()
 def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
     """out (n_owned, 3) = values · x (n_local, 3)."""
     for row in range(len(indptr) - 1):
@@ -46,7 +46,7 @@ def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
         out[row, 0], out[row, 1], out[row, 2] = s0, s1, s2
 
 
-@njit(cache=True)
+@cached()
 def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyped-def]
     """Zero the rows and columns of prescribed coordinates; their diagonal gets its block's largest size."""
     for t in range(len(touched)):
@@ -105,6 +105,10 @@ class BlockRows:
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
         self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
+
+    def add_viscosity(self, term: Viscous, v: Array, values: Array) -> None:
+        """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
+        self.add(term.name, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
 
     def add_diagonal(self, diagonal: Array, values: Array) -> None:
         """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 import ctypes
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.kernel_cache import cached
 
 Array = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ KINDS = {"aij": "AIJ", "baij": "BAIJ"}
 """Matrix types whose storage is known here, as the C library spells them."""
 
 
-@njit(cache=True)
+@cached()
 def _to_baij(indptr, columns, n_owned, values, inside, outside):  # type: ignore[no-untyped-def]
     """Blocks column by column; those of owned columns apart from those of ghosts."""
     p = q = 0
@@ -37,7 +37,7 @@ def _to_baij(indptr, columns, n_owned, values, inside, outside):  # type: ignore
                 q += 1
 
 
-@njit(cache=True)
+@cached()
 def _to_aij(indptr, columns, n_owned, values, inside, outside):  # type: ignore[no-untyped-def]
     """Three scalar rows for each row of blocks; owned columns apart from ghosts."""
     p = q = 0

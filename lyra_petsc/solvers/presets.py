@@ -67,6 +67,9 @@ DIRECT_UNTIL = 30_000
 FACTOR_COST = 20.0, 5.0
 """Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
+GAMG_FROM = 8000
+"""Vertices from which multigrid takes over from incomplete factors before a factorisation does."""
+
 WORTH_OF_ILU, PRICE_OF_ILU = 4.0, 3.0
 """How many iterations of block Jacobi one with incomplete factors is worth, at the least, and costs."""
 
@@ -92,7 +95,9 @@ def candidates(
         return [*factors, incomplete, "gamg", "block-jacobi"]
     if small and newton:
         return ["block-jacobi", *factors, "gamg"]
-    return [incomplete, *factors, "gamg", "block-jacobi"]
+    if n_vertices < GAMG_FROM:
+        return [incomplete, *factors, "gamg", "block-jacobi"]
+    return [incomplete, "gamg", *factors, "block-jacobi"]
 
 
 def _factorisations(ranks: int) -> list[str]:

@@ -39,6 +39,7 @@ class Damping:
         self.acts = bool(points.comm.allreduce(len(self._terms), MPI.MAX))
         self._values = blocks.zeros() if self.acts else None
         self._at: Array | None = None
+        self._last: tuple[Array, Array] | None = None
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max() and len(self._terms) == len(elastic)
         self._gamma = float(factors[0]) if uniform else 0.0
@@ -48,14 +49,17 @@ class Damping:
         if self._values is None:
             return
         self._values[:] = 0.0
-        self._at = x.copy()
+        self._at, self._last = x.copy(), None
         for term in self._terms:
             self._blocks.add_stiffness(term, x, 1.0, term.elements.data["damping"], self._values)
 
     def product(self, v: Array) -> Array:
         """D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3)."""
         assert self._values is not None
-        return self._blocks.product(self._values, v)
+        # residual and objective ask at the same velocities
+        if self._last is None or not np.array_equal(v, self._last[0]):
+            self._last = v.copy(), self._blocks.product(self._values, v)
+        return self._last[1].copy()
 
     def into(self, values: Array) -> None:
         """Let ``values`` (n_blocks, 3, 3) be D."""

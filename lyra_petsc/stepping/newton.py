@@ -27,8 +27,8 @@ ENERGY_ROUNDOFF = 1e-14
 STALLED = 0.5
 """Fraction of the residual left by an iteration above which, at the round-off floor, it falls no more."""
 
-NEAR, FELL = 1e-3, 0.1
-"""Last increment over element size and fraction of the residual left below which the preconditioner stays."""
+FELL = 0.1
+"""Fraction of the residual left by an iteration below which the preconditioner stays."""
 
 JUDGED = 2
 """Newton iterations by whose linear iterations the linear solver is judged."""
@@ -114,9 +114,9 @@ class Newton:
             self.forcing.before_solve(self.norm)
         values = self._system.jacobian(v, self._blend.after(self._taken(u)))
         self._matrix.set(values)
-        # near the solution the geometry hardly changes: what was set up an iteration ago still serves
+        # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         separate = self._preconditioner is not self._matrix
-        self._kept = separate and self._fell and self.increment <= NEAR * self._spacing
+        self._kept = separate and self._fell
         self._same = (
             separate and self._convex and not self._kept and shows_negative_curvature(self._ksp.getPC())
         )
