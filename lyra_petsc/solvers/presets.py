@@ -64,7 +64,7 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
 
-FACTOR_COST = 20.0, 5.0
+FACTOR_COST = 50.0, 6.5
 """Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
 GAMG_FROM = 8000

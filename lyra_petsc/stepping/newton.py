@@ -30,8 +30,8 @@ STALLED = 0.5
 FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
-JUDGED = 2
-"""Newton iterations by whose linear iterations the linear solver is judged."""
+RECENT = 0.1
+"""Weight of the last Newton iteration in the mean of linear iterations by which the linear solver is judged."""
 
 
 class Newton:
@@ -90,6 +90,7 @@ class Newton:
         self._shape = (system.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
         self._watchdog = Watchdog()
+        self._usual = 0.0
         self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol"))
         self.begin_step()
 
@@ -101,7 +102,7 @@ class Newton:
         self._slope, self._returns = 0.0, False
         self._stalled, self.too_slow, self.increment = 0, False, np.inf
         self._fell = self._kept = self._same = self._convex = False
-        self._spent: list[int] = [0]
+        self._spent = 0
         self._watchdog.begin()
         self.forcing.begin()
 
@@ -213,8 +214,10 @@ class Newton:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
         spent = snes.getLinearSolveIterations() + self.more_linear
-        self._spent.append(spent)
-        if iteration >= JUDGED and spent - self._spent[-1 - JUDGED] > JUDGED * self._linear_limit:
+        if iteration > 0:
+            self._usual += RECENT * (spent - self._spent - self._usual)
+        self._spent = spent
+        if self._usual > self._linear_limit:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol, _ = snes.getTolerances()
