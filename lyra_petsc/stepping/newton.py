@@ -31,7 +31,7 @@ FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
 RECENT = 0.1
-"""Weight of the last Newton iteration in the mean of linear iterations by which the linear solver is judged."""
+"""Weight of the last Newton iteration in the mean of linear iterations that judges the linear solver."""
 
 
 class Newton:
