@@ -163,6 +163,7 @@ class Stepper:
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=1e-6, max_it=5000)
+            ksp.setInitialGuessNonzero(True)
         try:
             ts.setFromOptions()
         except PETSc.Error as error:
@@ -323,7 +324,13 @@ class Stepper:
         self._system.residual(v, rate, out)
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
-        first_guess(self._system, u.getArray().reshape(self._shape))
+        guess = u.getArray().reshape(self._shape)
+        first_guess(self._system, guess)
+        if not self._iterates:
+            # the linear solve sets out from the last velocities; its tolerance stays relative to the whole
+            last = self._system.v[: len(guess)].copy()
+            self._system.prescribe(last)
+            snes.getSolutionUpdate().setArray((guess - last).ravel())
 
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
