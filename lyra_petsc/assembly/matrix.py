@@ -39,8 +39,6 @@ class SystemMatrix:
         except PETSc.Error:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
-        self._pattern, self._n_owned = pattern, points.n_owned
-        self._storage: Storage | None = None
         self._indptr = pattern.indptr.astype(PETSc.IntType)
         self._columns = points.global_number[pattern.columns].astype(PETSc.IntType)
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
@@ -49,6 +47,10 @@ class SystemMatrix:
         if self.kind == "sbaij":
             self._keep_upper(points)
         self.mat.setUp()
+        self._storage: Storage | None = None
+        if self.kind in KINDS and PETSc.ScalarType == np.float64:
+            with suppress(AttributeError, OSError):
+                self._storage = Storage(self.mat, self.kind, pattern, points.n_owned)
 
     def _preallocate(self, pattern: BlockPattern, points: Points) -> None:
         local = pattern.columns < points.n_owned
@@ -68,16 +70,13 @@ class SystemMatrix:
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
-        if self._storage is not None:
+        if self._storage is not None and self.mat.assembled:
             self._storage.write(values)
             return
         if self.kind == "sbaij":
             values = values[self._upper]
         self.mat.setValuesBlockedCSR(self._indptr, self._columns, values, PETSc.InsertMode.INSERT)
         self.mat.assemble()
-        if self.kind in KINDS:
-            with suppress(AttributeError, OSError):
-                self._storage = Storage(self.mat, self.kind, self._pattern, self._n_owned)
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

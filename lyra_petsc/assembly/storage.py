@@ -49,15 +49,14 @@ def _to_aij(indptr, columns, n_owned, values, inside, outside):  # type: ignore[
         a = b = 0
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n_owned:
-                for i in range(3):
-                    for j in range(3):
-                        inside[9 * p + 3 * (i * n_in + a) + j] = values[k, i, j]
+                out, at, width = inside, 9 * p + 3 * a, n_in
                 a += 1
             else:
-                for i in range(3):
-                    for j in range(3):
-                        outside[9 * q + 3 * (i * n_out + b) + j] = values[k, i, j]
+                out, at, width = outside, 9 * q + 3 * b, n_out
                 b += 1
+            for i in range(3):
+                for j in range(3):
+                    out[at + 3 * i * width + j] = values[k, i, j]
         p += n_in
         q += n_out
 
@@ -68,7 +67,7 @@ class Storage:
     Parameters
     ----------
     mat : PETSc.Mat
-        Assembled, with the entries of the pattern and no others.
+        With the entries of the pattern and no others; assembled when it is written to.
     kind : str
         A key of ``KINDS``.
     pattern : BlockPattern
@@ -81,12 +80,11 @@ class Storage:
     """
 
     def __init__(self, mat: PETSc.Mat, kind: str, pattern: BlockPattern, n_owned: int) -> None:
-        self._library = ctypes.CDLL(PETSc.__file__)
-        self._name, self._mat = KINDS[kind], mat
-        self._get = getattr(self._library, f"MatSeq{self._name}GetArray")
-        self._give_back = getattr(self._library, f"MatSeq{self._name}RestoreArray")
-        self._parts = getattr(self._library, f"MatMPI{self._name}GetSeq{self._name}")
-        self._pattern, self._n_owned = pattern, n_owned
+        library, name = ctypes.CDLL(PETSc.__file__), KINDS[kind]
+        self._get = getattr(library, f"MatSeq{name}GetArray")
+        self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
+        self._parts = getattr(library, f"MatMPI{name}GetSeq{name}")
+        self._mat, self._pattern, self._n_owned = mat, pattern, n_owned
         self._fill = _to_aij if kind == "aij" else _to_baij
         own = int(np.count_nonzero(pattern.columns < n_owned))
         self._sizes = 9 * own, 9 * (pattern.n_blocks - own)
@@ -100,16 +98,12 @@ class Storage:
             self._parts(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
             parts = [inside, outside]
         pointers = [ctypes.POINTER(ctypes.c_double)() for _ in parts]
-        for part, pointer in zip(parts, pointers, strict=True):
+        arrays = [np.empty(0), np.empty(0)]  # on one rank there is no outside
+        for number, (part, pointer) in enumerate(zip(parts, pointers, strict=True)):
             self._get(part, ctypes.byref(pointer))
-        arrays = [
-            np.ctypeslib.as_array(pointer, (size,)) if size else np.empty(0)
-            for pointer, size in zip(pointers, self._sizes, strict=False)
-        ]
-        outside_array = arrays[1] if len(arrays) > 1 else np.empty(0)
-        self._fill(
-            self._pattern.indptr, self._pattern.columns, self._n_owned, values, arrays[0], outside_array
-        )
+            if self._sizes[number]:
+                arrays[number] = np.ctypeslib.as_array(pointer, (self._sizes[number],))
+        self._fill(self._pattern.indptr, self._pattern.columns, self._n_owned, values, *arrays)
         for part, pointer in zip(parts, pointers, strict=True):
             self._give_back(part, ctypes.byref(pointer))
         self._mat.assemble()

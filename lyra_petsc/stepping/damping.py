@@ -46,8 +46,7 @@ class Damping:
 
     def freeze(self, x: Array) -> None:
         """Take the geometry of positions x (n_local, 3)."""
-        if self._values is None:
-            return
+        assert self._values is not None
         self._values[:] = 0.0
         self._at, self._last = x.copy(), None
         for term in self._terms:

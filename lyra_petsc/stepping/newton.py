@@ -153,14 +153,16 @@ class Newton:
             self._system.new_iterate(None)
             return True
         residual = self._snes.getFunction()[0]
-        self._convex = not self._useless(residual, y)
-        while self._useless(residual, y) and (self._kept or self._same or self._blend.raise_()):
+        useless = self._useless(residual, y)
+        self._convex = not useless
+        while useless and (self._kept or self._same or self._blend.raise_()):
             self._assemble_again(x)
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
             self.more_linear += self._ksp.getIterationNumber()
             changed = True
-        if self._useless(residual, y):
+            useless = self._useless(residual, y)
+        if useless:
             y.zeroEntries()
             return True
         if self._from is not None:
@@ -175,7 +177,8 @@ class Newton:
         if self._kept or self._same:
             self._preconditioner.set(self._system.jacobian(v, 1.0))
             self._kept = self._same = False
-        self._matrix.set(self._system.jacobian(v, self._blend.value))
+        else:
+            self._matrix.set(self._system.jacobian(v, self._blend.value))
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

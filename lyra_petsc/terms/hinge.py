@@ -66,13 +66,13 @@ def angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _add_outer(a, b, scale, out):  # type: ignore[no-untyped-def]
-    """out += scale · a bᵀ."""
+def _add_turn(n, d, w, b, scale, out):  # type: ignore[no-untyped-def]
+    """out += scale · (n dᵀ − w b nᵀ)."""
     for i in range(3):
-        s = scale * a[i]
-        out[i, 0] += s * b[0]
-        out[i, 1] += s * b[1]
-        out[i, 2] += s * b[2]
+        p, q = scale * n[i], -scale * w * b[i]
+        for j in range(3):
+            out[i, j] += p * d[j]
+            out[i, j] += q * n[j]
 
 
 @kernel(inline="always")
@@ -99,8 +99,8 @@ def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-de
         # up: the direction of the height, from the edge to the opposite corner
         up = _combined(1.0 / height, p, -foot / height, u)
         part = foot / length
-        # how height and foot change along u and up with x0, x1 and the opposite corner
-        dh0, dh1, dh2 = part - 1.0, -part, 1.0
+        # how the height changes along up with x0 and x1; with the opposite corner by 1
+        dh0, dh1 = part - 1.0, -part
         r = height / length
         # ω = (1/h − f/(L h), f/(L h), −1/h) of x0, x1, opposite; ∂f/∂x0 = −u − r·up, ∂x1: r·up, opposite: u
         w1 = part / height
@@ -109,7 +109,7 @@ def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-de
         # ∂ω1 = ∂f/(L h) − ω1 ∂L/L − ω1 ∂h/h
         d10 = _combined(w1 / length - k, u, -k * r - w1 * inverse * dh0, up)
         d11 = _combined(-w1 / length, u, k * r - w1 * inverse * dh1, up)
-        d12 = _combined(k, u, -w1 * inverse * dh2, up)
+        d12 = _combined(k, u, -w1 * inverse, up)
         # ∂ω2 = ∂h/h², ∂ω0 = −∂ω2 − ∂ω1
         square = inverse * inverse
         d20 = _combined(0.0, u, square * dh0, up)
@@ -121,21 +121,12 @@ def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-de
         b1 = _combined(1.0 / length, u, inverse * dh1, up)
         b2 = _combined(0.0, u, inverse, up)
         o = 2 + side
-        _add_outer(n, d00, scale, out[0, 0])
-        _add_outer(b0, n, -scale * w0, out[0, 0])
-        _add_outer(n, d01, scale, out[0, 1])
-        _add_outer(b1, n, -scale * w0, out[0, 1])
-        _add_outer(n, d02, scale, out[0, o])
-        _add_outer(b2, n, -scale * w0, out[0, o])
-        _add_outer(n, d10, scale, out[1, 0])
-        _add_outer(b0, n, -scale * w1, out[1, 0])
-        _add_outer(n, d11, scale, out[1, 1])
-        _add_outer(b1, n, -scale * w1, out[1, 1])
-        _add_outer(n, d12, scale, out[1, o])
-        _add_outer(b2, n, -scale * w1, out[1, o])
-        _add_outer(n, d20, scale, out[o, 0])
-        _add_outer(b0, n, -scale * w2, out[o, 0])
-        _add_outer(n, d21, scale, out[o, 1])
-        _add_outer(b1, n, -scale * w2, out[o, 1])
-        _add_outer(n, d22, scale, out[o, o])
-        _add_outer(b2, n, -scale * w2, out[o, o])
+        _add_turn(n, d00, w0, b0, scale, out[0, 0])
+        _add_turn(n, d01, w0, b1, scale, out[0, 1])
+        _add_turn(n, d02, w0, b2, scale, out[0, o])
+        _add_turn(n, d10, w1, b0, scale, out[1, 0])
+        _add_turn(n, d11, w1, b1, scale, out[1, 1])
+        _add_turn(n, d12, w1, b2, scale, out[1, o])
+        _add_turn(n, d20, w2, b0, scale, out[o, 0])
+        _add_turn(n, d21, w2, b1, scale, out[o, 1])
+        _add_turn(n, d22, w2, b2, scale, out[o, o])
