@@ -13,14 +13,18 @@ from petsc4py import PETSc
 from lyra_petsc.solvers.options import Value, is_set
 
 PRESETS: dict[str, dict[str, Value]] = {
-    # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last option
-    # has all pivots counted
+    # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last four
+    # have all pivots counted, leave out scaling and pivoting (an indefinite matrix is given up anyway) and
+    # order by minimum degree
     "direct": {
         "mat_type": "aij",
         "ksp_type": "cg",
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_13": 1,
+        "mat_mumps_icntl_8": 0,
+        "mat_mumps_cntl_1": 0.0,
+        "mat_mumps_icntl_7": 6,
     },
     # where PETSc was built without MUMPS; one rank
     "cholesky": {

@@ -91,6 +91,7 @@ class Newton:
         self._from: PETSc.Vec | None = None
         self._watchdog = Watchdog()
         self._usual = 0.0
+        self._began_convex = False
         self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol"))
         self.begin_step()
 
@@ -101,7 +102,9 @@ class Newton:
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
         self._stalled, self.too_slow, self.increment = 0, False, np.inf
-        self._fell = self._kept = self._same = self._convex = False
+        self._fell = self._kept = self._same = False
+        # a step begins as the one before did
+        self._convex, self._first = self._began_convex, True
         self._spent = 0
         self._watchdog.begin()
         self.forcing.begin()
@@ -155,6 +158,8 @@ class Newton:
         residual = self._snes.getFunction()[0]
         useless = self._useless(residual, y)
         self._convex = not useless
+        if self._first:
+            self._began_convex, self._first = self._convex, False
         while useless and (self._kept or self._same or self._blend.raise_()):
             self._assemble_again(x)
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
