@@ -28,6 +28,7 @@ LEVELS = [
     {"compression", "fields"},
     {"simulation"},
     {"recorder"},
+    {"results"},
     {"exact", "report"},
     {"study", "verification"},
     {"stress"},

@@ -5,10 +5,12 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
-
-from mpi4py import MPI
+from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import LyraError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 # what h5py raises when the library reports a failure, depending on the call and its version
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
@@ -41,6 +43,8 @@ def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
     LyraError
         The same on every rank, if any rank has one.
     """
+    from mpi4py import MPI
+
     first = comm.allreduce(comm.size if problem is None else comm.rank, MPI.MIN)
     if first == comm.size:
         return

@@ -31,6 +31,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
 
     ``/mesh/triangles`` (F, 3) int64, ``/mesh/rest`` (V, 3) [m] and the material coordinates
     [m]: ``/mesh/uv`` (V, 2) where each vertex has one, else ``/mesh/corner_uv`` (F, 3, 2).
+    The attribute ``vt`` of ``/mesh`` is 1 if they came with the mesh, as texture coordinates.
     Beside them, for `check_same_mesh`: ``/start`` (V, 3), the start positions [m], and
     ``/groups/<number>`` with an attribute ``name`` and its ``vertices`` (n,), ``edges`` (k, 2)
     and ``triangles`` (m,) where it has any.
@@ -54,7 +55,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
         if mesh is None:
             raise ValueError("rank 0 needs the mesh")
         datasets = _arrays(mesh)
-        names: dict[str, dict[str, int | float | str]] = {}
+        names: dict[str, dict[str, int | float | str]] = {"mesh": {"vt": int(mesh.has_uv)}}
         for number, (name, group) in enumerate(mesh.groups.items()):
             names[f"groups/{number}"] = {"name": name}
             parts = _parts(group)

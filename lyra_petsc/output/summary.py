@@ -8,15 +8,17 @@ import os
 import platform
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mpi4py import MPI
 
 import lyra_petsc
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.parallel import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 
 def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm: MPI.Comm) -> None:
@@ -59,6 +61,7 @@ def versions() -> dict[str, str]:
     """Names and versions of what takes part in a run; numba only if a term has loaded it."""
     import mpi4py
     import petsc4py
+    from mpi4py import MPI
     from petsc4py import PETSc
 
     h5py = import_h5py()

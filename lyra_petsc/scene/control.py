@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, WithJsonSchema, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.rules import absent, given, when
 from lyra_petsc.scene.values import Count, Flag, Fraction, Positive, StepLength, problem, shown
 
 INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "alpha2", "bdf2")
@@ -16,15 +17,19 @@ ANALYSES = ("dynamic", "static")
 TOLERANCE = 1e-3
 SPECTRAL_RADIUS = 0.5
 LOAD_STEP = 0.25
-FIELDS = (
-    "velocity",
-    "green_strain",
-    "stress",
-    "membrane_energy",
-    "bending_energy",
-    "curvature",
-    "rank",
-)
+FIELD_UNITS = {
+    "velocity": "m/s",
+    "green_strain": "1",
+    "stress": "N/m",
+    "membrane_energy": "J/m²",
+    "bending_energy": "J/m²",
+    "curvature": "1/m",
+    "rank": "1",
+}
+FIELDS = tuple(FIELD_UNITS)
+
+
+_FIELDS = {"type": "array", "items": {"enum": list(FIELDS)}}
 
 
 def _word_of(value: Any, known: tuple[str, ...]) -> Any:
@@ -55,6 +60,23 @@ class Time(Block):
     spectral_radius : float or None
         Of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
     """
+
+    rules = (
+        when(
+            given(analysis={"const": "static"}),
+            {
+                **absent("integrator", "tolerance", "spectral_radius"),
+                "allOf": [
+                    when(given("end"), given(end={"const": 1})),
+                    when(given("step"), given(step={"type": "number", "maximum": 1})),
+                ],
+            },
+            given("end", "step"),
+        ),
+        when(given("tolerance"), given(step={"const": "auto"}, tolerance={"exclusiveMaximum": 1})),
+        when(given("spectral_radius"), given(integrator={"const": "alpha2"})),
+    )
+    sometimes_filled = frozenset({"end", "step"})
 
     analysis: Literal["dynamic", "static"] = "dynamic"
     end: Positive
@@ -150,7 +172,7 @@ class Output(Block):
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
 
     every: Positive | None = 0.04
-    fields: list[str] = Field(default_factory=list)
+    fields: Annotated[list[str], WithJsonSchema(_FIELDS)] = Field(default_factory=list)
     checkpoint: Checkpoint = Field(default_factory=Checkpoint)
     reactions: Flag = False
 

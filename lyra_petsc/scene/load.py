@@ -22,7 +22,7 @@ __all__ = ["dump_scene", "load_scene"]
 _OUR_KEYS = {"mesh", "material", "time"}
 
 
-def load_scene(path: Path | str, overrides: Sequence[str] = ()) -> Scene:
+def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed: bool = True) -> Scene:
     """Read and check a scene: YAML, or the original program's conf.json.
 
     Parameters
@@ -30,6 +30,8 @@ def load_scene(path: Path | str, overrides: Sequence[str] = ()) -> Scene:
     path : Path
     overrides : sequence of ``key.path=value``
         Applied to the scene as understood, before it is checked; see `apply_overrides`.
+    meshes_needed : bool
+        Whether the mesh files must be there.
 
     Returns
     -------
@@ -55,7 +57,7 @@ def load_scene(path: Path | str, overrides: Sequence[str] = ()) -> Scene:
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=path) from None
     for i, source in enumerate(scene.mesh):
-        if source.file is not None:
+        if meshes_needed and source.file is not None:
             _check_mesh_file(source.file, dotted(["mesh", i, "file"], data), path)
     scene._source = path
     return scene
