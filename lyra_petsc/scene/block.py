@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema
 
 from lyra_petsc.nearest import nearest
+from lyra_petsc.scene.describe import attributes, summary
 from lyra_petsc.scene.values import problem, shown
 
 
@@ -20,6 +23,12 @@ class Block(BaseModel):
 
     # keys that a scene may well try, and what to say of them
     not_yet: ClassVar[dict[str, str]] = {}
+
+    # how keys depend on each other, as far as JSON Schema can say it (scene.rules)
+    rules: ClassVar[tuple[dict[str, Any], ...]] = ()
+
+    # keys that `complete` fills in only in some cases
+    sometimes_filled: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     def keys(cls) -> list[str]:
@@ -47,6 +56,31 @@ class Block(BaseModel):
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Hook: defaults that depend on which other keys are given."""
         return data
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        schema = handler.resolve_ref_schema(handler(core))
+        said = attributes(cls)
+        keys = {}
+        for name, field in cls.model_fields.items():
+            key = field.alias or name
+            content = {word: value for word, value in schema["properties"][key].items() if word != "title"}
+            default = content.pop("default", None)
+            optional = not field.is_required() or name in cls.sometimes_filled
+            if "anyOf" in content and {"type": "null"} in content["anyOf"]:
+                pass
+            elif optional:  # an empty key counts as absent
+                content = {"anyOf": [content, {"type": "null"}]}
+            elif "$ref" in content:  # draft 7 ignores what stands beside a reference
+                content = {"allOf": [content]}
+            keys[key] = {"description": said[name].sentence, **content}
+            if default not in (None, math.inf):
+                keys[key]["default"] = default
+        schema.pop("title", None)
+        needed = [key for key in schema.get("required", ()) if key not in cls.sometimes_filled]
+        schema["required"] = needed
+        schema |= {"description": summary(cls), "properties": keys}
+        return schema | ({"allOf": list(cls.rules)} if cls.rules else {})
 
     def given(self, *names: str) -> list[str]:
         """Those of ``names`` that have a value."""

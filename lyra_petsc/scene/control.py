@@ -47,7 +47,7 @@ class Time(Block):
         ``dynamic``: a motion in time; ``static``: the equilibrium under the loads, which grow with a
         load factor from 0 to 1 that takes the place of time.
     end : float [s]
-        1 in a static analysis.
+        Time at which the run ends; 1 in a static analysis.
     step : float [s] or "auto"
         Nominal and largest Δt; ``auto``: as the tolerance asks. In a static analysis the first
         increment of the load factor.
@@ -56,9 +56,9 @@ class Time(Block):
         of the diagonal of the rest shape's bounding box.
     integrator : str or None
         ``beuler`` (first order, full Newton), ``semi-implicit`` (one linear solve a step), ``midpoint``,
-        ``alpha2`` (generalised-α), ``bdf2`` (second order); None in a static analysis.
+        ``alpha2`` (generalised-α), ``bdf2`` (second order); none in a static analysis. By default ``beuler``.
     spectral_radius : float or None
-        Of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
+        Spectral radius of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
     """
 
     rules = (
@@ -148,7 +148,7 @@ class Checkpoint(Block):
     seconds : float [s]
         Wall time.
     steps : int or None
-        Accepted steps; None: only by wall time.
+        Accepted steps; without: only by wall time.
     """
 
     seconds: Positive = 60.0
@@ -161,12 +161,13 @@ class Output(Block):
     Attributes
     ----------
     every : float [s] or None
-        Simulated time between states; None: every step.
+        Simulated time between states; empty: every step.
     fields : list of str
-        Beside the positions.
+        What a state holds beside the positions.
     checkpoint : Checkpoint
+        How often a checkpoint is written at least.
     reactions : bool
-        Forces at the handles.
+        Write the forces at the handles to reactions.csv.
     """
 
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})

@@ -6,12 +6,15 @@ import math
 from collections import Counter
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.rules import absent, given, one_of, when
 from lyra_petsc.scene.sheet import Rotation
 from lyra_petsc.scene.values import (
+    LARGEST_INDEX,
+    VECTOR,
     Flag,
     Index,
     Name,
@@ -26,10 +29,12 @@ from lyra_petsc.scene.values import (
     problem,
     shown,
     vector,
+    whole,
 )
 
 Direction = Literal["x", "y", "z"]
 AXES: tuple[Direction, ...] = ("x", "y", "z")
+_AXES = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
 
 
 class Wind(Block):
@@ -38,9 +43,11 @@ class Wind(Block):
     Attributes
     ----------
     velocity : (3,) [m/s]
+        Of the air; zeros are still air.
     density : float [kg/m³]
+        Of the air.
     drag : float [kg/(m² s)]
-        Tangential.
+        Tangential drag coefficient.
     """
 
     velocity: Vector
@@ -54,12 +61,26 @@ def _vertex_list(value: Any) -> Any:
     return list(value)
 
 
+_VERTICES = {"type": "array", "items": whole(0, LARGEST_INDEX), "minItems": 1, "uniqueItems": True}
+_BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
+
+
 class _Vertices(Block):
-    """The three ways to name vertices."""
+    """The three ways to name vertices.
+
+    Attributes
+    ----------
+    group : str or None
+        A group of the mesh, or a sheet's name.
+    nodes : list of int or None
+        Vertex numbers, from 0, in file order.
+    box : two (3,) [m] or None
+        Lower and upper corner; start positions, faces included.
+    """
 
     group: Name | None = None
-    nodes: Annotated[list[Index], BeforeValidator(_vertex_list)] | None = None
-    box: tuple[Vec3, Vec3] | None = None
+    nodes: Annotated[list[Index], BeforeValidator(_vertex_list), WithJsonSchema(_VERTICES)] | None = None
+    box: Annotated[tuple[Vec3, Vec3], WithJsonSchema(_BOX)] | None = None
 
     @field_validator("nodes")
     @classmethod
@@ -84,17 +105,9 @@ class _Vertices(Block):
 
 
 class Selector(_Vertices):
-    """Vertices by exactly one of group, nodes, box.
+    """Vertices by exactly one of group, nodes, box."""
 
-    Attributes
-    ----------
-    group : str or None
-        A group of the mesh, or a sheet's name.
-    nodes : list of int or None
-        Vertex numbers, from 0, in file order.
-    box : two (3,) [m] or None
-        Lower and upper corner; start positions, faces included.
-    """
+    rules = (one_of("group", "nodes", "box"),)
 
     @model_validator(mode="after")
     def _one_selection(self) -> Self:
@@ -108,25 +121,23 @@ class Handle(Selector):
 
     Attributes
     ----------
-    group, nodes, box
-        See `Selector`.
     axes : tuple of "x", "y", "z"
         Directions that are held.
     clamp : bool
         Keep the slope of held boundary edges.
     motion : str or None
-        Name in ``motions``; None: held in place.
+        Name in ``motions``; without: held in place.
     interpolation : str
-        Of the motion in time.
+        Of the motion in time, between keyframes.
     start, until : float [s]
-        Held for start ≤ t ≤ until (inf: to the end); the key of ``start`` is ``from``.
+        Held for start ≤ t ≤ until (without: to the end); the key of ``start`` is ``from``.
     fade : float [s]
         After ``until`` the hold fades as (1 − (t − until)/fade)⁴.
     stiffness : float [N/m] or None
         Per vertex and axis: a spring instead of a constraint.
     """
 
-    axes: tuple[Direction, ...] = AXES
+    axes: Annotated[tuple[Direction, ...], WithJsonSchema(_AXES)] = AXES
     clamp: Flag = False
     motion: Name | None = None
     interpolation: Literal["hermite", "linear"] = "hermite"
@@ -164,11 +175,15 @@ class Keyframe(Block):
     Attributes
     ----------
     time : float [s]
+        Later than the keyframe before.
     scale : float or (3,)
+        Factor about the origin, or one for each axis; not 0.
     rotate : Rotation or None
+        Rotation after the scaling.
     translate : (3,) [m]
+        Displacement after the rotation.
     velocity : (3,) [m/s] or None
-        Of the translation; None: by central differences, zero at both ends.
+        Of the translation; without: by central differences, zero at both ends.
     """
 
     time: Number
@@ -183,8 +198,9 @@ class Load(_Vertices):
 
     Attributes
     ----------
-    group, nodes, box
-        See `Selector`; for pressure and traction a surface group or nothing (every triangle).
+    group : str or None
+        A group of the mesh, or a sheet's name; for pressure and traction a surface group, or nothing (every
+        triangle).
     force : (3,) [N] or None
         Total, shared by the selected vertices.
     pressure : float [Pa] or None
@@ -194,6 +210,11 @@ class Load(_Vertices):
     start, until : float [s]
         Acts for start ≤ t ≤ until; the key of ``start`` is ``from``.
     """
+
+    rules = (
+        one_of("force", "pressure", "traction"),
+        when(given("force"), one_of("group", "nodes", "box"), absent("nodes", "box")),
+    )
 
     force: Vector | None = None
     pressure: Number | None = None
@@ -221,6 +242,7 @@ class Initial(Block):
     Attributes
     ----------
     velocity : (3,) [m/s]
+        Of all vertices.
     angular_velocity : (3,) [rad/s]
         About the centre of mass.
     noise : float [m]

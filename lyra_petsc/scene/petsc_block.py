@@ -14,7 +14,7 @@ from pydantic import PlainValidator
 
 from lyra_petsc.scene.values import number, problem, shown
 
-_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 _REFUSED = re.compile(
     r"(log|log_all|log_trace|history|tee|info|x|draw|dll|malloc|start|stop|on_error|debug|saws|mpe)(_.*)?"
@@ -24,7 +24,7 @@ _REFUSED = re.compile(
 )
 _SHOWS = re.compile(r".*(view|monitor).*")
 _SCREEN = re.compile(r"((ascii|stdout)?(::ascii\w*)?)")
-_PLAIN = re.compile(r"[\w+,. -]*", re.ASCII)
+_PLAIN = re.compile(r"[A-Za-z0-9_+,. -]*")
 
 
 def _petsc_value(value: Any) -> Any:
@@ -65,3 +65,26 @@ def _reaches_out(name: str, value: Any) -> bool:
     if _SHOWS.fullmatch(name):
         return not _SCREEN.fullmatch(value)
     return not _PLAIN.fullmatch(value) or (name.endswith("type") and value in ("python", "shell"))
+
+
+def _of_any_case(pattern: re.Pattern[str]) -> str:
+    """A pattern for lower-case names as JSON Schema, which knows no flags, needs it."""
+    letters = re.sub(r"(?<!\\)[a-z]", lambda letter: f"[{letter[0]}{letter[0].upper()}]", pattern.pattern)
+    return f"^({letters})$"
+
+
+def _or_no_text(pattern: str) -> dict[str, Any]:
+    return {"anyOf": [{"type": "string", "pattern": pattern}, {"type": ["number", "boolean", "null"]}]}
+
+
+_SHOWING = _of_any_case(_SHOWS)
+PETSC_BLOCK: dict[str, Any] = {
+    "type": "object",
+    "propertyNames": {"pattern": rf"^({_NAME.pattern})$", "not": {"pattern": _of_any_case(_REFUSED)}},
+    "patternProperties": {
+        _SHOWING: _or_no_text(rf"^{_SCREEN.pattern}$"),
+        rf"^(?!{_SHOWING[1:]})": _or_no_text(rf"^{_PLAIN.pattern}$"),
+        "[tT][yY][pP][eE]$": {"not": {"enum": ["python", "shell"]}},
+    },
+}
+"""The same in words of JSON Schema."""

@@ -10,14 +10,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, WithJsonSchema, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.control import Output, Solver, Time
 from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
-from lyra_petsc.scene.petsc_block import PetscValue, petsc_options
+from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
+from lyra_petsc.scene.rules import given, when
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
 from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
 
@@ -53,6 +54,9 @@ def _too_small(step: float, end: float) -> str:
     )
 
 
+_AT_REST = {"anyOf": [{"type": "null"}, {"items": {"const": 0}}]}
+
+
 def _one_or_many(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         if not value:
@@ -81,24 +85,46 @@ class Scene(Block):
     Attributes
     ----------
     title : str
+        One line for summaries and pages.
     mesh : list of MeshSource
-        Sheets, vertices numbered consecutively.
+        Where the sheets come from: one block, or a list whose vertices are numbered consecutively.
     material : list of Material
-        At most one without a group: it serves the triangles that no other block names.
+        One block, or a list; at most one without a group: it serves the triangles that no other block names.
     gravity : (3,) [m/s²] or None
+        Acceleration of gravity; without this key there is none.
     wind : Wind or None
+        Uniform wind; without this key there is no air.
     handles : list of Handle
+        Vertices that are held or moved.
     motions : dict of list of Keyframe
-        By name; times strictly ascending.
+        Motions of handles, by name; times strictly ascending.
     loads : list of Load
+        Forces, pressures and tractions.
     initial : Initial or None
+        State at t = 0, where it is not rest.
     time : Time
+        Time stepping, or the way to an equilibrium.
     output : Output
+        What is written, and how often.
     probes : dict of Selector
+        Vertices whose mean position goes into probes.csv at every step, by name.
     solver : Solver
+        When a step counts as converged.
     petsc : dict
-        PETSc options without the leading dash; None is an option without a value.
+        PETSc options without the leading dash; an empty value is an option without one.
     """
+
+    # a static analysis starts at rest
+    rules = (
+        when(
+            given(time=given(analysis={"const": "static"}), initial={"type": "object"}),
+            {
+                "properties": {
+                    "initial": {"properties": dict.fromkeys(("velocity", "angular_velocity"), _AT_REST)}
+                }
+            },
+        ),
+    )
 
     title: Text = ""
     mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
@@ -115,7 +141,9 @@ class Scene(Block):
     output: Output = Field(default_factory=Output)
     probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
     solver: Solver = Field(default_factory=Solver)
-    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options)] = Field(default_factory=dict)
+    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), WithJsonSchema(PETSC_BLOCK)] = (
+        Field(default_factory=dict)
+    )
 
     _source: Path | None = PrivateAttr(default=None)
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.materials.tables import names
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.rules import given, one_of, only, when
 from lyra_petsc.scene.values import (
     Axis,
     Bending,
@@ -35,8 +36,9 @@ class Rotation(Block):
     Attributes
     ----------
     axis : (3,)
-        Not zero; need not be a unit vector.
+        Direction of the axis; not zero, need not be a unit vector.
     degrees : float [°]
+        Angle.
     """
 
     axis: Axis
@@ -49,9 +51,11 @@ class Transform(Block):
     Attributes
     ----------
     scale : float or (3,)
-        > 0.
+        Factor, or one for each axis; > 0.
     rotate : Rotation or None
+        Rotation after the scaling.
     translate : (3,) [m]
+        Displacement after the rotation.
     """
 
     scale: PositiveScale = 1.0
@@ -69,7 +73,7 @@ class Grid(Block):
     nx, ny : int
         Cells in x and y.
     pattern : str
-        How cells are cut into triangles.
+        How cells are cut into triangles: all diagonals alike, alternating, or four triangles a cell.
     """
 
     width: Positive
@@ -79,22 +83,32 @@ class Grid(Block):
     pattern: Literal["diagonal", "alternating", "criss-cross"] = "diagonal"
 
 
+def _file(*endings: str) -> dict[str, Any]:
+    """Schema of a file name with one of these endings, in any case."""
+    any_case = ("".join(f"[{letter}{letter.upper()}]" for letter in ending) for ending in endings)
+    return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
+
+
 class MeshSource(Block):
     """Where one sheet comes from: a file or a grid.
 
     Attributes
     ----------
     file : Path or None
-        .geo, .msh or .obj; absolute (a relative path stands beside the scene file).
+        A .geo, .msh or .obj; a relative path stands beside the scene file.
     grid : Grid or None
+        A rectangle instead of a file.
     size : float [m] or None
         Element size for a .geo.
     transform : Transform
+        Where the sheet starts; without ``vt`` its scaling counts for the rest shape, too.
     name : str or None
         Name of the sheet; a surface group of that name holds its triangles.
     """
 
-    file: Path | None = None
+    rules = (one_of("file", "grid"), when(given("size"), given(file=_file("geo"))))
+
+    file: Annotated[Path, WithJsonSchema(_file("geo", "msh", "obj"))] | None = None
     grid: Grid | None = None
     size: Positive | None = None
     transform: Transform = Field(default_factory=Transform)
@@ -150,6 +164,7 @@ class Membrane(Block):
         return self
 
 
+_SHEET = ("membrane", "bending")
 _ISOTROPIC = ("young", "poisson", "thickness")
 
 
@@ -162,17 +177,21 @@ class Material(Block):
     Attributes
     ----------
     group : str or None
-        Surface group it is for; None: all triangles that no other block names.
+        Surface group it is for; without: all triangles that no other block names.
     cloth : str or None
-        A library name.
+        Name of a measured cloth or an engineering material of the library, instead of numbers.
     density : float [kg/m²] or None
         Areal density.
     membrane : Membrane or None
+        Stretching stiffness.
     bending : float or (3,) [N·m] or None
         Cylindrical stiffness B; three values hold for hinge edges at 0°, 45°, 90° to the warp.
     young : float [Pa] or None
+        Young's modulus of an isotropic shell.
     poisson : float or None
+        Poisson's ratio of an isotropic shell.
     thickness : float [m] or None
+        Thickness of an isotropic shell.
     damping : float [s]
         γ of stiffness-proportional damping.
     warp_degrees : float [°]
@@ -182,11 +201,21 @@ class Material(Block):
     thicken : float
         t: density × t, membrane × t, bending × t³.
     rest_curvature : (3,) [1/m] or None
-        κ11, κ22, κ12 in the material axes.
+        Curvature κ11, κ22, κ12 at rest, in the material axes.
     """
 
+    rules = (
+        {
+            "oneOf": [
+                only(("cloth",), unless=("density", *_SHEET, *_ISOTROPIC)),
+                only(("density", "membrane"), unless=("cloth", *_ISOTROPIC)),
+                only(("density", *_ISOTROPIC), unless=("cloth", *_SHEET)),
+            ]
+        },
+    )
+
     group: Name | None = None
-    cloth: Name | None = None
+    cloth: Annotated[Name, WithJsonSchema({"enum": names()})] | None = None
     density: Positive | None = None
     membrane: Membrane | None = None
     bending: Bending | None = None
@@ -217,7 +246,7 @@ class Material(Block):
     def _one_way(self) -> Self:
         ways = {
             "cloth": self.given("cloth"),
-            "membrane": self.given("membrane", "bending"),
+            "membrane": self.given(*_SHEET),
             "young": self.given(*_ISOTROPIC),
         }
         used = {way: keys for way, keys in ways.items() if keys}

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 import reprlib
+import sys
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
-from pydantic import PlainValidator
+from pydantic import PlainValidator, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 Vec3 = tuple[float, float, float]
@@ -180,21 +181,61 @@ def _step_length(value: Any) -> float | str:
     return step
 
 
-Number = Annotated[float, PlainValidator(number)]
-Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0"))]
-NonNegative = Annotated[float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0"))]
-Fraction = Annotated[float, PlainValidator(_bounded(lambda x: 0 <= x <= 1, "from 0 to 1"))]
-StepLength = Annotated[float | Literal["auto"], PlainValidator(_step_length)]
-Poisson = Annotated[float, PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]"))]
-Until = Annotated[float, PlainValidator(_until)]
-Vector = Annotated[Vec3, PlainValidator(vector)]
-Axis = Annotated[Vec3, PlainValidator(_axis)]
-Scale = Annotated[float | Vec3, PlainValidator(_scale)]
-PositiveScale = Annotated[float | Vec3, PlainValidator(_positive_scale)]
-Bending = Annotated[float | Vec3, PlainValidator(_bending)]
-Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX))]
-Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX))]
-Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1))]
-Text = Annotated[str, PlainValidator(_text)]
-Name = Annotated[str, PlainValidator(_name)]
-Flag = Annotated[bool, PlainValidator(_flag)]
+Schema = dict[str, Any]
+
+# what JSON Schema can say of the values; .inf is a number to YAML
+FINITE: Schema = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
+NAME: Schema = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
+
+
+def _triple(of: Schema) -> Schema:
+    return {"type": "array", "items": of, "minItems": 3, "maxItems": 3}
+
+
+def whole(lowest: int, highest: int) -> Schema:
+    return {"type": "integer", "minimum": lowest, "maximum": highest}
+
+
+POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0, "maximum": sys.float_info.max}
+NON_NEGATIVE = FINITE | {"minimum": 0}
+NONZERO = FINITE | {"not": {"const": 0}}
+VECTOR = _triple(FINITE)
+
+Number = Annotated[float, PlainValidator(number), WithJsonSchema(FINITE)]
+Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0")), WithJsonSchema(POSITIVE)]
+NonNegative = Annotated[
+    float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0")), WithJsonSchema(NON_NEGATIVE)
+]
+Fraction = Annotated[
+    float,
+    PlainValidator(_bounded(lambda x: 0 <= x <= 1, "from 0 to 1")),
+    WithJsonSchema({"type": "number", "minimum": 0, "maximum": 1}),
+]
+StepLength = Annotated[
+    float | Literal["auto"],
+    PlainValidator(_step_length),
+    WithJsonSchema({"anyOf": [POSITIVE, {"const": "auto"}]}),
+]
+Poisson = Annotated[
+    float,
+    PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]")),
+    WithJsonSchema({"type": "number", "exclusiveMinimum": -1, "maximum": 0.5}),
+]
+Until = Annotated[float, PlainValidator(_until), WithJsonSchema({"type": "number"})]
+Vector = Annotated[Vec3, PlainValidator(vector), WithJsonSchema(VECTOR)]
+Axis = Annotated[Vec3, PlainValidator(_axis), WithJsonSchema(VECTOR | {"contains": {"not": {"const": 0}}})]
+Scale = Annotated[
+    float | Vec3, PlainValidator(_scale), WithJsonSchema({"anyOf": [NONZERO, _triple(NONZERO)]})
+]
+PositiveScale = Annotated[
+    float | Vec3, PlainValidator(_positive_scale), WithJsonSchema({"anyOf": [POSITIVE, _triple(POSITIVE)]})
+]
+Bending = Annotated[
+    float | Vec3, PlainValidator(_bending), WithJsonSchema({"anyOf": [NON_NEGATIVE, _triple(NON_NEGATIVE)]})
+]
+Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX)), WithJsonSchema(whole(1, LARGEST_INDEX))]
+Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX)), WithJsonSchema(whole(0, LARGEST_INDEX))]
+Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1)), WithJsonSchema(whole(0, 2**63 - 1))]
+Text = Annotated[str, PlainValidator(_text), WithJsonSchema({"type": "string", "pattern": r"^[^\0]*$"})]
+Name = Annotated[str, PlainValidator(_name), WithJsonSchema(NAME)]
+Flag = Annotated[bool, PlainValidator(_flag), WithJsonSchema({"type": "boolean"})]
