@@ -1,0 +1,32 @@
+"""What the declarations of several verbs share.
+
+`cli.verbs` registers the commands. A module that declares one imports what it needs for its work only when
+it is called: the declarations of all verbs are read for each.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+def _show_help(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        if ctx.obj.rank == 0:
+            click.echo(ctx.get_help())
+        ctx.exit()
+
+
+helped = click.option(
+    "--help", is_flag=True, is_eager=True, expose_value=False, callback=_show_help, help="Show this and exit."
+)
+SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
+
+scene = click.argument("scene", required=False, type=click.Path(path_type=Path))
+settings = click.option(
+    "--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="Change the scene; may be repeated."
+)
+results = click.argument("run", type=click.Path(path_type=Path))
+out = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")
