@@ -29,7 +29,7 @@ LEVELS = [
     {"simulation"},
     {"recorder"},
     {"results"},
-    {"exact", "report"},
+    {"exact", "render", "report"},
     {"study", "verification"},
     {"stress"},
     {"cli"},

@@ -18,11 +18,13 @@ from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.control import Output, Solver, Time
 from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
+from lyra_petsc.scene.render import Camera, Render
 from lyra_petsc.scene.rules import given, when
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
 from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
 
 __all__ = [
+    "Camera",
     "Grid",
     "Handle",
     "Initial",
@@ -32,6 +34,7 @@ __all__ = [
     "Membrane",
     "MeshSource",
     "Output",
+    "Render",
     "Rotation",
     "Scene",
     "Selector",
@@ -110,6 +113,8 @@ class Scene(Block):
         Vertices whose mean position goes into probes.csv at every step, by name.
     solver : Solver
         When a step counts as converged.
+    render : Render or None
+        What ``render`` shows; a run does not read it.
     petsc : dict
         PETSc options without the leading dash; an empty value is an option without one.
     """
@@ -141,6 +146,7 @@ class Scene(Block):
     output: Output = Field(default_factory=Output)
     probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
     solver: Solver = Field(default_factory=Solver)
+    render: Render | None = None
     petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), WithJsonSchema(PETSC_BLOCK)] = (
         Field(default_factory=dict)
     )

@@ -1,0 +1,158 @@
+"""Where a camera stands so that the whole motion is in the picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.scene.render import Camera, parallel
+from lyra_petsc.scene.schema import Scene
+
+Array = NDArray[np.float64]
+
+MARGIN = 0.86
+"""Part of the picture's height and width that the motion fills."""
+
+ELEVATIONS = (15.0, 35.0)
+AZIMUTHS = 24
+ASIDE = 25.0
+"""Degrees off the direction in which most of the sheet is seen: folds show better from the side."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A perspective camera.
+
+    Attributes
+    ----------
+    position, target : (3,) [m]
+    up : (3,)
+    angle : float
+        Height of the field of view [degrees].
+    """
+
+    position: Array
+    target: Array
+    up: Array
+    angle: float
+
+
+def upwards(scene: Scene) -> Array:
+    """Unit vector that points up in the pictures: as the scene says, else against gravity, else z."""
+    camera = _camera(scene)
+    gravity = np.array(scene.gravity or (0.0, 0.0, 0.0))
+    up = np.array(camera.up) if camera.up is not None else -gravity
+    return _unit(up) if up.any() else np.array([0.0, 0.0, 1.0])
+
+
+def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: NDArray[np.int64]) -> Array:
+    """Unit vector from the sheet to the camera.
+
+    Parameters
+    ----------
+    scene : Scene
+    up : (3,)
+    shapes : iterable of (V, 3)
+        Some states of the motion [m], looked at where the scene leaves the choice.
+    triangles : (F, 3)
+    """
+    given = _camera(scene).line_of_sight
+    if given is not None:
+        return _unit(np.array(given))
+    candidates = np.array(
+        [
+            direction(up, 2.0 * math.pi * i / AZIMUTHS, math.radians(elevation))
+            for i in range(AZIMUTHS)
+            for elevation in ELEVATIONS
+        ]
+    )
+    seen = np.zeros(len(candidates))
+    for x in shapes:
+        corners = x[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        seen += np.abs(normals @ candidates.T).sum(axis=0)
+    # of two sides that show the same, the first: seen against y where z is up
+    best = int(np.flatnonzero(seen >= seen.max() * (1.0 - 1e-9))[0])
+    azimuth = 2.0 * math.pi * (best // len(ELEVATIONS)) / AZIMUTHS + math.radians(ASIDE)
+    return direction(up, azimuth, math.radians(ELEVATIONS[best % len(ELEVATIONS)]))
+
+
+def direction(up: Array, azimuth: float, elevation: float) -> Array:
+    """Unit vector at angles [rad] from the front, about ``up`` and above the horizon."""
+    side, front = horizon(up)
+    level = math.cos(azimuth) * front + math.sin(azimuth) * side
+    return math.cos(elevation) * level + math.sin(elevation) * up
+
+
+def horizon(up: Array) -> tuple[Array, Array]:
+    """Two unit vectors normal to ``up``: to the right, and towards the viewer; x and −y where z is up."""
+    right = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    right = _unit(right - (right @ up) * up)
+    return right, np.cross(right, up)
+
+
+class Fit:
+    """Finds the nearest camera that sees all points it is shown.
+
+    A point is in the picture where it lies inside the four planes through the camera that bound it;
+    how far the points reach along the normals of the planes is all that has to be kept of them.
+
+    Parameters
+    ----------
+    scene : Scene
+    sight : (3,)
+        Unit vector towards the camera.
+    up : (3,)
+    aspect : float
+        Width of the picture over its height.
+    """
+
+    def __init__(self, scene: Scene, sight: Array, up: Array, aspect: float) -> None:
+        self._camera = _camera(scene)
+        # seen from straight above, what lies behind is up in the picture
+        self._up = -horizon(up)[1] if parallel(tuple(sight), tuple(up)) else up
+        self._sight = sight
+        self._right = _unit(np.cross(self._up, sight))
+        self._upper = np.cross(sight, self._right)
+        self._slope = MARGIN * math.tan(math.radians(self._camera.angle) / 2.0) * np.array([aspect, 1.0])
+        sides = [
+            sign * axis + slope * sight
+            for axis, slope in zip((self._right, self._upper), self._slope, strict=True)
+            for sign in (1.0, -1.0)
+        ]
+        self.normals = np.array([*sides, sight, -sight])
+
+    def view(self, reach: Array) -> View:
+        """The camera.
+
+        Parameters
+        ----------
+        reach : (6,)
+            Largest product of a point with each of ``normals`` [m].
+        """
+        camera = self._camera
+        if camera.position is not None and camera.target is not None:
+            return View(np.array(camera.position), np.array(camera.target), self._up, camera.angle)
+        pairs = reach[:4].reshape(2, 2)
+        across = (pairs[:, 0] - pairs[:, 1]) / 2.0
+        away = float((pairs.sum(axis=1) / (2.0 * self._slope)).max())
+        middle = float(reach[4] - reach[5]) / 2.0
+        centre = across[0] * self._right + across[1] * self._upper
+        distance = (away - middle) / (camera.zoom or 1.0)
+        target = centre + middle * self._sight
+        return View(target + distance * self._sight, target, self._up, camera.angle)
+
+
+def _camera(scene: Scene) -> Camera:
+    asked = scene.render.camera if scene.render is not None else None
+    return asked or Camera()
+
+
+def _unit(vector: Array) -> Array:
+    scaled = vector / np.abs(vector).max()
+    unit: Array = scaled / np.linalg.norm(scaled)
+    return unit
