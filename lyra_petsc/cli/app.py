@@ -17,6 +17,11 @@ from lyra_petsc.cli.signals import take_back_from_petsc
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError
 
+PROGRAM = "lyra-petsc"
+
+COMPLETION = "_LYRA_PETSC_COMPLETE"
+"""Variable by which the shell asks click for what may follow; click makes it of the program's name."""
+
 BUG = 70
 """Exit code of what should never happen."""
 
@@ -29,6 +34,8 @@ RESERVE = 4 * 2**20
 
 def run_command_line(argv: Sequence[str]) -> int:
     """Parse and run; the exit code. Starts PETSc with its part of the arguments."""
+    if COMPLETION in os.environ:  # the shell asks at a press of the tab key: PETSc is not needed
+        verbs.main([], prog_name=PROGRAM)
     ours, petsc = split(argv[1:])
     try:
         import petsc4py
@@ -47,10 +54,12 @@ def run_command_line(argv: Sequence[str]) -> int:
 
     comm = MPI.COMM_WORLD
     reserve = [bytes(RESERVE)]
+    # numba would put colour codes on the standard output where it finds colorama
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     # a number that overflows makes a step fail, which is told once and in words
     np.seterr(over="ignore", invalid="ignore")
     try:
-        code = verbs.main(ours, prog_name="lyra-petsc", standalone_mode=False, obj=comm)
+        code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=comm)
     except LyraError as error:
         _say(comm, str(error), error.details)
         return _leave_together(comm, error.exit_code, str(error))

@@ -17,6 +17,7 @@ from lyra_petsc.cli.run import read_scene
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.json_schema import SCHEMA_FILE
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.simulation import Simulation
 
@@ -47,6 +48,12 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
     if every is not None:
         _print(simulation, path, np.array(every))
     simulation.destroy()
+
+
+def print_schema(comm: MPI.Comm) -> None:
+    """Print the JSON Schema of scene files on rank 0."""
+    if comm.rank == 0:
+        print(SCHEMA_FILE.read_text(encoding="utf-8"), end="")
 
 
 def _elements(simulation: Simulation) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from lyra_petsc import __version__
+from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
 from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
@@ -21,7 +22,6 @@ LATER = {
     "view": "a live page",
     "export": "other formats",
     "report": "one page about a run",
-    "new": "a starter scene",
 }
 """Verbs that are announced and not there yet."""
 
@@ -33,6 +33,8 @@ class _Verbs(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0]
+        if ctx.resilient_parsing:  # shell completion
+            return super().resolve_command(ctx, args)
         if name in LATER:
             raise InputError(
                 f"'{name}' ({LATER[name]}) is not there yet; there are: {_listing(self)}", key=name
@@ -99,12 +101,17 @@ def run(
 @helped
 @scene
 @settings
+@click.option("--schema", is_flag=True, help="Print the JSON Schema of scene files, for editors.")
 @click.pass_obj
-def check(comm: Any, scene: Path | None, settings: tuple[str, ...]) -> None:
+def check(comm: Any, scene: Path | None, settings: tuple[str, ...], schema: bool) -> None:
     """Check SCENE and print what a run would do; runs nothing."""
     from lyra_petsc.cli.check import check as check_scene
+    from lyra_petsc.cli.check import print_schema
 
-    check_scene(comm, scene, settings)
+    if schema:
+        print_schema(comm)
+    else:
+        check_scene(comm, scene, settings)
 
 
 @verbs.command(context_settings=SETTINGS)
@@ -196,3 +203,6 @@ def info(comm: Any) -> None:
     text = describe(comm)
     if comm.rank == 0:
         click.echo(text)
+
+
+verbs.add_command(new)

@@ -1,0 +1,135 @@
+"""The text of a starter scene, with a grid or around a mesh of the user's."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+from lyra_petsc.materials.tables import names
+from lyra_petsc.scene.control import FIELDS
+from lyra_petsc.scene.json_schema import SCHEMA_FILE
+
+CLOTHS = 4
+"""Names of the library that are shown."""
+
+Box = tuple[tuple[float, ...], tuple[float, ...]]
+
+_GRID = """\
+mesh:
+  grid: {width: 1.0, height: 1.0, nx: 30, ny: 30}   # m, cells; in the xy plane, one corner at the origin
+  # file: sheet.geo             # instead: a gmsh script (.geo), a .msh or an .obj, beside this file
+  # transform: {rotate: {axis: [1, 0, 0], degrees: 90}, translate: [0, 0, 1]}"""
+
+_GRID_HANDLE = """\
+  - box: [[0, 1, 0], [1, 1, 0]] # the vertices in it: the edge y = 1. Or nodes: [0, 1], or group: NAME
+    # motion: swing"""
+
+_PLAIN_NAME = re.compile(r"[A-Za-z_][\w-]*")
+
+
+@dataclass(frozen=True)
+class OwnMesh:
+    """What the starter tells of a mesh.
+
+    Attributes
+    ----------
+    file : Path
+    n_vertices, n_triangles : int
+    groups : mapping of str to (str, int)
+        Point, curve or surface, and the number of vertices, by name.
+    span : pair of (3,)
+        Lower and upper corner [m].
+    """
+
+    file: Path
+    n_vertices: int
+    n_triangles: int
+    groups: Mapping[str, tuple[str, int]]
+    span: Box
+
+
+def starter(scene: Path, mesh: OwnMesh | None = None) -> str:
+    """A commented scene that can be run as it stands.
+
+    Parameters
+    ----------
+    scene : Path
+        Where it will be written; the mesh file is named relative to it.
+    mesh : OwnMesh, optional
+        Without it, a grid.
+    """
+    text = files("lyra_petsc.scene").joinpath("starter.yaml").read_text(encoding="utf-8")
+    return Template(text).substitute(
+        schema=SCHEMA_FILE,
+        file=shlex.quote(scene.name),
+        title=_quoted(scene.stem),
+        mesh=_GRID if mesh is None else _mesh(mesh, scene),
+        handle=_GRID_HANDLE if mesh is None else _handle(mesh),
+        cloths=", ".join(names()[:CLOTHS]),
+        fields=", ".join(name for name in FIELDS if name != "velocity"),
+    )
+
+
+def _mesh(mesh: OwnMesh, scene: Path) -> str:
+    file = os.path.relpath(mesh.file.absolute(), scene.absolute().parent)
+    if file.startswith(os.path.join("..", "..")):  # far away: neither is likely to move with the other
+        file = str(mesh.file.absolute())
+    lines = ["mesh:", f"  file: {_quoted(file)}"]
+    if mesh.file.suffix.lower() == ".geo":
+        lines.append("  # size: 0.02                # m, instead of the element sizes in the .geo")
+    low, high = ("[" + ", ".join(f"{x:.4g}" for x in corner) + "]" for corner in mesh.span)
+    lines += [
+        "  # transform: {scale: 0.001}   # for a mesh in millimetres; also: rotate, translate",
+        f"  # {mesh.n_vertices} vertices, {mesh.n_triangles} triangles, from {low} to {high}",
+    ]
+    if mesh.groups:
+        lines.append("  # groups, for handles, loads and probes, and those of surfaces for materials:")
+        width = max(len(_quoted(name)) for name in mesh.groups)
+        lines += [
+            f"  #   {_quoted(name):{width}}  {kind}, {count} {'vertex' if count == 1 else 'vertices'}"
+            for name, (kind, count) in mesh.groups.items()
+        ]
+    else:
+        lines.append("  # it has no groups (gmsh: Physical Curve, Physical Surface; .obj: g NAME)")
+    return "\n".join(lines)
+
+
+def _handle(mesh: OwnMesh) -> str:
+    lines = ["    # motion: swing"]
+    for name, (kind, count) in mesh.groups.items():
+        if kind != "surface" and count < mesh.n_vertices:
+            return "\n".join([f"  - group: {_quoted(name)}", *lines])
+    # nothing to name: the upper end of the sheet, along z or the longest axis of a flat one
+    low, high = mesh.span
+    extent = [b - a for a, b in zip(low, high, strict=True)]
+    axis = 2 if extent[2] > 0.01 * max(extent) else extent.index(max(extent))
+    bottom = [high[k] - 0.01 * extent[k] if k == axis else low[k] for k in range(3)]
+    margin = 1e-6 * max(extent)
+    corners = [[_digits(x - margin) for x in bottom], [_digits(x + margin) for x in high]]
+    box = ", ".join(f"[{', '.join(corner)}]" for corner in corners)
+    return "\n".join([f"  - box: [{box}]   # the vertices at the end of {'xyz'[axis]}", *lines])
+
+
+def _digits(value: float) -> str:
+    return f"{value:.9g}" if "e" not in f"{value:.9g}" else repr(float(f"{value:.9f}"))
+
+
+def _quoted(text: str) -> str:
+    """Text as YAML takes it for text."""
+    plain = _PLAIN_NAME.fullmatch(text) and text.lower() not in (
+        "null",
+        "true",
+        "false",
+        "yes",
+        "no",
+        "on",
+        "off",
+    )
+    return text if plain else json.dumps(text, ensure_ascii=False)
