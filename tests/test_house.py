@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
-    {"errors", "nearest"},
+    {"errors", "extras", "nearest"},
     {"kernel_cache", "parallel", "profiling"},
     {"materials"},
     {"scene"},

@@ -17,9 +17,9 @@ from lyra_petsc.cli.run import _petsc_speaks
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.cli.study_progress import StudyProgress
 from lyra_petsc.errors import InputError, Interrupted, SolverError
+from lyra_petsc.extras import require
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.parallel import on_root
-from lyra_petsc.report.extras import require
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.solvers.options import unused
 from lyra_petsc.study.case import Job

@@ -157,7 +157,7 @@ def verify(
 @click.pass_obj
 def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     """Error against run time: run, time and compare combinations of settings of SCENE."""
-    from lyra_petsc.report.extras import require
+    from lyra_petsc.extras import require
 
     require("study")
     from lyra_petsc.cli.study import Asked, run_job

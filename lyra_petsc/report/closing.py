@@ -6,9 +6,9 @@ import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from lyra_petsc.extras import missing, remedy
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.report.document import Report
-from lyra_petsc.report.extras import missing, remedy
 
 PLOTS = "plots"
 """Folder of the figures."""

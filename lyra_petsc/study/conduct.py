@@ -11,9 +11,9 @@ from typing import Any
 
 from mpi4py import MPI
 
+from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
-from lyra_petsc.report.extras import PACKAGES
 from lyra_petsc.study.advice import Advice, advise, choose_recommended
 from lyra_petsc.study.analysis import Row, mark_front, observed_orders
 from lyra_petsc.study.pages import main_axis, make_report

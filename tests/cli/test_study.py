@@ -299,7 +299,7 @@ def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
 def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     program = (
-        "import lyra_petsc.report.extras as extras; extras.missing = lambda packages=(): ['matplotlib']; "
+        "import lyra_petsc.extras as extras; extras.missing = lambda packages=(): ['matplotlib']; "
         "from lyra_petsc.__main__ import main; main()"
     )
     left = lyra(["study", "scene.yaml"], tmp_path, program=("-c", program))

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from lyra_petsc import extras
 from lyra_petsc.errors import InputError
-from lyra_petsc.report import extras
 from lyra_petsc.report.document import Report
 from lyra_petsc.report.numbers import percent, seconds, short
 from lyra_petsc.report.plots import Series, convergence, fitted_slope, work_precision
