@@ -14,6 +14,7 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
+from lyra_petsc.cli.report import report
 from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
 
@@ -21,7 +22,6 @@ LATER = {
     "render": "pictures and films",
     "view": "a live page",
     "export": "other formats",
-    "report": "one page about a run",
 }
 """Verbs that are announced and not there yet."""
 
@@ -206,3 +206,4 @@ def info(comm: Any) -> None:
 
 
 verbs.add_command(new)
+verbs.add_command(report)

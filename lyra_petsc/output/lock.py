@@ -86,3 +86,18 @@ class FolderLock:
                 self.path.unlink()
         with suppress(OSError):
             os.close(self._descriptor)
+
+
+def in_use(folder: Path) -> bool:
+    """Whether a process holds the lock of a folder; also True where the file system knows no locks."""
+    try:
+        descriptor = os.open(folder / LOCK_FILE, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)  # lets go at once
+    return False

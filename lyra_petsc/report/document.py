@@ -41,6 +41,7 @@ class Drawing:
     caption : str
     png : bytes
     svg : bytes
+        Empty for a picture that is no line drawing.
     """
 
     name: str
@@ -182,7 +183,8 @@ class Report:
 
 def _inline(drawing: Drawing) -> str:
     # as an image and not as tags: the ids of several SVGs in one page would clash
-    return "data:image/svg+xml;base64," + base64.b64encode(drawing.svg).decode("ascii")
+    kind, content = ("svg+xml", drawing.svg) if drawing.svg else ("png", drawing.png)
+    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
 
 
 def _plain(text: str) -> str:
