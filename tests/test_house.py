@@ -28,10 +28,11 @@ LEVELS = [
     {"compression", "fields"},
     {"simulation"},
     {"recorder"},
-    {"results"},
+    {"results", "whole_run"},
+    {"api"},
     {"exact", "render", "report"},
     {"study", "verification"},
-    {"stress"},
+    {"stress", "view"},
     {"cli"},
     {"__main__"},
 ]

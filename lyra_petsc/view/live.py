@@ -1,0 +1,104 @@
+"""The page of a run that goes on: a process of its own, which reads the run's folder and ends with the run.
+
+``python -m lyra_petsc.view.live FOLDER HOST PORT`` tells in one line on its standard output where the page
+is, or why there is none. When its standard input ends, the run has ended, however it did.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from lyra_petsc.errors import LyraError
+from lyra_petsc.study.launch import environment
+
+READY, FAILED = "ready ", "failed "
+"""How the line begins."""
+
+
+class LivePage:
+    """Starts the page's process, and lets go of it; for one rank. The run never waits for it.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the run, with its first state.
+    host : str
+    port : int
+    ready : callable
+        Called in a thread with the page's address.
+    failed : callable
+        Called in a thread with the reason, if there will be no page.
+    """
+
+    def __init__(
+        self, folder: Path, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
+    ) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        self._ready, self._failed = ready, failed
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "lyra_petsc.view.live", str(folder.absolute()), host, str(port)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=environment(),  # it is no rank of the run
+                start_new_session=True,  # Ctrl-C is for the run
+                text=True,
+            )
+        except OSError as error:
+            failed(str(error))
+        else:
+            threading.Thread(target=self._listen, args=[self._process], daemon=True).start()
+
+    def _listen(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        line = process.stdout.readline().strip()
+        if line.startswith(READY):
+            self._ready(line.removeprefix(READY))
+        elif process.stdin is not None and not process.stdin.closed:  # else the run was over before
+            self._failed(line.removeprefix(FAILED) or "its process ended")
+
+    def end(self) -> None:
+        """The run has ended: let the page show the last state and go."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+
+def main(folder: Path, host: str, port: int) -> None:
+    """Serve the page until the standard input ends."""
+    from lyra_petsc.view.server import find_run, serve
+
+    _step_back()
+
+    def tell(line: str) -> None:
+        with suppress(OSError):  # the run is gone already
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+
+    def ended() -> str:
+        sys.stdin.read()
+        return f"The run has ended, and so has this page. Look at it again with: lyra-petsc view {folder}"
+
+    try:
+        serve(find_run(folder), host=host, port=port, ready=lambda url: tell(READY + url), ended=ended)
+    except LyraError as error:
+        tell(FAILED + str(error))
+
+
+def _step_back() -> None:
+    """Leave the processors to the run: the last to get one, and not bound to that of rank 0."""
+    os.nice(19)
+    if hasattr(os, "sched_setaffinity"):
+        with suppress(OSError):
+            os.sched_setaffinity(0, range(os.cpu_count() or 1))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))

@@ -1,0 +1,189 @@
+"""The page's server: one address, one process, until it is told to end."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.agreement import reason
+from lyra_petsc.results.run import Run
+from lyra_petsc.view.access import Access
+
+LOCAL = "127.0.0.1"
+
+CLOSING_SECONDS = 1.0
+
+
+def check_address(host: str, port: int) -> None:
+    """Refuse an address that cannot be listened on, before anything else is done.
+
+    Raises
+    ------
+    InputError
+        For a port in use, a host that is not this machine, and the like.
+    """
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, address = found[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(address)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise _refusal(host, port, error) from None
+
+
+def _refusal(host: str, port: int, error: BaseException) -> InputError:
+    if isinstance(error, socket.gaierror):
+        return InputError(f"{host!r} is no address of this machine; leave it out for {LOCAL}", key="--host")
+    if isinstance(error, OSError) and error.errno is not None and "assign" in os.strerror(error.errno):
+        return InputError(f"{host} is no address of this machine; leave it out for {LOCAL}", key="--host")
+    return InputError(
+        f"{host}:{port} cannot be used: {reason(error)}; leave it out for a free port", key="--port"
+    )
+
+
+def serve(
+    run: Run,
+    *,
+    host: str,
+    port: int,
+    ready: Callable[[str], None],
+    ended: Callable[[], str] | None = None,
+) -> int:
+    """Serve the page of a run until a signal, or until what it shows is over.
+
+    Parameters
+    ----------
+    run : Run
+    host : str
+        The address to listen on.
+    port : int
+        0 for a free one.
+    ready : callable
+        Called with the page's address once it can be opened.
+    ended : callable, optional
+        Called in a thread; returns when the run that is shown has ended, with what the page then says.
+
+    Returns
+    -------
+    int
+        The signal that ended it, or 0.
+
+    Raises
+    ------
+    InputError
+        If it cannot listen there.
+    """
+    return asyncio.run(_serve(run, host, port, ready, ended))
+
+
+async def _serve(
+    run: Run, host: str, port: int, ready: Callable[[str], None], ended: Callable[[], str] | None
+) -> int:
+    os.environ["WSLINK_READY_MSG"] = ""  # or it writes to our stdout
+    from lyra_petsc.view.page import Page
+
+    token = secrets.token_urlsafe(24)
+    access = Access(token, host)
+    page = Page(run, access)
+    server = page.server
+    web: list[Any] = []
+
+    def bind(web_server: Any) -> None:
+        web.append(web_server)
+        web_server.app.middlewares.append(access.middleware())
+
+    def tell(**_: Any) -> None:
+        ready(f"http://{_in_address(host)}:{server.port}/?token={token}")
+
+    server.controller.on_server_bind.add(bind)
+    server.controller.on_server_ready.add(tell)
+    loop = asyncio.get_running_loop()
+    over: asyncio.Future[int] = loop.create_future()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, _settle, over, int(number))
+    words, sys.argv[1:] = sys.argv[1:], []  # trame reads them, too
+    try:
+        listening = asyncio.create_task(
+            server.start(
+                host=host,
+                port=port,
+                timeout=0,
+                thread=True,
+                open_browser=False,
+                show_connection_info=False,
+                disable_logging=True,
+                exec_mode="coroutine",
+            )
+        )
+    finally:
+        sys.argv[1:] = words
+    tasks = [asyncio.create_task(page.animate()), asyncio.create_task(page.follow())]
+    if ended is not None:
+        tasks.append(asyncio.create_task(_watch(ended, page, over)))
+    await asyncio.wait({listening, over}, return_when=asyncio.FIRST_COMPLETED)
+    for task in tasks:
+        task.cancel()
+    if listening.done():
+        try:
+            listening.result()
+        except OSError as error:
+            raise _refusal(host, port, error) from None
+    else:
+        await web[0].stop()
+        with suppress(asyncio.CancelledError):
+            await listening
+    return over.result() if over.done() else 0
+
+
+async def _watch(ended: Callable[[], str], page: Any, over: asyncio.Future[int]) -> None:
+    words = await asyncio.to_thread(ended)
+    await asyncio.sleep(CLOSING_SECONDS)  # for the run to write its last words
+    page.look()
+    page.close(words)
+    await asyncio.sleep(CLOSING_SECONDS)  # for them to arrive
+    _settle(over, 0)
+
+
+def _settle(over: asyncio.Future[int], number: int) -> None:
+    if not over.done():
+        over.set_result(number)
+
+
+def _in_address(host: str) -> str:
+    """A host as it stands in an address; for all of this machine's, the name others know it by."""
+    if host in ("0.0.0.0", "::", ""):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
+def open_browser(address: str) -> bool:
+    """Open the page where there is a desktop, or where BROWSER says how; whether it was tried."""
+    import webbrowser
+
+    known = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    return (known or sys.platform == "darwin") and webbrowser.open(address)
+
+
+def find_run(folder: Path) -> Run:
+    """The run in a folder.
+
+    Raises
+    ------
+    InputError
+        If what the page needs of it cannot be read.
+    """
+    run = Run(folder)
+    for needed in ("triangles", "rest", "scene", "history"):
+        getattr(run, needed)
+    run.positions[0]
+    return run
