@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -20,6 +21,10 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation, StepReport
 from lyra_petsc.solvers.options import unused
 from lyra_petsc.whole_run import Watcher, carry_out
+
+if TYPE_CHECKING:
+    from lyra_petsc.cli.view import Served
+    from lyra_petsc.view.live import LivePage
 
 
 def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str]) -> Scene:
@@ -37,8 +42,9 @@ def run(
     out: Path | None,
     force: bool,
     resume: bool,
+    served: Served | None = None,
 ) -> None:
-    """Simulate a scene; collective.
+    """Simulate a scene, with ``served`` also on a page; collective.
 
     Raises
     ------
@@ -49,6 +55,8 @@ def run(
     Interrupted
         A signal; the last step is in the checkpoint.
     """
+    if served is not None:
+        on_root(comm, lambda: served.check("--live"))
     phases = Phases()
     stop = StopRequest(comm)
     if path is None and resume and out is not None:
@@ -57,25 +65,44 @@ def run(
     stem = path.stem
     choice = choose(comm, stem, out, force=force, resume=resume)
     scene = read_scene(comm, path, settings)
-    carry_out(comm, scene, choice, Shown(comm), stop.signal_number, phases)
+    carry_out(comm, scene, choice, Shown(comm, served), stop.signal_number, phases)
 
 
 class Shown(Watcher):
-    """Shows a run on the terminal: its progress, its notes, and where the time went."""
+    """Shows a run on the terminal: its progress, its notes, and where the time went.
 
-    def __init__(self, comm: MPI.Comm) -> None:
-        self._comm = comm
+    Parameters
+    ----------
+    comm : MPI.Comm
+    served : Served, optional
+        Where it is shown in the browser as well.
+    """
+
+    def __init__(self, comm: MPI.Comm, served: Served | None = None) -> None:
+        self._comm, self._served = comm, served
         self._progress: Progress | None = None
+        self._page: LivePage | None = None
 
     def begin(self, simulation: Simulation, folder: Path) -> None:
-        """Begin the progress bar."""
-        self._progress = Progress(
+        """Begin the progress bar, and the page."""
+        self._progress = progress = Progress(
             self._comm,
             simulation.control.end,
             start=simulation.time,
             plain=_petsc_speaks(),
             unit="s" if simulation.model.system.scheme.moves else "",
         )
+        served = self._served
+        if served is not None and self._comm.rank == 0:
+            from lyra_petsc.view.live import LivePage
+
+            self._page = LivePage(
+                folder,
+                served.host,
+                served.port,
+                ready=lambda url: served.announce(url, progress.say),
+                failed=lambda why: progress.say(f"note: no page: {why}"),
+            )
 
     def note(self, text: str) -> None:
         """A line above the bar."""
@@ -92,7 +119,9 @@ class Shown(Watcher):
             )
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Leave the terminal as it was, and let the page go."""
+        if self._page is not None:
+            self._page.end()
         if self._progress is not None:
             self._progress.close()
 
@@ -100,6 +129,8 @@ class Shown(Watcher):
         """Where the time went, and options that nothing used."""
         simulation.stepper.ts.viewFromOptions("-ts_view")
         closing_table(self._comm, simulation.phases.seconds(), folder, "done")
+        if self._page is not None:
+            print(f"look again   lyra-petsc view {folder}", flush=True)
         left = unused(simulation.stepper.our_options)
         if left and self._comm.rank == 0:
             listed = ", ".join(f"-{name}" for name in left)

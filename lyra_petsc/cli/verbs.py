@@ -15,12 +15,12 @@ from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
 from lyra_petsc.cli.report import report
+from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
 
 LATER = {
     "render": "pictures and films",
-    "view": "a live page",
     "export": "other formats",
 }
 """Verbs that are announced and not there yet."""
@@ -87,14 +87,25 @@ def verbs(ctx: click.Context) -> None:
 @out
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
 @click.option("--resume", is_flag=True, help="Go on from the newest checkpoint.")
+@click.option("--live", is_flag=True, help="Show it in the browser while it goes on.")
+@where_served
 @click.pass_obj
 def run(
-    comm: Any, scene: Path | None, settings: tuple[str, ...], out: Path | None, force: bool, resume: bool
+    comm: Any,
+    /,
+    scene: Path | None,
+    settings: tuple[str, ...],
+    out: Path | None,
+    force: bool,
+    resume: bool,
+    live: bool,
+    **where: Any,
 ) -> None:
     """Simulate SCENE (default: a flag in the wind)."""
     from lyra_petsc.cli.run import run as run_scene
 
-    run_scene(comm, scene, settings, out=out, force=force, resume=resume)
+    served = Served.of_live(live, **where)
+    run_scene(comm, scene, settings, out=out, force=force, resume=resume, served=served)
 
 
 @verbs.command(context_settings=SETTINGS)
@@ -207,3 +218,4 @@ def info(comm: Any) -> None:
 
 verbs.add_command(new)
 verbs.add_command(report)
+verbs.add_command(view)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from lyra_petsc.cli.options import SETTINGS, helped, results
-from lyra_petsc.errors import Interrupted, LyraError
+from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules",
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def address(function: Function) -> Function:
-    """The options that say where the page is served."""
+def where_served(function: Function) -> Function:
+    """The options that say where the page is."""
     for option in (
         click.option("--no-browser", is_flag=True, help="Do not open the page in a browser."),
         click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Its port (a free one)."),
@@ -34,10 +35,65 @@ def address(function: Function) -> Function:
     return function
 
 
+@dataclass(frozen=True)
+class Served:
+    """Where the page is served, and whether a browser is opened."""
+
+    host: str
+    port: int
+    browse: bool
+
+    @classmethod
+    def of(cls, host: str | None, port: int | None, no_browser: bool) -> Served:
+        """From the options."""
+        return cls("127.0.0.1" if host is None else host, port or 0, not no_browser)
+
+    @classmethod
+    def of_live(cls, live: bool, host: str | None, port: int | None, no_browser: bool) -> Served | None:
+        """From the options of ``run``: None without ``--live``.
+
+        Raises
+        ------
+        InputError
+            For options that mean nothing then.
+        """
+        if live:
+            return cls.of(host, port, no_browser)
+        given = {"--host": host is not None, "--port": port is not None, "--no-browser": no_browser}
+        for name, is_given in given.items():
+            if is_given:
+                raise InputError("says where the page of --live is, which is not given", key=name)
+        return None
+
+    def check(self, what: str) -> None:
+        """Refuse what cannot be served, before anything else is done; for one rank.
+
+        Raises
+        ------
+        InputError
+            For packages that are missing, or an address that cannot be used.
+        """
+        require(what, PACKAGES, "view")
+        from lyra_petsc.view.server import check_address
+
+        check_address(self.host, self.port)
+
+    def announce(self, url: str, say: Callable[[str], Any]) -> None:
+        """Say where the page is and who can reach it, and open it."""
+        from lyra_petsc.view.access import is_loopback
+        from lyra_petsc.view.server import open_browser
+
+        say(f"view: {url}")
+        if not is_loopback(self.host):
+            say("reached from other machines, too, by whoever has this address; it is not encrypted")
+        if self.browse:
+            open_browser(url)
+
+
 @click.command(context_settings=SETTINGS)
 @helped
 @results
-@address
+@where_served
 @click.pass_obj
 def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: bool) -> None:
     """Play RUN, a folder of results, in the browser; follow it if it goes on."""
@@ -45,7 +101,7 @@ def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: b
     number = 0
     if comm.rank == 0:
         try:
-            number = _serve(run, host, port or 0, browse=not no_browser)
+            number = _serve(run, Served.of(host, port, no_browser))
         except LyraError as error:
             problem = error
     _wait_for_rank_0(comm)
@@ -63,28 +119,13 @@ def _wait_for_rank_0(comm: MPI.Comm) -> None:
         time.sleep(0.2)
 
 
-def _serve(folder: Path, host: str | None, port: int, *, browse: bool) -> int:
+def _serve(folder: Path, served: Served) -> int:
     """Serve until a signal; the signal."""
-    require("view", PACKAGES, "view")
-    from lyra_petsc.view.server import LOCAL, check_address, find_run, open_browser, serve
-
-    host = LOCAL if host is None else host
-    run = find_run(folder)
-    check_address(host, port)
+    served.check("view")
+    from lyra_petsc.view.server import find_run, serve
 
     def ready(url: str) -> None:
-        click.echo(announcement(url, host))
+        served.announce(url, click.echo)
         click.echo("Ctrl-C ends")
-        if browse:
-            open_browser(url)
 
-    return serve(run, host=host, port=port, ready=ready)
-
-
-def announcement(url: str, host: str) -> str:
-    """Where the page is, and who can reach it."""
-    from lyra_petsc.view.access import is_loopback
-
-    if is_loopback(host):
-        return f"view: {url}"
-    return f"view: {url}\nreached also from other machines, by whoever has this address; it is not encrypted"
+    return serve(find_run(folder), host=served.host, port=served.port, ready=ready)
