@@ -24,6 +24,9 @@ import sysconfig
 # what pip must never replace: builds that fit one MPI, one PETSc and one NumPy
 PINNED = ("numpy", "mpi4py", "petsc4py", "h5py", "gmsh")
 
+# packages whose modules have other names (beside a dash, which becomes an underscore)
+MODULES = {"pillow": "PIL", "usd-core": "pxr", "mkdocs-material": "material"}
+
 
 def package_folders():
     """The folders of ``sys.path`` that hold installed packages, in their order."""
@@ -91,7 +94,7 @@ def is_met(line):
         raise SystemExit(f"environment.py: only name>=version is understood, not {line!r}")
     name, least = match.groups()
     try:
-        if importlib.util.find_spec(name) is None:
+        if importlib.util.find_spec(MODULES.get(name, name.replace("-", "_"))) is None:
             return False
     except ImportError:  # the parent of a dotted name
         return False
