@@ -14,13 +14,13 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
+from lyra_petsc.cli.render import render
 from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
 
 LATER = {
-    "render": "pictures and films",
     "export": "other formats",
 }
 """Verbs that are announced and not there yet."""
@@ -217,5 +217,6 @@ def info(comm: Any) -> None:
 
 
 verbs.add_command(new)
+verbs.add_command(render)
 verbs.add_command(report)
 verbs.add_command(view)

@@ -70,13 +70,15 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: N
             for elevation in ELEVATIONS
         ]
     )
-    seen = np.zeros(len(candidates))
+    seen, facing = np.zeros(len(candidates)), np.zeros(len(candidates))
     for x in shapes:
         corners = x[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        seen += np.abs(normals @ candidates.T).sum(axis=0)
-    # of two sides that show the same, the first: seen against y where z is up
-    best = int(np.flatnonzero(seen >= seen.max() * (1.0 - 1e-9))[0])
+        areas = normals @ candidates.T
+        seen += np.abs(areas).sum(axis=0)
+        facing += areas.sum(axis=0)
+    # of two sides that show much the same, the one that shows the front
+    best = int(np.argmax(seen * (1.0 + 0.1 * np.sign(facing))))
     azimuth = 2.0 * math.pi * (best // len(ELEVATIONS)) / AZIMUTHS + math.radians(ASIDE)
     return direction(up, azimuth, math.radians(ELEVATIONS[best % len(ELEVATIONS)]))
 

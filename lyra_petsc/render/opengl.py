@@ -1,0 +1,64 @@
+"""Whether pictures can be drawn here: the optional packages, and an OpenGL that needs no display."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+from contextlib import suppress
+from typing import Any
+
+from lyra_petsc.errors import InputError
+
+REMEDY = (
+    "OpenGL cannot be started without a display; install libegl1 "
+    "(Debian, Ubuntu: apt-get install libegl1; conda: libegl), or libosmesa6"
+)
+
+
+def share_cores(ranks_here: int) -> None:
+    """Let the software renderer of this rank take its part of the cores; before anything is drawn."""
+    if ranks_here > 1:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, cores // ranks_here)))
+
+
+def import_pyvista() -> Any:
+    """The package, told to draw off-screen and to leave the terminal alone."""
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+
+    # which windows VTK tries in vain before it finds one is nothing to worry about
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    vtkObject.GlobalWarningDisplayOff()
+    pyvista.OFF_SCREEN = True
+    return pyvista
+
+
+def check_opengl() -> None:
+    """Find out whether VTK can draw here.
+
+    Raises
+    ------
+    InputError
+        Saying which library to install.
+    """
+    import_pyvista()
+    import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (it brings the windows)
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+    window = vtkRenderWindow()
+    window.SetOffScreenRendering(True)
+    # VTK takes OSMesa for granted when nothing else is there, and crashes without it
+    by_osmesa = window.GetClassName() == "vtkOSOpenGLRenderWindow"
+    if not (_has_osmesa() if by_osmesa else window.SupportsOpenGL()):
+        raise InputError(REMEDY, key="render")
+    window.Finalize()
+
+
+def _has_osmesa() -> bool:
+    for name in ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so", ctypes.util.find_library("OSMesa")):
+        with suppress(OSError):
+            if name is not None:
+                ctypes.CDLL(name)
+                return True
+    return False

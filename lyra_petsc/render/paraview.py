@@ -1,0 +1,126 @@
+"""A script that opens a run in ParaView: colours, exaggeration, camera, time."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from string import Template
+
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.render.camera import line_of_sight, upwards
+from lyra_petsc.results.run import Run
+
+SCRIPT = "open_in_paraview.py"
+LOOKED_AT = 9
+"""States from which the direction of the camera is found."""
+
+TEXT = Template('''\
+"""Opens the run beside this file in ParaView (5.11 or newer).
+
+    paraview --script=$script          the window, ready to play
+    pvbatch $script film.png           pictures film.0000.png, film.0001.png, ... without a window
+
+Or in the window: File > Load State is for .pvsm files; this one goes into View > Python Shell > Run Script.
+"""
+
+import os
+import sys
+
+from paraview.simple import *
+
+FOLDER = os.path.dirname(os.path.abspath(__file__)) if "__file__" in globals() else $folder
+COLOUR = $colour        # one of: $fields; None: one colour
+EXAGGERATION = 0.0      # 0: as it moved; 1: displacements from the rest shape drawn twice as large
+UP = $up  # in the picture
+SIGHT = $sight  # towards the camera
+
+paraview.simple._DisableFirstRenderCameraReset()
+
+# the states as a time series; their times are those of the run
+states = Xdmf3ReaderS(registrationName="states", FileName=[os.path.join(FOLDER, "states.xdmf")])
+states.UpdatePipeline(states.TimestepValues[-1])
+
+# the displacement from the rest shape, and that many times more of it
+displaced = Calculator(registrationName="displacement", Input=states)
+displaced.ResultArrayName = "displacement"
+displaced.Function = "coords - rest"
+warped = WarpByVector(registrationName="exaggerated", Input=displaced)
+warped.Vectors = ["POINTS", "displacement"]
+warped.ScaleFactor = EXAGGERATION
+
+view = GetActiveViewOrCreate("RenderView")
+shown = Show(warped, view)
+shown.Interpolation = "Gouraud"
+shown.Diffuse = 0.9
+shown.Specular = 0.15
+if COLOUR is None:
+    ColorBy(shown, None)
+    shown.DiffuseColor = [0.78, 0.25, 0.18]
+    shown.BackfaceRepresentation = "Surface"
+    shown.BackfaceDiffuseColor = [0.94, 0.89, 0.78]
+else:
+    on = "POINTS" if COLOUR in warped.PointData.keys() else "CELLS"
+    ColorBy(shown, (on, COLOUR, "Magnitude") if $vectors.get(COLOUR) else (on, COLOUR))
+    # one scale for the whole run
+    shown.RescaleTransferFunctionToDataRangeOverTime()
+    colours = GetColorTransferFunction(COLOUR)
+    colours.ApplyPreset("Viridis (matplotlib)", True)
+    bar = GetScalarBar(colours, view)
+    bar.Title = COLOUR.replace("_", " ") + $units.get(COLOUR, "")
+    bar.ComponentTitle = ""
+    shown.SetScalarBarVisibility(view, True)
+
+label = AnnotateTimeFilter(registrationName="time", Input=states)
+label.Format = "t = {time:.4g}$unit"
+Show(label, view)
+
+# one picture for each state
+scene = GetAnimationScene()
+scene.UpdateAnimationUsingDataTimeSteps()
+scene.PlayMode = "Snap To TimeSteps"
+
+view.CameraViewUp = UP
+scene.GoToLast()
+ResetCamera(view)
+view.CameraPosition = [f + s for f, s in zip(view.CameraFocalPoint, SIGHT)]
+ResetCamera(view)
+scene.GoToFirst()
+Render(view)
+
+if len(sys.argv) > 1 and sys.argv[1].endswith((".png", ".avi", ".ogv")):
+    SaveAnimation(os.path.abspath(sys.argv[1]), view, ImageResolution=[1280, 720])
+''')
+
+
+def write_script(folder: Path) -> Path:
+    """Write the script beside a run's states; its path.
+
+    Raises
+    ------
+    InputError
+        If the folder is not one of a run.
+    OutputError
+        If it cannot be written.
+    """
+    run = Run(folder)
+    scene = run.scene
+    static = scene.time.analysis == "static"
+    count = len(run.times)
+    shapes = (run.positions[i] for i in range(0, count, max(1, count // LOOKED_AT)))
+    up = upwards(scene)
+    sight = line_of_sight(scene, up, shapes, run.triangles)
+    path = run.folder / SCRIPT
+    names = run.fields
+    text = TEXT.substitute(
+        script=shlex.quote(str(path)),
+        folder=repr(str(run.folder.absolute())),
+        colour=repr("velocity" if "velocity" in names else names[0] if names else None),
+        fields=", ".join(map(repr, names)) or "none was written",
+        vectors=repr({name: True for name in names if len(run.field(name)[0].shape) > 1}),
+        units=repr({name: f" [{unit}]" for name in names if (unit := run.field_units(name)) != "1"}),
+        unit="" if static else " s",
+        up=repr([float(v) for v in up]),
+        sight=repr([round(float(v), 6) for v in sight]),
+    )
+    replace_text(path, text)
+    return path
