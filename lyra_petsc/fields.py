@@ -102,10 +102,20 @@ def chosen(model: Model) -> list[Field]:
     """
     fields = [FIELDS[name] for name in model.scene.output.fields]
     for field in fields:
-        if field.term not in model.terms:
-            raise InputError(
-                f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",
-                file=model.scene.source,
-                key="output.fields",
-            )
+        check_field(field, model)
     return fields
+
+
+def check_field(field: Field, model: Model) -> None:
+    """Refuse a field of a term that the scene does not have.
+
+    Raises
+    ------
+    InputError
+    """
+    if field.term not in model.terms:
+        raise InputError(
+            f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",
+            file=model.scene.source,
+            key="output.fields",
+        )

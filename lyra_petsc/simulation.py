@@ -96,7 +96,14 @@ class Simulation:
         self.comm, self.scene = comm, scene
         self.phases = phases or Phases()
         self._filled = fill_gaps(scene.petsc)
-        self.model: Model = build_model(comm, scene, self.phases)
+        try:
+            self._set_up(scene)
+        except BaseException:
+            self._take_back_options()
+            raise
+
+    def _set_up(self, scene: Scene) -> None:
+        self.model: Model = build_model(self.comm, scene, self.phases)
         self.notes = list(self.model.outline.notes)
         outline, system = self.model.outline, self.model.system
         with self.phases("solve"):
@@ -193,19 +200,9 @@ class Simulation:
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
-        return StepReport(
-            self.step_number,
-            self.time,
-            dt,
-            newton,
-            linear,
-            rejected,
-            attempt.residual,
-            seconds,
-            self.compression.smallest,
-            self.compression.largest,
-            attempt.increment,
-        )
+        took = newton, linear, rejected, attempt.residual, seconds
+        stretch = self.compression.smallest, self.compression.largest
+        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.increment)
 
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
@@ -340,5 +337,8 @@ class Simulation:
         """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""
         self.stepper.destroy()
         self.model.points.destroy()
+        self._take_back_options()
+
+    def _take_back_options(self) -> None:
         for name in self._filled:
             PETSc.Options().delValue(name)

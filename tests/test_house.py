@@ -37,6 +37,7 @@ LEVELS = [
     {"__main__"},
 ]
 RANK = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
+RANK[""] = len(LEVELS)  # the package itself, which names what it offers
 
 #: output knows arrays and files; of the rest of the house only the mesh as plain data and the profile
 OUTPUT_MAY_USE = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.messages import dotted, input_error
-from lyra_petsc.scene.overrides import apply_overrides, unshared
+from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain, unshared
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
 from lyra_petsc.scene.values import shown
@@ -51,15 +51,71 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
     try:
         data = unshared(data)
         overridden = apply_overrides(data, overrides)
-        scene = Scene.model_validate(data, context={"directory": path.absolute().parent})
-    except ValidationError as error:
-        raise input_error(error, data, file=path, overridden=overridden) from None
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=path) from None
-    for i, source in enumerate(scene.mesh):
-        if meshes_needed and source.file is not None:
-            _check_mesh_file(source.file, dotted(["mesh", i, "file"], data), path)
-    scene._source = path
+    return _checked(data, path, path.absolute().parent, overridden, meshes_needed=meshes_needed)
+
+
+def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> Scene:
+    """Check a scene given as nested dictionaries with the keys of a scene file.
+
+    Parameters
+    ----------
+    data : mapping
+        Mesh paths stand under the working directory.
+    changes : mapping of ``key.path`` to value, optional
+        As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
+
+    Raises
+    ------
+    InputError
+        On anything that cannot be used, naming the key.
+    """
+    return _changed(data, changes or {}, None, Path.cwd())
+
+
+def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
+    """Another scene: the first one's keys as they were given, with some changed as in `scene_of`.
+
+    Raises
+    ------
+    InputError
+        On anything that cannot be used, naming the key.
+    """
+    if scene._given is None:
+        return _changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
+    return _changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+
+
+def _changed(
+    given: Mapping[str, Any], changes: Mapping[str, Any], source: Path | None, directory: Path
+) -> Scene:
+    try:
+        data = plain(given)
+        apply_changes(data, changes)
+    except RecursionError:
+        raise InputError("is nested too deeply, or refers to itself", file=source) from None
+    return _checked(data, source, directory)
+
+
+def _checked(
+    data: dict[str, Any],
+    source: Path | None,
+    directory: Path,
+    overridden: Sequence[str] = (),
+    *,
+    meshes_needed: bool = True,
+) -> Scene:
+    try:
+        scene = Scene.model_validate(data, context={"directory": directory})
+    except ValidationError as error:
+        raise input_error(error, data, file=source, overridden=overridden) from None
+    except RecursionError:
+        raise InputError("is nested too deeply, or refers to itself", file=source) from None
+    for i, mesh in enumerate(scene.mesh):
+        if meshes_needed and mesh.file is not None:
+            _check_mesh_file(mesh.file, dotted(["mesh", i, "file"], data), source)
+    scene._source, scene._given, scene._directory = source, data, directory
     return scene
 
 
@@ -80,7 +136,7 @@ def _read(path: Path, text: str) -> Any:
     return import_original(data, path)
 
 
-def _check_mesh_file(file: Path, key: str, scene: Path) -> None:
+def _check_mesh_file(file: Path, key: str, scene: Path | None) -> None:
     try:
         if file.is_file():
             return

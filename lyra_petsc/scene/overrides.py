@@ -1,9 +1,9 @@
-"""``--set key.path=value``: single values of a scene, changed before it is checked."""
+"""Single values of a scene, changed before it is checked: ``--set key.path=value``, or from Python."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,23 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> list[str]
     return [_apply(data, text) for text in overrides]
 
 
+def apply_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """Change ``data`` in place as `apply_overrides` does, by values of Python; None removes a key."""
+    for path, value in changes.items():
+        _set(data, str(path), plain(value), one_line(str(path)))
+
+
+def plain(value: Any) -> Any:
+    """A copy made of what a scene file can hold; numpy's numbers and arrays, paths and tuples are read so."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value) if isinstance(value, Path) else value
+
+
 def unshared(value: Any) -> Any:
     """A copy in which no two places hold the same block (YAML anchors make such)."""
     if isinstance(value, dict):
@@ -49,8 +66,11 @@ def _apply(data: dict[str, Any], text: str) -> str:
     option = one_line(f"--set {text if len(text) <= 60 else text[:57] + '...'}")
     if not equals:
         raise InputError("must read key.path=value", key=option)
-    parts = _parts(path_text.strip(), option)
-    value = parse_yaml(value_text, file=None, key=option)
+    return _set(data, path_text.strip(), parse_yaml(value_text, file=None, key=option), option)
+
+
+def _set(data: dict[str, Any], path: str, value: Any, option: str) -> str:
+    parts = _parts(path, option)
     if parts[0] == "mesh":
         value = _found_here(value, parts[-1])
     first = parts[0]

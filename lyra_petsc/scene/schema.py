@@ -7,6 +7,7 @@ term is off.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -152,11 +153,27 @@ class Scene(Block):
     )
 
     _source: Path | None = PrivateAttr(default=None)
+    _given: dict[str, Any] | None = PrivateAttr(default=None)
+    _directory: Path | None = PrivateAttr(default=None)
 
     @property
     def source(self) -> Path | None:
         """The file this scene was read from, for messages; no part of its value."""
         return self._source
+
+    def changed(self, changes: Mapping[str, Any]) -> Scene:
+        """Another scene with some keys changed, as in ``{"time.end": 2.0, "handles[0].until": 1.0}``.
+
+        None removes a key. The other keys stand as they were given: defaults follow the changes.
+
+        Raises
+        ------
+        InputError
+            On anything that cannot be used, naming the key.
+        """
+        from lyra_petsc.scene.load import change_scene
+
+        return change_scene(self, changes)
 
     def __eq__(self, other: object) -> bool:
         # equal in value: which file it came from does not count

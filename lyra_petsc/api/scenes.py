@@ -1,0 +1,39 @@
+"""Scenes from files, or from dictionaries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.load import load_scene, scene_of
+from lyra_petsc.scene.schema import Scene
+
+SceneLike: TypeAlias = Scene | str | Path | Mapping[str, Any]
+
+
+def load(source: SceneLike | None = None, changes: Mapping[str, Any] | None = None) -> Scene:
+    """A checked scene.
+
+    Parameters
+    ----------
+    source : path, mapping or Scene, optional
+        A scene file, or its keys as nested dictionaries; without it the default scene, a flag.
+    changes : mapping of ``key.path`` to value, optional
+        As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
+
+    Returns
+    -------
+    Scene
+        Its attributes have the names of the scene file's keys; ``scene.changed({…})`` makes another.
+
+    Raises
+    ------
+    InputError
+        On anything that cannot be used, naming file and key.
+    """
+    if isinstance(source, Mapping):
+        return scene_of(source, changes)
+    scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
+    return scene.changed(changes) if changes else scene

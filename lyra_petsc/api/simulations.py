@@ -1,0 +1,267 @@
+"""A scene that is stepped through in a loop."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.api.scenes import SceneLike, load
+from lyra_petsc.errors import InputError
+from lyra_petsc.fields import FIELDS, check_field
+from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.nearest import nearest
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.simulation import Simulation as Stepping
+
+Array = NDArray[np.float64]
+
+_OPEN: weakref.WeakSet[Simulation] = weakref.WeakSet()
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted step, and the state after it.
+
+    Attributes
+    ----------
+    number : int
+        Accepted steps so far.
+    time, dt : float
+        End and length of the step [s]; of the load factor in a static analysis.
+    positions, velocities : (n, 3) float64
+        [m], [m/s], of this rank's vertices, ``Simulation.vertices``.
+    energies : dict of str to float
+        [J]; see ``Simulation.energies``.
+    newton_iterations, linear_iterations, rejected : int
+        What it took, rejected attempts included.
+    residual : float
+        Norm of the force residual [N] that was left.
+    wall_seconds : float
+    """
+
+    number: int
+    time: float
+    dt: float
+    positions: Array
+    velocities: Array
+    energies: dict[str, float]
+    newton_iterations: int
+    linear_iterations: int
+    rejected: int
+    residual: float
+    wall_seconds: float
+
+
+class Simulation:
+    """A scene in memory, stepped through by iteration; writes no files. Every method is collective.
+
+    ::
+
+        with lyra_petsc.Simulation("flag.yaml") as flag:
+            for step in flag:
+                print(step.time, step.energies["kinetic"])
+
+    Under mpirun every rank has the vertices it owns; in one process that is all of them, in the
+    order of the mesh file only after ``gather``.
+
+    Parameters
+    ----------
+    scene : Scene, path or mapping
+    comm : MPI.Comm, optional
+        COMM_WORLD unless given.
+
+    Attributes
+    ----------
+    scene : Scene
+    mesh : Mesh or None
+        The whole mesh in file order, on rank 0: ``positions`` at the start, ``rest``, ``triangles``,
+        ``groups``.
+    vertices : (n,) int64
+        Number in the mesh file of each of this rank's vertices.
+    triangles : (m,) int64
+        Number in the mesh file of each of this rank's triangles.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the scene cannot be simulated.
+    """
+
+    def __init__(self, scene: SceneLike, comm: MPI.Comm | None = None) -> None:
+        self.comm: MPI.Comm = MPI.COMM_WORLD if comm is None else comm
+        loaded = on_root(self.comm, lambda: load(scene))
+        assert loaded is not None
+        self.scene: Scene = loaded
+        _refuse_mixed_options(loaded)
+        with np.errstate(over="ignore", invalid="ignore"):
+            stepping = Stepping(self.comm, loaded)
+        self._stepping: Stepping | None = stepping
+        model = stepping.model
+        self.mesh: Mesh | None = model.mesh
+        self.vertices: NDArray[np.int64] = model.points.original
+        elements = model.membrane.elements
+        self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned]
+        _OPEN.add(self)
+
+    # -- stepping ------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Iterator[Step]:
+        """The steps from here to the end of the scene."""
+        while not self.finished:
+            yield self.step()
+
+    def step(self) -> Step:
+        """One step, repeated with a smaller Δt where it fails.
+
+        Raises
+        ------
+        SolverError
+            If even the smallest Δt fails; the state is that before the step.
+        """
+        # a number that overflows makes a step fail, which is told in words
+        with np.errstate(over="ignore", invalid="ignore"):
+            report = self._running.step()
+        return Step(
+            report.step,
+            report.time,
+            report.dt,
+            self.positions,
+            self.velocities,
+            self.energies,
+            report.newton_iterations,
+            report.linear_iterations,
+            report.rejected,
+            report.residual,
+            report.wall_seconds,
+        )
+
+    @property
+    def finished(self) -> bool:
+        """Whether the end of the scene is reached."""
+        return self._running.finished
+
+    @property
+    def time(self) -> float:
+        """[s], or the load factor of a static analysis."""
+        return self._running.time
+
+    @property
+    def step_number(self) -> int:
+        """Accepted steps so far."""
+        return self._running.step_number
+
+    # -- state ---------------------------------------------------------------------------------------
+
+    @property
+    def positions(self) -> Array:
+        """(n, 3) current positions [m] of this rank's vertices, a copy."""
+        return self._owned(self._running.model.system.x)
+
+    @property
+    def velocities(self) -> Array:
+        """(n, 3) current velocities [m/s] of this rank's vertices, a copy."""
+        return np.array(self._running.model.system.written_velocity())
+
+    def _owned(self, rows: Array) -> Array:
+        return rows[: len(self.vertices)].copy()
+
+    def field(self, name: str) -> Array:
+        """A field that ``output.fields`` of a scene may name, on this rank's vertices or triangles.
+
+        Raises
+        ------
+        InputError
+            If there is none of that name, or its term is not in the scene.
+        """
+        if name not in FIELDS:
+            raise InputError(f"unknown field {name!r}, {nearest(name, FIELDS)}", key="field")
+        model = self._running.model
+        check_field(FIELDS[name], model)
+        return np.array(FIELDS[name].compute(model))
+
+    @property
+    def energies(self) -> dict[str, float]:
+        """Of the whole sheet [J]: kinetic, membrane, bending, potential; and the cumulative works
+        external_work (handles and loads other than gravity) and dissipation (material damping).
+        """
+        return asdict(self._running.budget)
+
+    @property
+    def notes(self) -> list[str]:
+        """What one should know: mesh repairs, a linear solver that was changed, …"""
+        return list(self._running.notes)
+
+    def gather(self, rows: NDArray[Any]) -> NDArray[Any] | None:
+        """Rows of the ranks' vertices, or triangles, in the order of the mesh file: on rank 0, else None.
+
+        Parameters
+        ----------
+        rows : (n, ...) or (m, ...) array
+            A row for each of this rank's ``vertices`` or ``triangles``, as in ``sim.positions``.
+        """
+        on_vertices = len(rows) == len(self.vertices)
+        numbers = self.vertices if self.comm.allreduce(on_vertices, MPI.LAND) else self.triangles
+        if not self.comm.allreduce(len(rows) == len(numbers), MPI.LAND):
+            raise ValueError(
+                f"{len(rows)} rows for {len(self.vertices)} vertices, {len(self.triangles)} triangles"
+            )
+        pieces = self.comm.gather((numbers, rows), root=0)
+        if pieces is None:
+            return None
+        order = np.concatenate([piece[0] for piece in pieces])
+        stacked = np.concatenate([piece[1] for piece in pieces])
+        whole: NDArray[Any] = np.empty_like(stacked)
+        whole[order] = stacked
+        return whole
+
+    # -- end -----------------------------------------------------------------------------------------
+
+    @property
+    def _running(self) -> Stepping:
+        if self._stepping is None:
+            raise ValueError("this simulation is closed")
+        return self._stepping
+
+    def close(self) -> None:
+        """Free what PETSc and MPI hold, and take back the scene's PETSc options; collective."""
+        if self._stepping is not None:
+            self._stepping.destroy()
+            self._stepping = None
+        _OPEN.discard(self)
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None or self.comm.size == 1:  # else the others may not come here
+            self.close()
+
+    def __del__(self) -> None:
+        # of several ranks nobody knows whether all let go at the same time
+        if getattr(self, "_stepping", None) is not None and self.comm.size == 1 and not MPI.Is_finalized():
+            self.close()
+
+
+def _refuse_mixed_options(scene: Scene) -> None:
+    """PETSc has one set of options: two simulations at a time cannot have different ones.
+
+    Raises
+    ------
+    InputError
+    """
+    if any(other.scene.petsc != scene.petsc for other in _OPEN):
+        raise InputError(
+            "another Simulation that is open has other PETSc options; close() it first",
+            file=scene.source,
+            key="petsc",
+        )
