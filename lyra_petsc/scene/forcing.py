@@ -130,7 +130,7 @@ class Handle(Selector):
     interpolation : str
         Of the motion in time, between keyframes.
     start, until : float [s]
-        Held for start ≤ t ≤ until (without: to the end); the key of ``start`` is ``from``.
+        Held for from ≤ t ≤ until (without: to the end).
     fade : float [s]
         After ``until`` the hold fades as (1 − (t − until)/fade)⁴.
     stiffness : float [N/m] or None
@@ -208,7 +208,7 @@ class Load(_Vertices):
     traction : (3,) [N/m²] or None
         Per rest area, direction fixed in space.
     start, until : float [s]
-        Acts for start ≤ t ≤ until; the key of ``start`` is ``from``.
+        Acts for from ≤ t ≤ until (without: to the end).
     """
 
     rules = (
