@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 MARGIN = 0.86
 """Part of the picture's height and width that the motion fills."""
+BAR = 0.12
+"""Part of its height that is left free for a bar of colours."""
 
 ELEVATIONS = (15.0, 35.0)
 AZIMUTHS = 24
@@ -33,12 +35,15 @@ class View:
     up : (3,)
     angle : float
         Height of the field of view [degrees].
+    raised : float
+        How far the target stands above the middle of the picture, over half its height.
     """
 
     position: Array
     target: Array
     up: Array
     angle: float
+    raised: float = 0.0
 
 
 def upwards(scene: Scene) -> Array:
@@ -111,16 +116,20 @@ class Fit:
     up : (3,)
     aspect : float
         Width of the picture over its height.
+    bar : bool
+        Leave room for a bar of colours below.
     """
 
-    def __init__(self, scene: Scene, sight: Array, up: Array, aspect: float) -> None:
+    def __init__(self, scene: Scene, sight: Array, up: Array, aspect: float, *, bar: bool = False) -> None:
         self._camera = _camera(scene)
         # seen from straight above, what lies behind is up in the picture
         self._up = -horizon(up)[1] if parallel(tuple(sight), tuple(up)) else up
         self._sight = sight
         self._right = _unit(np.cross(self._up, sight))
         self._upper = np.cross(sight, self._right)
-        self._slope = MARGIN * math.tan(math.radians(self._camera.angle) / 2.0) * np.array([aspect, 1.0])
+        self._raised = BAR if bar else 0.0
+        half = math.tan(math.radians(self._camera.angle) / 2.0)
+        self._slope = half * np.array([MARGIN * aspect, MARGIN - self._raised])
         sides = [
             sign * axis + slope * sight
             for axis, slope in zip((self._right, self._upper), self._slope, strict=True)
@@ -146,7 +155,7 @@ class Fit:
         centre = across[0] * self._right + across[1] * self._upper
         distance = (away - middle) / (camera.zoom or 1.0)
         target = centre + middle * self._sight
-        return View(target + distance * self._sight, target, self._up, camera.angle)
+        return View(target + distance * self._sight, target, self._up, camera.angle, self._raised)
 
 
 def _camera(scene: Scene) -> Camera:

@@ -60,7 +60,7 @@ def draw(comm: MPI.Comm, asked: Asked, plan: Plan, tell: Callable[[int, int], No
     shown = _together(comm, lambda: quantity(plan.run, asked.field) if asked.field else None)
     sight = _together(comm, lambda: _line_of_sight(plan))
     normals = Bounds.axes_of(upwards(plan.scene))
-    fit = Fit(plan.scene, sight, normals[2], plan.size[0] / plan.size[1])
+    fit = Fit(plan.scene, sight, normals[2], plan.size[0] / plan.size[1], bar=shown is not None)
     around = np.concatenate([fit.normals, normals, -normals])
     mine = states[comm.rank :: comm.size]
     part = _together(comm, lambda: survey(plan.run, mine, around, shown if plan.limits is None else None))

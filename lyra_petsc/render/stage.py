@@ -20,7 +20,7 @@ from lyra_petsc.render.window import image_of
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-SKY, HORIZON = "#e3e9ef", "#fbfbfa"
+SKY, HORIZON = "#d9e2ec", "#ecebe8"
 INK = "#2b2f36"
 HANDLE_COLOR, WIND_COLOR = "#30343b", "#6d8fae"
 MAP, SIGNED_MAP = "viridis", "coolwarm"
@@ -93,6 +93,7 @@ class Stage:
         plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
         plotter.camera.position, plotter.camera.focal_point = tuple(view.position), tuple(view.target)
         plotter.camera.up, plotter.camera.view_angle = tuple(view.up), view.angle
+        plotter.camera.SetWindowCenter(0.0, -view.raised)
         self._scale = look.size[1] / 720.0
         key = self._add_lights(view)
         points = np.zeros((len(self._surface.source), 3))
@@ -105,6 +106,7 @@ class Stage:
         if look.held is not None:
             self._handles = pyvista.PolyData(np.zeros((1, 3)))
             self._rods = pyvista.PolyData(np.zeros((1, 3)))
+            self._rods.verts = np.zeros(0, dtype=np.int64)
             width = 5.0 * self._scale
             plotter.add_mesh(
                 self._handles,
@@ -202,7 +204,9 @@ class Stage:
         elif look.texture is not None and look.corner_uv is not None:
             self._sheet.active_texture_coordinates = self._surface.uv
             texture = self._pyvista.Texture(look.texture)
-            texture.repeat = texture.interpolate = True
+            texture.interpolate = True
+            # repeated, its left edge would shine through on the right
+            texture.repeat = bool(look.corner_uv.min() < 0.0 or look.corner_uv.max() > 1.0)
             self._plotter.add_mesh(self._sheet, texture=texture, color="white", **common)
         else:
             front, back = look.colors
@@ -211,42 +215,42 @@ class Stage:
             )
 
     def _add_bar(self, quantity: Quantity) -> None:
+        left, width, top = 0.64, 0.32, 0.125
+        title = self._plotter.add_text(
+            quantity.label, position=(left, top), viewport=True, font_size=1, color=INK
+        )
+        title.prop.font_size = round(20 * self._scale)
         self._plotter.add_scalar_bar(
-            title=quantity.label,
+            title="",
             vertical=False,
-            width=0.36,
-            height=0.11,
-            position_x=0.62,
-            position_y=0.02,
+            width=width,
+            height=0.07,
+            position_x=left,
+            position_y=0.04,
             n_labels=5,
             fmt="%.3g",
             color=INK,
             font_family="arial",
-            title_font_size=round(20 * self._scale),
             label_font_size=round(16 * self._scale),
         )
 
     def _add_lights(self, view: View) -> Array:
-        """Three lights about the camera; the direction of the main one."""
+        """The lights about the camera; the direction of the main one."""
         sight = view.position - view.target
         up = self._bounds.axes[2]
         level = sight - (sight @ up) * up
         front = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-6 else self._bounds.axes[1]
         right = np.cross(up, front)
-        key = _towards(front, right, up, azimuth=-42.0, elevation=48.0)
+        key = _towards(front, right, up, azimuth=-40.0, elevation=55.0)
         lights = [
-            (key, 0.85),
-            (_towards(front, right, up, azimuth=55.0, elevation=20.0), 0.38),
-            (_towards(front, right, up, azimuth=-10.0, elevation=5.0), 0.28),
+            (key, 0.9),
+            (_towards(front, right, up, azimuth=55.0, elevation=20.0), 0.3),
+            (_towards(front, right, up, azimuth=-10.0, elevation=10.0), 0.2),
+            (_towards(front, right, up, azimuth=10.0, elevation=-50.0), 0.22),  # from the floor
         ]
         for towards, intensity in lights:
             self._plotter.add_light(
-                self._pyvista.Light(
-                    position=tuple(towards),
-                    focal_point=(0, 0, 0),
-                    intensity=intensity,
-                    light_type="scene light",
-                )
+                self._pyvista.Light(position=tuple(towards), focal_point=(0, 0, 0), intensity=intensity)
             )
         return key
 
