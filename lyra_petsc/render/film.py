@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+import subprocess
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,23 +64,25 @@ class Film:
         self._path, self._size, self._fps = path, size, fps
         # ffmpeg goes by the ending
         self._part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
-        self._frames: Generator[Any, Any, None] | None = None
+        self._ffmpeg: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Film:
         import imageio_ffmpeg
 
         codec, pixels, options = FORMATS[self._path.suffix.lower()]
-        self._frames = imageio_ffmpeg.write_frames(
-            str(self._part),
-            self._size,
-            fps=self._fps,
-            codec=codec,
-            pix_fmt_out=pixels,
-            macro_block_size=1,
-            ffmpeg_log_level="error",
-            output_params=options,
-        )
-        self._do(lambda: self._frames.send(None))
+        width, height = self._size
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+        command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{self._fps:g}"]
+        command += ["-i", "-", "-an", "-c:v", codec, "-pix_fmt", pixels, *options, f"file:{self._part}"]
+        self._words = tempfile.TemporaryFile()
+        try:
+            # in a session of its own: Ctrl-C is for us, who then end it
+            self._ffmpeg = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stderr=self._words, start_new_session=True
+            )
+        except OSError as error:
+            self._words.close()
+            raise OutputError(f"{self._path}: ffmpeg cannot be started: {reason(error)}") from error
         return self
 
     def add(self, image: NDArray[np.uint8]) -> None:
@@ -90,29 +93,37 @@ class Film:
         OutputError
             If it cannot be written.
         """
-        frame = np.ascontiguousarray(image)
-        self._do(lambda: self._frames.send(frame))  # type: ignore[union-attr]
+        assert self._ffmpeg is not None
+        assert self._ffmpeg.stdin is not None
+        try:
+            self._ffmpeg.stdin.write(np.ascontiguousarray(image).data)
+        except OSError:
+            self._ffmpeg.wait()
+            raise self._failure() from None
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._ffmpeg is None:
+            return
         try:
-            self._do(self._frames.close)  # type: ignore[union-attr]
+            if kind is not None:
+                self._ffmpeg.kill()
+            with suppress(BrokenPipeError):
+                self._ffmpeg.communicate()
             if kind is None:
-                if not self._part.exists() or self._part.stat().st_size == 0:
-                    raise OutputError(f"{self._path}: ffmpeg wrote nothing (disk full?)")
+                if self._ffmpeg.returncode != 0:
+                    raise self._failure()
                 os.replace(self._part, self._path)
+        except OSError as problem:
+            raise OutputError(f"{self._path}: cannot be written: {reason(problem)}") from problem
         finally:
+            self._words.close()
             self._part.unlink(missing_ok=True)
 
-    def _do(self, work: Any) -> None:
-        try:
-            work()
-        except (OSError, RuntimeError, StopIteration) as error:
-            why = reason(error) if isinstance(error, OSError) and error.errno else _last_line(error)
-            raise OutputError(f"{self._path}: cannot be written: {why}") from error
-
-
-def _last_line(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else "ffmpeg stopped"
+    def _failure(self) -> OutputError:
+        self._words.seek(0)
+        said = self._words.read().decode(errors="replace").splitlines()
+        # the cause stands behind the last colon of the first line
+        why = said[0].rpartition(": ")[2] if said else "ffmpeg stopped without a word"
+        return OutputError(f"{self._path}: cannot be written: {why}")
