@@ -16,6 +16,8 @@ packages=(python3-petsc4py-real python3-petsc4py python3-mpi4py python3-h5py pyt
     python3-gmsh python3-numpy python3-venv openmpi-bin)
 # not needed, but factorisations take less than half the time with an optimised BLAS
 faster=(libopenblas0-serial)
+# OpenGL without a display, for the extra "view"
+pictures=(libegl1)
 manual="see \"Other ways to install\" in README.md"
 
 say() { printf 'set-up: %s\n' "$*" >&2; }
@@ -74,6 +76,8 @@ check_versions() {
 # --- the distribution's packages -----------------------------------------------------------------
 
 is_installed() { [[ $(dpkg-query -W -f '${db:Status-Status}' "$1" 2>/dev/null) == installed ]]; }
+
+has_egl() { PATH=$PATH:/usr/sbin:/sbin ldconfig -p 2>/dev/null | grep 'libEGL\.so\.1' >/dev/null; }
 
 apt() { "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 "$@"; }
 
@@ -212,6 +216,9 @@ set_up() {
     check_versions
     if [[ $owner == distribution ]] && ! { [[ -x /usr/bin/mpirun ]] && is_up_to_date run; }; then
         install_packages "${packages[@]}"
+    fi
+    if [[ $owner == distribution && " $* " == *" view "* ]] && ! has_egl; then
+        install_packages "${pictures[@]}"
     fi
     if [[ $owner == environment && -z $("$base" -B "$helper" missing "$root/pyproject.toml" stack "$@") ]]; then
         python=("$base") # the environment in use has everything
