@@ -30,7 +30,7 @@ LEVELS = [
     {"recorder"},
     {"results", "whole_run"},
     {"api"},
-    {"exact", "render", "report"},
+    {"exact", "export", "render", "report"},
     {"study", "verification"},
     {"stress", "view"},
     {"cli"},

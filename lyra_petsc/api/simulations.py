@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from mpi4py import MPI
@@ -199,20 +199,19 @@ class Simulation:
         """What one should know: mesh repairs, a linear solver that was changed, …"""
         return list(self._running.notes)
 
-    def gather(self, rows: NDArray[Any]) -> NDArray[Any] | None:
+    def gather(self, rows: NDArray[Any], on: Literal["vertex", "triangle"] = "vertex") -> NDArray[Any] | None:
         """Rows of the ranks' vertices, or triangles, in the order of the mesh file: on rank 0, else None.
 
         Parameters
         ----------
         rows : (n, ...) or (m, ...) array
-            A row for each of this rank's ``vertices`` or ``triangles``, as in ``sim.positions``.
+            A row for each of this rank's ``vertices``, as in ``positions``, or ``triangles``.
+        on : str
+            Which of these.
         """
-        on_vertices = len(rows) == len(self.vertices)
-        numbers = self.vertices if self.comm.allreduce(on_vertices, MPI.LAND) else self.triangles
+        numbers = self.vertices if on == "vertex" else self.triangles
         if not self.comm.allreduce(len(rows) == len(numbers), MPI.LAND):
-            raise ValueError(
-                f"{len(rows)} rows for {len(self.vertices)} vertices, {len(self.triangles)} triangles"
-            )
+            raise ValueError(f"a rank has {len(rows)} rows, not one for each {on} of its own")
         pieces = self.comm.gather((numbers, rows), root=0)
         if pieces is None:
             return None

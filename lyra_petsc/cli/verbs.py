@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from lyra_petsc import __version__
+from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
 from lyra_petsc.cli.render import render
@@ -19,11 +20,6 @@ from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError
 from lyra_petsc.nearest import nearest
-
-LATER = {
-    "export": "other formats",
-}
-"""Verbs that are announced and not there yet."""
 
 
 class _Verbs(click.Group):
@@ -35,10 +31,6 @@ class _Verbs(click.Group):
         name = args[0]
         if ctx.resilient_parsing:  # shell completion
             return super().resolve_command(ctx, args)
-        if name in LATER:
-            raise InputError(
-                f"'{name}' ({LATER[name]}) is not there yet; there are: {_listing(self)}", key=name
-            )
         if self.get_command(ctx, name) is None:
             hint = (
                 "give a verb first, as in: run " + name
@@ -47,10 +39,6 @@ class _Verbs(click.Group):
             )
             raise InputError(f"unknown verb, {hint}", key=name)
         return super().resolve_command(ctx, args)
-
-
-def _listing(group: click.Group) -> str:
-    return ", ".join(sorted(group.commands))
 
 
 def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
@@ -216,6 +204,7 @@ def info(comm: Any) -> None:
         click.echo(text)
 
 
+verbs.add_command(export)
 verbs.add_command(new)
 verbs.add_command(render)
 verbs.add_command(report)

@@ -30,11 +30,14 @@ class State:
         Where the positions are.
     fields : mapping of str to tuple of str
         Where what else the state holds is.
+    on : mapping of str to str
+        ``vertex`` or ``triangle``: what the rows of each field belong to.
     """
 
     time: float
     position: Place
     fields: Mapping[str, Place]
+    on: Mapping[str, str]
 
 
 def announced_states(folder: Path) -> list[State]:
@@ -74,8 +77,13 @@ def _state(grid: Element) -> State:
     time, geometry = grid.find("Time"), grid.find("Geometry")
     if time is None or geometry is None:
         raise ValueError
-    fields = {a.attrib["Name"]: _place(a) for a in grid.iterfind("Attribute") if a.get("Name") != "rest"}
-    return State(float(time.attrib["Value"]), _place(geometry), fields)
+    fields = {a.attrib["Name"]: a for a in grid.iterfind("Attribute") if a.get("Name") != "rest"}
+    return State(
+        float(time.attrib["Value"]),
+        _place(geometry),
+        {name: _place(field) for name, field in fields.items()},
+        {name: "triangle" if field.get("Center") == "Cell" else "vertex" for name, field in fields.items()},
+    )
 
 
 def _place(element: Element) -> Place:

@@ -164,6 +164,10 @@ class Run:
 
         return "m" if name == "position" else FIELD_UNITS[name]
 
+    def field_on(self, name: str) -> str:
+        """``vertex`` or ``triangle``: what the rows of a field belong to, in the order of the mesh file."""
+        return self._states[0].on[name]
+
     def at(self, time: float) -> int:
         """Number of the state nearest to a time [s]."""
         return int(np.abs(self.times - time).argmin())

@@ -57,7 +57,7 @@ def test_a_loop_over_the_steps_gives_what_a_run_writes(shared_tmp, comm):
         assert simulation.finished
         position = simulation.gather(simulation.positions)
         velocity = simulation.gather(steps[-1].velocities)
-        stress = simulation.gather(simulation.field("stress"))
+        stress = simulation.gather(simulation.field("stress"), on="triangle")
         mesh, vertices = simulation.mesh, simulation.vertices
         owned = simulation.positions
     with pytest.raises(ValueError, match="closed"):

@@ -82,7 +82,7 @@ def test_a_mistake_is_one_line(folder: Path, name: str, ranks: int) -> None:
     [
         (["runn", "scene.yaml"], "runn: unknown verb, did you mean 'run'"),
         (["scene.yaml"], "give a verb first, as in: run scene.yaml"),
-        (["render", "scene.yaml"], "is not there yet; there are: check, info, run, stress, study, verify"),
+        (["export", "nowhere", "--to", "obj"], "nowhere: no such folder"),
         (["run", "none.yaml"], "none.yaml"),
         (["run", "used"], "used"),
         (["check", "noise.msh"], "noise.msh"),

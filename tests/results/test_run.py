@@ -23,6 +23,8 @@ def test_states_are_read_as_they_were_written(tmp_path):
     assert run.fields == ("velocity", "stress")
     np.testing.assert_array_equal(run.velocities[1], velocity(1))
     np.testing.assert_array_equal(run.field("stress")[2], stress(2))
+    assert len(REST) == len(TRIANGLES)  # the number of rows does not tell
+    assert (run.field_on("velocity"), run.field_on("stress")) == ("vertex", "triangle")
     assert run.name == "run"
 
 
