@@ -1,0 +1,267 @@
+"""Writes docs/reference/ from the program itself: keys of a scene, PETSc options, commands.
+
+``python scripts/docs/reference.py`` after a change of these; tests/docs/test_reference.py says when.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import typing
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+from pydantic_core import PydanticUndefined
+
+from lyra_petsc.cli.verbs import verbs
+from lyra_petsc.materials.tables import ClothTable, entries, names
+from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.control import FIELDS
+from lyra_petsc.scene.describe import attributes, summary
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.solvers.options import Value
+from lyra_petsc.solvers.presets import DIRECT_UNTIL, ILU_FROM, ILU_UNTIL, PRESETS
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "docs" / "reference"
+MADE = "<!-- made by scripts/docs/reference.py; change the program, not this page -->"
+
+OPTIONS = {
+    "ts_dt": "Δt [s] instead of `time.step`; with `step: auto` the first step.",
+    "ts_max_time": "End [s] instead of `time.end`.",
+    "ts_max_steps": "Steps after which the run ends.",
+    "ts_adapt_dt_min": "Smallest Δt [s], of steps of automatic length and of repeated ones.",
+    "ts_adapt_dt_max": "Largest Δt [s] of steps of automatic length.",
+    "ts_alpha_radius": "Spectral radius of `alpha2` instead of `time.spectral_radius`.",
+    "ts_type": "Refused: choose `time.integrator`.",
+    "ts_adapt_type": "Refused but for `none`: the steps are controlled by `time.tolerance`.",
+    "ts_theta_endpoint": "Refused: it has no meaning for the reduced form.",
+    "ts_theta_theta": "Refused: it has no meaning for the reduced form.",
+    "snes_max_it": "Newton iterations of a step instead of `solver.max_iterations`.",
+    "snes_rtol": "Relative residual at which a step stops, where given, before `solver` says so.",
+    "snes_atol": "Residual [N] at which a step stops, likewise.",
+    "snes_stol": "Relative increment at which a step stops, likewise.",
+    "ksp_rtol": "Relative tolerance of linear solves; without it 1e-2, and down to 1e-6 where Newton is "
+    "slow; "
+    "`semi-implicit`: 1e-6.",
+    "ksp_max_it": "Iterations of a linear solve (5000).",
+    "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
+    "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
+    "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
+    "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
+    "mat_type": "Storage of the matrix: `aij`, `baij`, `sbaij`; by default as the preconditioner needs.",
+    "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
+    "without any of "
+    "these `average`.",
+}
+"""What the program does with options that it reads, sets defaults for, or refuses."""
+
+_READ = re.compile(
+    r"(?:is_set|petsc_number|hasName|getString|getReal|getInt|getBool)\(\s*\"(\w+)\"|\"(ts_theta_\w+)\""
+)
+
+_PLAIN = {
+    "str": "text",
+    "float": "number",
+    "int": "whole number",
+    "bool": "true or false",
+    "dict": "by name:",
+    "(3,)": "three numbers",
+    "Path": "path",
+    "tuple": "list",
+}
+"""Python's words for values in those of a scene's author."""
+
+_DEFAULTS = {
+    ("Time", "end"): "required; static: 1",
+    ("Time", "step"): "required; static: 0.25",
+    ("Time", "integrator"): "beuler",
+    ("Time", "tolerance"): "1e-3",
+    ("Time", "spectral_radius"): "0.5",
+    ("Handle", "until"): "end",
+    ("Load", "until"): "end",
+}
+"""Defaults that depend on other keys."""
+
+
+def options_read() -> set[str]:
+    """Names of the PETSc options that the program itself asks for."""
+    found = set()
+    for path in (ROOT / "lyra_petsc").rglob("*.py"):
+        for match in _READ.finditer(path.read_text(encoding="utf-8")):
+            found.add(match[1] or match[2])
+    return found
+
+
+# -- scene -------------------------------------------------------------------------------------------
+
+
+def scene_page() -> str:
+    """Every key of a scene."""
+    parts = [
+        "# Keys of a scene",
+        MADE,
+        "SI units. A key that is left out has its default, or its term is off; an empty key counts as "
+        "left out. "
+        "Unknown keys are refused. `lyra-petsc check --schema` prints the same for editors "
+        "([how](../howto/editor.md)), `--set KEY.PATH=VALUE` changes a key for one run.",
+        *(_block_section(block, where) for block, where in _blocks()),
+        "## Names of `material.cloth`",
+        "Cloths, most of them measured by Wang, O'Brien and Ramamoorthi (2011): "
+        + _listed(name for name in names() if isinstance(entries()[name], ClothTable))
+        + ".\n\nEngineering materials: "
+        + _listed(name for name in names() if not isinstance(entries()[name], ClothTable))
+        + ".\n\nTheir numbers are in `lyra_petsc/materials/`.",
+        "## Names of `output.fields`",
+        _listed(FIELDS) + ".",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _listed(words: Iterable[str]) -> str:
+    return ", ".join(f"`{word}`" for word in words)
+
+
+def _blocks() -> Iterator[tuple[type[Block], list[str]]]:
+    """The blocks of a scene in the order of their first use, and the keys under which they stand."""
+    places: dict[type[Block], list[str]] = {Scene: []}
+    waiting = [Scene]
+    while waiting:
+        block = waiting.pop(0)
+        for name, field in block.model_fields.items():
+            for inner in _blocks_in(field.annotation):
+                above = places[block][:1]
+                path = ".".join([*above, field.alias or name])
+                if inner not in places:
+                    waiting.append(inner)
+                places.setdefault(inner, []).append(path)
+    yield from places.items()
+
+
+def _blocks_in(annotation: Any) -> list[type[Block]]:
+    if isinstance(annotation, type) and issubclass(annotation, Block):
+        return [annotation]
+    return [block for part in typing.get_args(annotation) for block in _blocks_in(part)]
+
+
+def _block_section(block: type[Block], where: list[str]) -> str:
+    title = "The scene" if block is Scene else ", ".join(f"`{path}`" for path in where)
+    said = attributes(block)
+    rows = ["| key | value | default | |", "| --- | --- | --- | --- |"]
+    for name, field in block.model_fields.items():
+        entry = said[name]
+        default = _DEFAULTS.get((block.__name__, name)) or _default(field)
+        cells = [f"`{field.alias or name}`", _kind(entry.kind, field.annotation), default, entry.text]
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    words = "" if block is Scene else f"{summary(block)}{_further(block)}\n\n"
+    return f"## {title}\n\n{words}" + "\n".join(rows)
+
+
+def _further(block: type[Block]) -> str:
+    """What a docstring says between its first paragraph and its list."""
+    paragraphs = (block.__doc__ or "").split("\n\n")[1:]
+    more = [" ".join(p.split()) for p in paragraphs if "Attributes\n" not in p and p.strip()]
+    return " " + more[0] if more else ""
+
+
+def _kind(kind: str, annotation: Any) -> str:
+    text, bracket, unit = kind.removesuffix(" or None").partition(" [")
+    words = [value for value in _literals(annotation) if value != "auto"]
+    if words and text == "str":
+        return "one of " + ", ".join(f"`{word}`" for word in words)
+    blocks = {block.__name__ for block in _blocks_in(annotation)}
+    plain = [_PLAIN.get(word, "block" if word in blocks else word) for word in text.split(" ")]
+    return (
+        " ".join(plain).replace("by name: of", "by name:").replace("of block", "of blocks") + bracket + unit
+    )
+
+
+def _literals(annotation: Any) -> list[str]:
+    if typing.get_origin(annotation) is typing.Literal:
+        return list(typing.get_args(annotation))
+    return [word for part in typing.get_args(annotation) for word in _literals(part)]
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    if value in (None, PydanticUndefined, math.inf, "", [], {}) or isinstance(value, Block):
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f"{entry:g}" if isinstance(entry, float) else entry for entry in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# -- PETSc -------------------------------------------------------------------------------------------
+
+
+def petsc_page() -> str:
+    """PETSc options that the program has to do with, and the linear solvers it starts with."""
+    rows = ["| option | |", "| --- | --- |", *(f"| `-{name}` | {text} |" for name, text in OPTIONS.items())]
+    presets = ["| name | options |", "| --- | --- |"]
+    presets += [f"| `{name}` | `{_words(options)}` |" for name, options in PRESETS.items()]
+    parts = [
+        "# PETSc options",
+        MADE,
+        "Every option of PETSc's TS, SNES, KSP, PC, Mat and Vec has its usual name, without a prefix: "
+        "`-ksp_monitor`, `-snes_view`, `-log_view`. Later ones win in: the program's defaults, the "
+        "scene's `petsc:` "
+        "block, `.petscrc`, `PETSC_OPTIONS`, the command line. `lyra-petsc run SCENE -help` lists all "
+        "that PETSc has. "
+        "Options that nothing used are named in a warning at the end.",
+        "The program itself has to do with these:",
+        "\n".join(rows),
+        "## Named linear solvers",
+        f"Without `-pc_type` the program chooses among these: by size ({ILU_FROM} and {ILU_UNTIL} "
+        f"vertices), by how many "
+        f"iterations are expected and seen, and factorisations up to {DIRECT_UNTIL} vertices; when one "
+        f"breaks down, the "
+        "next takes over ([how](../newton.md)).",
+        "\n".join(presets),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _words(options: dict[str, Value]) -> str:
+    return " ".join(f"-{name} {value}" for name, value in options.items())
+
+
+# -- commands ----------------------------------------------------------------------------------------
+
+
+def commands_page() -> str:
+    """The help text of every verb."""
+    parts = [
+        "# Commands",
+        MADE,
+        "`mpirun -n P lyra-petsc VERB [ARGUMENTS] [--our options] [-petsc options]`; in a checkout also "
+        "`bash scripts/lyra.sh VERB …` or `.venv/bin/python -m lyra_petsc VERB …`. Options with two "
+        "dashes are "
+        "ours, those with one go to PETSc.",
+    ]
+    for name in sorted(verbs.commands):
+        command = verbs.commands[name]
+        context = click.Context(
+            command, info_name=f"lyra-petsc {name}", terminal_width=100, max_content_width=100
+        )
+        parts.append(f"## `{name}`\n\n```text\n{command.get_help(context)}\n```")
+    return "\n\n".join(parts) + "\n"
+
+
+PAGES = {"scene.md": scene_page, "petsc.md": petsc_page, "commands.md": commands_page}
+
+
+def main() -> None:
+    """Write the pages."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    for name, page in PAGES.items():
+        (FOLDER / name).write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Code blocks of the documentation, with what the comment before each says to its test.
+
+``<!-- test: WORDS -->`` on the line before a block, invisible to readers, with words among
+
+``exit=N``
+    the last command ends with this exit code;
+``by=PATH``
+    cannot run here, or not in this time: the test at PATH does it with other sizes;
+``not here: REASON``
+    cannot run here at all (a cluster, another installation); its syntax is checked.
+
+A block whose first line of fences has ``title="NAME"`` is a file, written before the commands that follow it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+_FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)(?P<rest>[^\n`]*)$")
+_TITLE = re.compile(r'title="([^"]+)"')
+_SAID = re.compile(r"^ *<!-- test: (.*) -->$")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One code block.
+
+    Attributes
+    ----------
+    page : Path
+    line : int
+        Of its first fence, from 1.
+    language : str
+        Empty for what a program prints.
+    text : str
+    title : str
+        Name of the file that it is, or empty.
+    said : str
+        What its comment says.
+    """
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    title: str
+    said: str
+
+    @property
+    def place(self) -> str:
+        """Page and line."""
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+    @property
+    def runs(self) -> bool:
+        """Whether it is a program or commands that the tests of the documentation run as they stand."""
+        elsewhere = self.said.startswith(("not here: ", "by="))
+        return self.language in ("sh", "python") and not self.title and not elsewhere
+
+    @property
+    def exit_code(self) -> int:
+        """With which its last command ends."""
+        found = re.search(r"exit=(\d+)", self.said)
+        return int(found[1]) if found else 0
+
+
+def blocks_of(page: Path) -> list[Block]:
+    """The code blocks of a page in order."""
+    found: list[Block] = []
+    lines = page.read_text(encoding="utf-8").splitlines()
+    number = 0
+    while number < len(lines):
+        opening = _FENCE.match(lines[number])
+        if opening is None:
+            number += 1
+            continue
+        end = next(i for i in range(number + 1, len(lines)) if lines[i].strip() == "```")
+        said = _SAID.match(lines[number - 1]) if number else None
+        title = _TITLE.search(opening["rest"])
+        indent = len(opening["indent"])
+        found.append(
+            Block(
+                page,
+                number + 1,
+                opening["language"],
+                "\n".join(line[indent:] for line in lines[number + 1 : end]) + "\n",
+                title[1] if title else "",
+                said[1] if said else "",
+            )
+        )
+        number = end + 1
+    return found

@@ -1,0 +1,141 @@
+"""Every command, scene and program that the documentation shows is run, or its syntax is checked."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from blocks import PAGES, ROOT, Block, blocks_of
+
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.text import parse_json, parse_yaml
+
+END = 0.05
+"""Seconds that runs are shortened to."""
+
+PATIENCE = 300.0
+
+BASE = {
+    "mesh": {"grid": {"width": 1, "height": 1, "nx": 2, "ny": 2}},
+    "material": {"cloth": "paper"},
+    "time": {"end": 1, "step": 0.01},
+    "motions": {"swing": [{"time": 0}]},
+}
+"""What a piece of a scene is put into."""
+
+PROGRAM = f"""\
+#!{sys.executable}
+# the program as installed; runs are shortened, but for load factors
+import os, sys
+words = sys.argv[1:]
+scenes = [open(word).read() for word in words if word.endswith(".yaml") and os.path.exists(word)]
+if words[:1] == ["run"] and not any("analysis: static" in scene for scene in scenes):
+    words += ["--set", "time.end={END}"]
+os.execv(sys.executable, [sys.executable, "-m", "lyra_petsc", *words])
+"""
+PYTHON = f"""\
+#!/bin/sh
+[ "$1 $2" = "-m lyra_petsc" ] && {{ shift 2; exec lyra-petsc "$@"; }}
+exec {sys.executable} "$@"
+"""
+RUN_SH = 'exec mpirun -n "${RANKS:-2}" lyra-petsc run "$@"\n'
+LYRA_SH = 'exec lyra-petsc "$@"\n'
+
+ALL = {page: blocks_of(page) for page in PAGES}
+
+
+def shown(page: Path) -> str:
+    """A page's name in a test's."""
+    return str(page.relative_to(ROOT))
+
+
+LANGUAGES = {"", "sh", "yaml", "json", "python", "geo", "text", "diff"}
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """What a reader has: a checkout with ``.venv`` and an installed program; and the environment."""
+    folder = tmp_path / "lyra_petsc"
+    folder.mkdir()
+    for name in ("configs", "meshes", "docs", "lyra_petsc", "pyproject.toml", "README.md"):
+        (folder / name).symlink_to(ROOT / name)
+    shutil.copytree(ROOT / "scripts", folder / "scripts", ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "scripts" / "run.sh").write_text(RUN_SH, encoding="utf-8")
+    (folder / "scripts" / "lyra.sh").write_text(LYRA_SH, encoding="utf-8")
+    programs = folder / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    for name, text in (("lyra-petsc", PROGRAM), ("python", PYTHON)):
+        (programs / name).write_text(text, encoding="utf-8")
+        (programs / name).chmod(0o755)
+    ours = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PETSC_OPTIONS"))}
+    return folder, {
+        **ours,
+        "PATH": f"{programs}:{ours['PATH']}",
+        "PYTHONPATH": str(ROOT) + os.pathsep + ours.get("PYTHONPATH", ""),
+        "OMPI_ALLOW_RUN_AS_ROOT": "1",
+        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+        "OMPI_MCA_rmaps_base_oversubscribe": "1",
+        "OMPI_MCA_mpi_yield_when_idle": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", [page for page, blocks in ALL.items() if any(b.runs for b in blocks)], ids=shown
+)
+def test_commands(page: Path, checkout: tuple[Path, dict[str, str]]) -> None:
+    """The files of a page are written and its commands run, in their order."""
+    folder, environment = checkout
+    for block in ALL[page]:
+        if block.title:
+            path = folder / block.title
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(block.text, encoding="utf-8")
+        if not block.runs:
+            continue
+        command = ["bash", "-euo", "pipefail", "-c", block.text]
+        if block.language == "python":
+            command = [sys.executable, "-c", block.text]
+        process = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE
+        )
+        said = f"{block.place}\n{block.text}\n{process.stdout[-2000:]}\n{process.stderr[-3000:]}"
+        assert process.returncode == block.exit_code, said
+
+
+def check_scene(block: Block) -> None:
+    """A whole scene, or a piece of one, is accepted; meshes and names in it need not exist."""
+    data = parse_yaml(block.text, file=block.place)
+    assert isinstance(data, dict), block.place
+    Scene.model_validate(BASE | data, context={"directory": ROOT})
+
+
+EVERY = [block for blocks in ALL.values() for block in blocks]
+
+
+@pytest.mark.parametrize("block", EVERY, ids=[block.place for block in EVERY])
+def test_what_is_shown_is_well_formed(block: Block) -> None:
+    assert block.language in LANGUAGES
+    if block.said.startswith("by="):
+        assert (ROOT / block.said.removeprefix("by=")).exists(), f"{block.place}: {block.said}"
+    if block.language == "yaml" and block.said != "not a scene":
+        check_scene(block)
+    elif block.language == "json":
+        assert parse_json(block.text, file=block.place) is not None
+    elif block.language == "python":
+        compile(block.text, block.place, "exec")
+    elif block.language == "sh":
+        subprocess.run(["bash", "-n", "-c", block.text], check=True)
+    elif block.language == "geo":
+        assert block.title.endswith(".geo"), "a .geo is shown as a file, for the commands that mesh it"
+
+
+def test_the_blocks_are_found() -> None:
+    assert len(PAGES) > 15
+    assert sum(block.runs for block in EVERY) > 20
+    assert sum(block.language == "yaml" for block in EVERY) > 15

@@ -1,0 +1,76 @@
+"""The pages made from the program are up to date and whole, and the site builds without warnings."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from lyra_petsc.cli.verbs import verbs
+from lyra_petsc.solvers.presets import PRESETS
+
+ROOT = Path(__file__).parents[2]
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
+
+
+@pytest.fixture(scope="module")
+def reference() -> ModuleType:
+    specification = importlib.util.spec_from_file_location("reference", ROOT / "scripts/docs/reference.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["scene.md", "petsc.md", "commands.md"])
+def test_the_pages_are_up_to_date(name: str, reference: ModuleType) -> None:
+    text = (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8")
+    assert text == reference.PAGES[name](), "run: python scripts/docs/reference.py"
+
+
+def test_no_option_that_the_program_reads_is_left_out(reference: ModuleType) -> None:
+    read = reference.options_read()
+    assert {"ts_dt", "pc_type", "mat_partitioning_type", "ts_theta_endpoint"} <= read
+    assert read <= set(reference.OPTIONS)
+
+
+def test_every_verb_and_linear_solver_is_there(reference: ModuleType) -> None:
+    commands = reference.commands_page()
+    assert all(f"## `{name}`" in commands for name in verbs.commands)
+    petsc = reference.petsc_page()
+    assert all(f"`{name}`" in petsc for name in PRESETS)
+
+
+def test_readme_has_a_row_for_every_verb() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    missing = [name for name in verbs.commands if not re.search(rf"^\| `{name}\b", readme, re.MULTILINE)]
+    assert missing == []
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    links = LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
+    inside = [link for link in links if "://" not in link]
+    assert len(inside) > 10
+    assert [link for link in inside if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("material")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", "scripts/docs/mkdocs.yml"]
+    built = subprocess.run(
+        [*command, "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert (tmp_path / "site" / "tutorial.html").is_file()
