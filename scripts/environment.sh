@@ -18,6 +18,8 @@ packages=(python3-petsc4py-real python3-petsc4py python3-mpi4py python3-h5py pyt
 faster=(libopenblas0-serial)
 # OpenGL without a display, for the extra "view"
 pictures=(libegl1)
+# the tests open the page of `view`
+browser=(chromium chromium-driver)
 manual="see \"Other ways to install\" in README.md"
 
 say() { printf 'set-up: %s\n' "$*" >&2; }
@@ -219,6 +221,9 @@ set_up() {
     fi
     if [[ $owner == distribution && " $* " == *" view "* ]] && ! has_egl; then
         install_packages "${pictures[@]}"
+    fi
+    if [[ $owner == distribution && " $* " == *" test "* ]] && ! command -v chromedriver >/dev/null; then
+        (install_packages "${browser[@]}") || say "the tests that need a browser are skipped"
     fi
     if [[ $owner == environment && -z $("$base" -B "$helper" missing "$root/pyproject.toml" stack "$@") ]]; then
         python=("$base") # the environment in use has everything
