@@ -167,6 +167,7 @@ class Recorder:
             self._triangles,
             n_triangles=self._simulation.model.outline.n_triangles,
             resume_after=resume_after,
+            vtkhdf=self._simulation.scene.output.vtkhdf,
         )
         opened = {
             name: History(folder / name, columns, self._comm, resume_after=resume_after)

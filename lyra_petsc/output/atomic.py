@@ -1,4 +1,4 @@
-"""Small text files that are old or new, never half."""
+"""Small files that are old or new, never half."""
 
 from __future__ import annotations
 
@@ -17,11 +17,16 @@ def replace_text(path: str | os.PathLike[str], text: str) -> None:
     OutputError
         If it could not be written; what stood there before stands.
     """
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+    """As `replace_text`, for content that is no text."""
     path = Path(path)
     part = path.with_name(path.name + ".part")
     try:
-        with open(part, "w", encoding="utf-8") as file:
-            file.write(text)
+        with open(part, "wb") as file:
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)

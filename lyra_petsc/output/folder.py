@@ -21,7 +21,7 @@ RUNS = Path("runs")
 
 # what a run writes, and nothing else: --force removes no other file
 RESULT = re.compile(
-    r"(states-\d{4,}\.h5|mesh\.h5|checkpoint(-previous|-next)?\.h5|states\.xdmf"
+    r"(states-\d{4,}\.h5|(mesh|cells)\.h5|checkpoint(-previous|-next)?\.h5|states\.(xdmf|vtkhdf)"
     r"|(history|probes|reactions)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
 )
 

@@ -19,6 +19,7 @@ from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.mesh_file import MESH_FILE
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.vtkhdf import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import Field, State, group_name, xdmf_text
 from lyra_petsc.parallel import on_root
 
@@ -44,6 +45,8 @@ class StateWriter:
     resume_after : int, optional
         Keep the states up to and including this step, remove later ones and go on with the
         next number. Otherwise the first state is number 0.
+    vtkhdf : bool
+        Announce the states in ``states.vtkhdf``, too.
 
     Raises
     ------
@@ -59,6 +62,7 @@ class StateWriter:
         *,
         n_triangles: int,
         resume_after: int | None = None,
+        vtkhdf: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self.vertices = vertices
@@ -66,6 +70,9 @@ class StateWriter:
         self.n_triangles = n_triangles
         self._states: list[State] = []  # kept on rank 0
         self._next = 0
+        self._vtkhdf = vtkhdf
+        if vtkhdf:
+            on_root(self._comm, lambda: write_cells(self.folder, MESH_FILE))
         if resume_after is not None:
             self._next = on_root(self._comm, lambda: self._truncate(resume_after)) or 0
 
@@ -140,8 +147,10 @@ class StateWriter:
 
     def _announce(self, state: State | None) -> None:
         states = self._states if state is None else [*self._states, state]
-        text = xdmf_text(states, self.vertices.n_global, self.n_triangles, MESH_FILE)
-        replace_text(self.folder / XDMF_FILE, text)
+        sizes = self.vertices.n_global, self.n_triangles
+        replace_text(self.folder / XDMF_FILE, xdmf_text(states, *sizes, MESH_FILE))
+        if self._vtkhdf:
+            write_vtkhdf(self.folder, states, *sizes, MESH_FILE)
         self._states = states
 
     def _truncate(self, last_step: int) -> int:
@@ -150,9 +159,10 @@ class StateWriter:
         keep = {path: state for path, state in found.items() if state is not None and state.step <= last_step}
         self._states = list(keep.values())
         self._announce(None)
+        stale = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
         try:
-            for path in found.keys() - keep.keys():
-                path.unlink()
+            for path in [*(found.keys() - keep.keys()), *stale]:
+                path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: a later state cannot be removed: {reason(error)}") from error
         return max((state.number for state in self._states), default=-1) + 1

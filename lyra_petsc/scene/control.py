@@ -168,6 +168,8 @@ class Output(Block):
         How often a checkpoint is written at least.
     reactions : bool
         Write the forces at the handles to reactions.csv.
+    vtkhdf : bool
+        Announce the states also in states.vtkhdf, which newer ParaView and PyVista read faster than the XDMF.
     """
 
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
@@ -176,6 +178,7 @@ class Output(Block):
     fields: Annotated[list[str], WithJsonSchema(_FIELDS)] = Field(default_factory=list)
     checkpoint: Checkpoint = Field(default_factory=Checkpoint)
     reactions: Flag = False
+    vtkhdf: Flag = False
 
     @field_validator("fields", mode="before")
     @classmethod

@@ -1,6 +1,7 @@
 """What is read back from each format equals the states, to the format's precision."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -175,7 +176,22 @@ def test_npz(tmp_path, vt):
     assert (units["time"], units["position"], units["velocity"], units["stress"]) == ("s", "m", "m/s", "N/m")
 
 
-@pytest.mark.parametrize("to", ["obj", "ply", "gltf", "usd", "npz"])
+def test_vtkhdf(tmp_path):
+    reader = pytest.importorskip("vtkhdf_reader")
+    done = export_run(written(tmp_path / "run", states=4), "vtkhdf", tmp_path / "out", every=2)
+    shutil.rmtree(tmp_path / "run")  # it stands alone
+    for i, (time, points, triangles, arrays) in zip(
+        (0, 2), reader.read(done.folder / "run.vtkhdf"), strict=True
+    ):
+        assert time == 0.1 * i
+        np.testing.assert_array_equal(points, position(i))
+        np.testing.assert_array_equal(triangles, TRIANGLES)
+        np.testing.assert_array_equal(arrays["vertex"]["rest"], REST)
+        np.testing.assert_array_equal(arrays["vertex"]["velocity"], velocity(i))
+        np.testing.assert_array_equal(arrays["triangle"]["stress"], stress(i))
+
+
+@pytest.mark.parametrize("to", ["obj", "ply", "gltf", "usd", "npz", "vtkhdf"])
 def test_a_single_state_of_a_run_with_a_name_of_its_own(tmp_path, to):
     folder = tmp_path / "Fähnchen 旗 (1)"
     done = export_run(written(folder, states=1, fields=False), to)

@@ -1,0 +1,144 @@
+"""What VTK's reader finds in states.vtkhdf: every time, position and field, as they were written."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from vtkhdf_reader import read
+from written_run import REST, TRIANGLES, position, ring, stress, velocity
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output import states as states_module
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.states import StateWriter, state_files
+from lyra_petsc.output.vtkhdf import CELLS_FILE, VTKHDF_FILE
+
+pytestmark = pytest.mark.parallel
+
+
+class Writer:
+    """A writer for the ring, its vertices and triangles dealt to the ranks."""
+
+    def __init__(self, comm, folder, resume_after=None, vtkhdf=True):
+        self.vertices = np.arange(len(REST))[::-1][comm.rank :: comm.size]
+        self.triangles = np.arange(len(TRIANGLES))[comm.rank :: comm.size]
+        orders = (FileOrder(comm, rows, 8) for rows in (self.vertices, self.triangles))
+        self.states = StateWriter(
+            folder, *orders, n_triangles=len(TRIANGLES), resume_after=resume_after, vtkhdf=vtkhdf
+        )
+
+    def write(self, i, fields=True):
+        self.states.write(
+            i,
+            0.1 * i,
+            position(i)[self.vertices],
+            {"velocity": velocity(i)[self.vertices], "rank": 0 * self.vertices + i} if fields else {},
+            {"stress": stress(i)[self.triangles]} if fields else {},
+        )
+
+
+@pytest.fixture
+def folder(shared_tmp, comm):
+    write_mesh(shared_tmp, ring() if comm.rank == 0 else None, comm)
+    return shared_tmp
+
+
+def check(path, numbers):
+    found = read(path)
+    np.testing.assert_array_equal([time for time, *_ in found], [0.1 * i for i in numbers])
+    for i, (_, points, triangles, arrays) in zip(numbers, found, strict=True):
+        np.testing.assert_array_equal(points, position(i))
+        np.testing.assert_array_equal(triangles, TRIANGLES)
+        assert set(arrays["vertex"]) == {"rest", "velocity", "rank"}
+        assert set(arrays["triangle"]) == {"stress"}
+        np.testing.assert_array_equal(arrays["vertex"]["rest"], REST)
+        np.testing.assert_array_equal(arrays["vertex"]["velocity"], velocity(i))
+        np.testing.assert_array_equal(arrays["vertex"]["rank"], i)
+        np.testing.assert_array_equal(arrays["triangle"]["stress"], stress(i))
+
+
+def on_rank_0(comm, work):
+    """Run what only reads on one rank, so that a failure is seen on all."""
+    comm.barrier()
+    if comm.rank == 0:
+        work()
+    comm.barrier()
+
+
+def test_every_time_and_field_at_every_moment(folder, comm):
+    writer = Writer(comm, folder)
+    for i in range(4):
+        writer.write(i)
+        on_rank_0(comm, lambda i=i: check(folder / VTKHDF_FILE, range(i + 1)))
+
+
+def test_resumed_without_a_gap_or_a_double(folder, comm):
+    writer = Writer(comm, folder)
+    for i in range(5):
+        writer.write(i)
+    again = Writer(comm, folder, resume_after=2)
+    on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1, 2]))
+    again.write(3)
+    on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1, 2, 3]))
+
+
+def test_resumed_with_and_without_it(folder, comm):
+    Writer(comm, folder, vtkhdf=False).write(0)
+    assert not (folder / VTKHDF_FILE).exists()
+    assert not (folder / CELLS_FILE).exists()
+    Writer(comm, folder, resume_after=0).write(1)
+    on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1]))
+    Writer(comm, folder, resume_after=1, vtkhdf=False)
+    assert not (folder / VTKHDF_FILE).exists()
+
+
+def test_a_field_that_some_states_lack(folder, comm):
+    Writer(comm, folder).write(0, fields=False)
+    Writer(comm, folder, resume_after=0).write(1)
+
+    def compare():
+        (_, points, _, arrays), later = read(folder / VTKHDF_FILE)
+        np.testing.assert_array_equal(points, position(0))
+        assert np.isnan(arrays["vertex"]["velocity"]).all()
+        np.testing.assert_array_equal(later[3]["vertex"]["velocity"], velocity(1))
+
+    on_rank_0(comm, compare)
+
+
+def test_a_disk_that_fails_leaves_the_states_before(folder, comm, monkeypatch):
+    writer = Writer(comm, folder)
+    writer.write(0)
+    writer.write(1)
+
+    def fails(*arguments):
+        raise OutputError("states.vtkhdf: cannot be written: No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(states_module, "write_vtkhdf", fails)
+        with pytest.raises(OutputError, match="No space left"):
+            writer.write(2)
+    on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1]))
+    again = Writer(comm, folder, resume_after=1)
+    assert again.states.count == 2
+    assert len(state_files(folder)) == 2
+
+
+def test_the_folder_may_be_moved(folder, comm, tmp_path_factory):
+    Writer(comm, folder).write(0)
+
+    def move():
+        moved = folder.rename(folder.with_name(folder.name + "-moved"))
+        check(moved / VTKHDF_FILE, [0])
+
+    on_rank_0(comm, move)
+
+
+def test_thousand_states_are_announced_quickly(folder, comm):
+    if comm.size > 1:
+        pytest.skip("one rank is enough")
+    writer = Writer(comm, folder)
+    for i in range(3):
+        writer.write(i)
+    began = MPI.Wtime()
+    states_module.write_vtkhdf(folder, writer.states._states * 333, 8, 8, "mesh.h5")
+    assert MPI.Wtime() - began < 2.0
