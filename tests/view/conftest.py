@@ -21,8 +21,6 @@ import pytest
 for room in ("cli", "results"):
     sys.path.insert(0, str(Path(__file__).parents[1] / room))
 
-from launch import start
-
 
 @dataclass
 class Served:
@@ -57,6 +55,8 @@ Serve = Callable[..., Served]
 @pytest.fixture
 def serve(tmp_path: Path) -> Iterator[Serve]:
     """Starts ``view`` on a folder; ended with the test."""
+    from launch import start
+
     pytest.importorskip("trame")
     started = []
 

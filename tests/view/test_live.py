@@ -1,0 +1,144 @@
+"""``run --live``: the page comes, follows, and goes with the run however that ends."""
+
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from launch import SCENE, done, finish, lyra, start, write_scene
+from written_run import Writer
+
+from lyra_petsc.results.run import Run
+from lyra_petsc.view.live import LivePage
+
+SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
+"""The same without an end in sight."""
+
+PATIENCE = 60.0
+
+
+def pages(folder):
+    """Processes that serve the page of a run below ``folder``."""
+    found = []
+    for entry in os.scandir("/proc"):
+        if entry.name.isdigit():
+            try:
+                words = Path(entry.path, "cmdline").read_bytes().split(b"\0")
+            except OSError:
+                continue
+            if b"lyra_petsc.view.live" in words and any(w.startswith(os.fsencode(folder)) for w in words):
+                found.append(int(entry.name))
+    return found
+
+
+def until(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def address(process):
+    """Where the page is, as soon as the run says so."""
+    told = []
+    for line in process.stderr:
+        told.append(line)
+        found = re.match(r"view: (http://127\.0\.0\.1:\d+/\?token=\S+)$", line)
+        if found:
+            return found[1]
+    pytest.fail("no page:\n" + "".join(told))
+
+
+@pytest.fixture(autouse=True)
+def needs_the_extra():
+    pytest.importorskip("trame")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL), (3, signal.SIGTERM)])
+def test_the_page_goes_with_the_run(tmp_path, ranks, number):
+    write_scene(tmp_path, SLOW)
+    process = start(
+        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path, ranks
+    )
+    try:
+        address(process)
+        assert len(pages(tmp_path)) == 1
+        os.killpg(process.pid, number)
+        until(lambda: not pages(tmp_path), "the page outlives its run")
+    finally:
+        finish(process)
+    assert len(Run(tmp_path / "out")) > 1
+
+
+@pytest.mark.slow
+def test_resume_has_a_page_too(tmp_path):
+    write_scene(tmp_path)
+    done(["run", "scene.yaml", "--out", tmp_path / "out"], tmp_path)
+    settings = ["--set", "time.end=500", "--resume", "--live", "--no-browser"]
+    process = start(["run", "scene.yaml", "--out", tmp_path / "out", *settings], tmp_path)
+    try:
+        assert "token=" in address(process)
+    finally:
+        os.killpg(process.pid, signal.SIGINT)
+        assert finish(process).code == 130
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_leaves_no_page(tmp_path):
+    # the launcher must not wait for the page, nor the page for ever
+    write_scene(tmp_path, SCENE)
+    options = ["-snes_max_it", "1", "-snes_rtol", "1e-15", "-snes_stol", "0", "-ts_adapt_dt_min", "0.01"]
+    left = lyra(
+        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser", *options], tmp_path
+    )
+    assert left.code == 3
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+def test_a_run_ends_as_without_a_page(tmp_path):
+    write_scene(tmp_path)
+    left = done(["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path)
+
+    assert len(Run(tmp_path / "out")) == 4
+    assert Run(tmp_path / "out").finished
+    assert "note: no page" not in left.err
+    assert f"lyra-petsc view {tmp_path / 'out'}" in left.out
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+def test_a_port_in_use_is_told_before_anything_is_written(tmp_path):
+    import socket
+
+    write_scene(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        left = lyra(["run", "scene.yaml", "--out", "out", "--live", "--port", port], tmp_path)
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert "Address already in use" in left.ours[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_page_that_cannot_be_served_is_told(tmp_path):
+    told = []
+    page = LivePage(tmp_path / "nowhere", "127.0.0.1", 0, told.append, told.append)
+    until(lambda: told, "nothing is said")
+    page.end()
+    assert "nowhere: no such folder" in told[0]
+
+
+def test_who_looks_is_told_that_the_run_has_ended(tmp_path):
+    writer = Writer(tmp_path / "run")
+    writer.write()
+    told = []
+    page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
+    until(lambda: told, "nothing is said")
+    assert told[0].startswith("http://127.0.0.1:")
+    assert pages(tmp_path)
+    page.end()
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+    assert len(told) == 1
