@@ -22,6 +22,7 @@ from lyra_petsc.render.quantities import Quantity, material_coordinates, quantit
 from lyra_petsc.render.stage import Look, Stage, wind_arrows
 from lyra_petsc.render.surface import over_whole_sheet
 from lyra_petsc.render.survey import Survey, survey
+from lyra_petsc.render.timing import spread_states
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -62,7 +63,7 @@ def draw(comm: MPI.Comm, asked: Asked, plan: Plan, tell: Callable[[int, int], No
     normals = Bounds.axes_of(upwards(plan.scene))
     fit = Fit(plan.scene, sight, normals[2], plan.size[0] / plan.size[1], bar=shown is not None)
     around = np.concatenate([fit.normals, normals, -normals])
-    mine = states[comm.rank :: comm.size]
+    mine = plan.motion[comm.rank :: comm.size]
     part = _together(comm, lambda: survey(plan.run, mine, around, shown if plan.limits is None else None))
     whole = comm.bcast(_joined(comm.gather(part)))
     with ExitStack() as open_now:
@@ -95,9 +96,7 @@ def _together(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
 
 
 def _line_of_sight(plan: Plan) -> NDArray[np.float64]:
-    states = plan.states
-    some = states[:: max(1, len(states) // LOOKED_AT)]
-    shapes = (plan.run.positions[state] for state in some)
+    shapes = (plan.run.positions[state] for state in spread_states(plan.run.times, LOOKED_AT))
     return line_of_sight(plan.scene, upwards(plan.scene), shapes, plan.run.triangles)
 
 

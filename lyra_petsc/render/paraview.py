@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from string import Template
 
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.render.camera import line_of_sight, upwards
+from lyra_petsc.render.timing import spread_states
 from lyra_petsc.results.run import Run
 
 SCRIPT = "open_in_paraview.py"
@@ -17,78 +17,85 @@ LOOKED_AT = 9
 TEXT = Template('''\
 """Opens the run beside this file in ParaView (5.11 or newer).
 
-    paraview --script=$script          the window, ready to play
-    pvbatch $script film.png           pictures film.0000.png, film.0001.png, ... without a window
+    paraview --script=$script       the window, ready to play
+    pvbatch $script film.png        pictures film.0000.png, film.0001.png, ... without it
 
-Or in the window: File > Load State is for .pvsm files; this one goes into View > Python Shell > Run Script.
+In an open window: View > Python Shell, then Run Script.
 """
 
 import os
 import sys
 
-from paraview.simple import *
+from paraview import simple
 
 FOLDER = os.path.dirname(os.path.abspath(__file__)) if "__file__" in globals() else $folder
-COLOUR = $colour        # one of: $fields; None: one colour
-EXAGGERATION = 0.0      # 0: as it moved; 1: displacements from the rest shape drawn twice as large
+COLOUR = $colour  # one of: $fields; None: one colour
+EXAGGERATION = 0.0  # 0: as it moved; 1: displacements from the rest shape drawn twice as large
 UP = $up  # in the picture
 SIGHT = $sight  # towards the camera
 
-paraview.simple._DisableFirstRenderCameraReset()
+simple._DisableFirstRenderCameraReset()
 
 # the states as a time series; their times are those of the run
-states = Xdmf3ReaderS(registrationName="states", FileName=[os.path.join(FOLDER, "states.xdmf")])
+states = simple.Xdmf3ReaderS(registrationName="states", FileName=[os.path.join(FOLDER, "states.xdmf")])
 states.UpdatePipeline(states.TimestepValues[-1])
 
 # the displacement from the rest shape, and that many times more of it
-displaced = Calculator(registrationName="displacement", Input=states)
+displaced = simple.Calculator(registrationName="displacement", Input=states)
 displaced.ResultArrayName = "displacement"
 displaced.Function = "coords - rest"
-warped = WarpByVector(registrationName="exaggerated", Input=displaced)
+warped = simple.WarpByVector(registrationName="exaggerated", Input=displaced)
 warped.Vectors = ["POINTS", "displacement"]
 warped.ScaleFactor = EXAGGERATION
+surface = simple.ExtractSurface(registrationName="surface", Input=warped)
+# in ParaView 5.12 the filter got another name
+normals = getattr(simple, "SurfaceNormals", None) or simple.GenerateSurfaceNormals
+smooth = normals(registrationName="smooth", Input=surface)
+smooth.FeatureAngle = 180.0
 
-view = GetActiveViewOrCreate("RenderView")
-shown = Show(warped, view)
+view = simple.GetActiveViewOrCreate("RenderView")
+shown = simple.Show(smooth, view)
 shown.Interpolation = "Gouraud"
-shown.Diffuse = 0.9
+shown.Ambient = 0.25
+shown.Diffuse = 0.85
 shown.Specular = 0.15
 if COLOUR is None:
-    ColorBy(shown, None)
+    simple.ColorBy(shown, None)
     shown.DiffuseColor = [0.78, 0.25, 0.18]
     shown.BackfaceRepresentation = "Surface"
     shown.BackfaceDiffuseColor = [0.94, 0.89, 0.78]
 else:
-    on = "POINTS" if COLOUR in warped.PointData.keys() else "CELLS"
-    ColorBy(shown, (on, COLOUR, "Magnitude") if $vectors.get(COLOUR) else (on, COLOUR))
+    on = "POINTS" if COLOUR in smooth.PointData.keys() else "CELLS"
+    simple.ColorBy(shown, (on, COLOUR, "Magnitude") if $vectors.get(COLOUR) else (on, COLOUR))
     # one scale for the whole run
     shown.RescaleTransferFunctionToDataRangeOverTime()
-    colours = GetColorTransferFunction(COLOUR)
+    colours = simple.GetColorTransferFunction(COLOUR)
     colours.ApplyPreset("Viridis (matplotlib)", True)
-    bar = GetScalarBar(colours, view)
+    bar = simple.GetScalarBar(colours, view)
     bar.Title = COLOUR.replace("_", " ") + $units.get(COLOUR, "")
     bar.ComponentTitle = ""
     shown.SetScalarBarVisibility(view, True)
 
-label = AnnotateTimeFilter(registrationName="time", Input=states)
+label = simple.AnnotateTimeFilter(registrationName="time", Input=states)
 label.Format = "t = {time:.4g}$unit"
-Show(label, view)
+simple.Show(label, view)
 
 # one picture for each state
-scene = GetAnimationScene()
+scene = simple.GetAnimationScene()
 scene.UpdateAnimationUsingDataTimeSteps()
 scene.PlayMode = "Snap To TimeSteps"
 
-view.CameraViewUp = UP
 scene.GoToLast()
-ResetCamera(view)
-view.CameraPosition = [f + s for f, s in zip(view.CameraFocalPoint, SIGHT)]
-ResetCamera(view)
+view.CameraFocalPoint = [0.0, 0.0, 0.0]
+view.CameraPosition = SIGHT
+view.CameraViewUp = UP
+simple.ResetCamera(view)
 scene.GoToFirst()
-Render(view)
+simple.Render(view)
 
 if len(sys.argv) > 1 and sys.argv[1].endswith((".png", ".avi", ".ogv")):
-    SaveAnimation(os.path.abspath(sys.argv[1]), view, ImageResolution=[1280, 720])
+    view.ViewSize = [1280, 720]
+    simple.SaveAnimation(os.path.abspath(sys.argv[1]), view, ImageResolution=view.ViewSize)
 ''')
 
 
@@ -105,14 +112,13 @@ def write_script(folder: Path) -> Path:
     run = Run(folder)
     scene = run.scene
     static = scene.time.analysis == "static"
-    count = len(run.times)
-    shapes = (run.positions[i] for i in range(0, count, max(1, count // LOOKED_AT)))
+    shapes = (run.positions[i] for i in spread_states(run.times, LOOKED_AT))
     up = upwards(scene)
     sight = line_of_sight(scene, up, shapes, run.triangles)
     path = run.folder / SCRIPT
     names = run.fields
     text = TEXT.substitute(
-        script=shlex.quote(str(path)),
+        script=SCRIPT,
         folder=repr(str(run.folder.absolute())),
         colour=repr("velocity" if "velocity" in names else names[0] if names else None),
         fields=", ".join(map(repr, names)) or "none was written",

@@ -28,6 +28,8 @@ SMALLEST, LARGEST = 32, 8192
 COLORS = "#c8402f,#f0e2c8"
 FILM, SHEET = "film.mp4", "sheet.png"
 LONGEST_LIST = 1000
+MOTION = 500
+"""States that stand for the whole motion, beside those that are shown."""
 FASTEST = 240.0
 """Frames a second that may be asked for."""
 
@@ -93,6 +95,11 @@ class Plan:
         shown = {state for _, state in self.pictures}
         shown |= set(self.film[1].states) if self.film else set()
         return sorted(shown | set(self.sheet[1] if self.sheet else ()))
+
+    @property
+    def motion(self) -> list[int]:
+        """The states that camera and colours are fitted to: the whole run, so that all its pictures agree."""
+        return sorted({*self.states, *spread_states(self.run.times, MOTION)})
 
 
 def make_plan(asked: Asked) -> Plan:

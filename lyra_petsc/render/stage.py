@@ -129,7 +129,7 @@ class Stage:
         self._text = plotter.add_text(
             " ", position=(18 * self._scale, 14 * self._scale), font_size=1, color=INK, font="arial"
         )
-        self._text.prop.font_size = round(20 * self._scale)
+        self._text.prop.font_size = round(25 * self._scale)
         self._first = True
 
     def image(self, state: int, time: float, x: Array) -> Image:
@@ -181,7 +181,7 @@ class Stage:
             "interpolation": "phong",
             "ambient": 0.2,
             "diffuse": 0.8,
-            "specular": 0.12,
+            "specular": 0.08,
             "specular_power": 14.0,
             "reset_camera": False,
         }
@@ -219,7 +219,7 @@ class Stage:
         title = self._plotter.add_text(
             quantity.label, position=(left, top), viewport=True, font_size=1, color=INK
         )
-        title.prop.font_size = round(20 * self._scale)
+        title.prop.font_size = round(25 * self._scale)
         self._plotter.add_scalar_bar(
             title="",
             vertical=False,
@@ -231,7 +231,7 @@ class Stage:
             fmt="%.3g",
             color=INK,
             font_family="arial",
-            label_font_size=round(16 * self._scale),
+            label_font_size=round(20 * self._scale),
         )
 
     def _add_lights(self, view: View) -> Array:
@@ -243,7 +243,7 @@ class Stage:
         right = np.cross(up, front)
         key = _towards(front, right, up, azimuth=-40.0, elevation=55.0)
         lights = [
-            (key, 0.9),
+            (key, 0.76),
             (_towards(front, right, up, azimuth=55.0, elevation=20.0), 0.3),
             (_towards(front, right, up, azimuth=-10.0, elevation=10.0), 0.2),
             (_towards(front, right, up, azimuth=10.0, elevation=-50.0), 0.22),  # from the floor

@@ -35,7 +35,7 @@ def write_png(path: Path, image: Image) -> None:
 
     part = path.with_name(f".{path.name}.part")
     try:
-        Pictures.fromarray(image).save(part, format="PNG", optimize=True)
+        Pictures.fromarray(image).save(part, format="PNG")
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)

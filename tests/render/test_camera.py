@@ -19,7 +19,7 @@ def with_camera(camera: dict | None, gravity: tuple | None = None) -> Scene:
 
 
 def in_picture(view: View, points: np.ndarray, aspect: float) -> np.ndarray:
-    """(n, 2) places of points in the picture, -1 to 1 from edge to edge; raised as VTK's window centre does."""
+    """(n, 2) places of points in the picture, -1 to 1 from edge to edge, raised by the window centre."""
     sight = view.position - view.target
     sight = sight / np.linalg.norm(sight)
     right = np.cross(view.up, sight)

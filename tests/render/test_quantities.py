@@ -55,7 +55,9 @@ def test_what_is_not_there_is_said(run, tmp_path):
     with pytest.raises(InputError, match="no field 'spede', did you mean 'speed'"):
         quantity(run, "spede")
     bare = Run(written(tmp_path / "bare", fields=False))
-    with pytest.raises(InputError, match="speed needs the velocities, .* add velocity to the scene's output.fields"):
+    with pytest.raises(
+        InputError, match=r"speed needs the velocities, .* add velocity to the scene's output.fields"
+    ):
         quantity(bare, "speed")
 
 
@@ -66,7 +68,9 @@ def test_a_survey_is_the_same_in_parts(run):
     parts = survey(run, [1], normals, shown).join(survey(run, [], normals, shown))
     parts = parts.join(survey(run, [0, 2], normals, shown))
     np.testing.assert_array_equal(whole.reach, parts.reach)
-    np.testing.assert_array_equal(whole.reach, np.max([position(i) @ normals.T for i in range(3)], axis=(0, 1)))
+    np.testing.assert_array_equal(
+        whole.reach, np.max([position(i) @ normals.T for i in range(3)], axis=(0, 1))
+    )
     assert whole.limits == parts.limits
     assert Survey(whole.reach, 0.0, 0.0).limits == (0.0, 1e-12)
 
@@ -84,5 +88,7 @@ def test_held_vertices_follow_the_windows_of_handles(tmp_path):
     vertices, edges = held.at(0.2)
     assert vertices.tolist() == [1, 3]
     assert edges.tolist() == [[1, 3]]
-    assert {tuple(edge) for edge in edges} <= {tuple(sorted(t[[i, i - 1]])) for t in TRIANGLES for i in range(3)}
+    assert {tuple(edge) for edge in edges} <= {
+        tuple(sorted(t[[i, i - 1]])) for t in TRIANGLES for i in range(3)
+    }
     assert len(REST) == 8

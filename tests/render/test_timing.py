@@ -65,13 +65,21 @@ def test_a_single_state_is_a_film_of_one_frame():
 
 
 def test_films_without_end_are_refused():
-    with pytest.raises(InputError, match="--film: .* would have 1e.06 frames"):
+    with pytest.raises(InputError, match=r"--film: .* would have 1e.06 frames"):
         film_timing(np.linspace(0.0, 1e5, 1001))
 
 
 def test_the_nearest_state():
     times = np.array([0.0, 1.0, 4.0])
-    assert nearest_states(times, np.array([-1.0, 0.49, 0.5, 0.51, 2.4, 2.6, 9.0])).tolist() == [0, 0, 0, 1, 1, 2, 2]
+    assert nearest_states(times, np.array([-1.0, 0.49, 0.5, 0.51, 2.4, 2.6, 9.0])).tolist() == [
+        0,
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
     assert pick_state(times, 3.0, " s") == 2
 
 

@@ -1,0 +1,112 @@
+"""Runs the scenes in configs/ and makes the pictures and films of docs/gallery.
+
+    python scripts/gallery.py [NAME…] [--runs FOLDER] [--ranks P]
+
+Runs that are in the folder of runs (runs/gallery) already are not repeated. Ends with an error if the gallery
+grows beyond 5 MB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+GALLERY = ROOT / "docs" / "gallery"
+LIMIT = 5_000_000
+"""Bytes of all pictures and films."""
+SIZE = "640x360"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A scene of the gallery.
+
+    Attributes
+    ----------
+    at : float
+        Time of the picture [s].
+    options : tuple of str
+        Of ``render``, for picture and film.
+    settings : tuple of str
+        ``--set`` of the run.
+    speed : float
+        Simulated seconds in a second of the film.
+    """
+
+    at: float
+    options: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
+    speed: float = 1.0
+
+
+ENTRIES = {
+    "flag": Entry(1.5, ("--handles", "--wind")),
+    "sail": Entry(1.0, ("--handles", "--field", "stress", "--range", "0,120"), speed=0.5),
+    "drape": Entry(2.0, ("--handles", "--colors", "#2f6f9f,#f3e7d3")),
+    "swing": Entry(0.28, ("--handles", "--field", "speed"), ("output.every=0.01",), speed=0.2),
+    "spin": Entry(5.4, ("--handles", "--colors", "#7d3c74,#f0d49a"), ("time.end=7.4",)),
+    "paper": Entry(0.4, ("--handles", "--colors", "#eee9dc,#c9a86a"), ("output.every=0.01",), speed=0.2),
+    "plate": Entry(1.0, ("--handles", "--field", "curvature"), speed=0.5),
+}
+
+
+def lyra(*words: str, ranks: int = 1) -> None:
+    """Run the program; ends the script if it fails."""
+    launcher = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    command = [*launcher, sys.executable, "-m", "lyra_petsc", *words]
+    if subprocess.run(command, cwd=ROOT, check=False).returncode != 0:
+        raise SystemExit(f"gallery: failed: {' '.join(command)}")
+
+
+def make(name: str, entry: Entry, runs: Path, ranks: int) -> None:
+    """The picture and the film of one scene."""
+    run = runs / name
+    if not (run / "summary.json").exists():
+        settings = [word for setting in entry.settings for word in ("--set", setting)]
+        lyra("run", f"configs/{name}.yaml", "--out", str(run), "--force", *settings, ranks=ranks)
+    look = ("--size", SIZE, "--out", str(run), *entry.options)
+    lyra("render", str(run), "--at", f"{entry.at:g}", *look)
+    (run / f"picture-{entry.at:g}.png").replace(GALLERY / f"{name}.png")
+    lyra("render", str(run), "--film", str(GALLERY / f"{name}.mp4"), "--speed", f"{entry.speed:g}", *look)
+
+
+def main() -> None:
+    """Make what was asked for, and say how large the gallery is."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(ENTRIES)} (all)")
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "gallery", help="folder of the runs")
+    parser.add_argument("--ranks", type=int, default=1, help="ranks of a run (1)")
+    asked = parser.parse_args()
+    unknown = set(asked.names) - set(ENTRIES)
+    if unknown:
+        parser.error(f"no such scene: {', '.join(sorted(unknown))}")
+    GALLERY.mkdir(parents=True, exist_ok=True)
+    for name in asked.names or ENTRIES:
+        make(name, ENTRIES[name], asked.runs.absolute(), asked.ranks)
+    if not asked.names or "flag" in asked.names:
+        run = str(asked.runs.absolute() / "flag")
+        lyra(
+            "render",
+            run,
+            "--film",
+            str(GALLERY / "flag.gif"),
+            "--size",
+            "480x270",
+            "--fps",
+            "20",
+            "--handles",
+        )
+    size = sum(path.stat().st_size for path in GALLERY.iterdir())
+    print(f"gallery      {GALLERY}: {size / 1e6:.2f} MB")
+    if size > LIMIT:
+        raise SystemExit(f"gallery: more than {LIMIT / 1e6:g} MB; make films shorter or smaller")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""The verb as a user meets it: what it says, what it leaves, how it leaves."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from launch import SCENE, lyra, start, write_scene
+from mpi4py import MPI
+from written_run import Writer, written
+
+from lyra_petsc.cli.render import FrameProgress
+from lyra_petsc.errors import InputError
+from lyra_petsc.render.paraview import SCRIPT, write_script
+from lyra_petsc.render.plan import Asked, make_plan
+
+MISTAKES = [
+    ({"at": "5"}, "--at: 5 s is outside the run, whose states go from 0 to 0.2 s"),
+    ({"at": "a,b"}, "--at: must be numbers with commas between them"),
+    ({"at": "nan"}, "--at: must be numbers"),
+    ({"at": ","}, "--at: must be numbers"),
+    ({"film": Path("film.avi")}, "--film: a film's name ends in .mp4, .webm, .gif, not 'film.avi'"),
+    ({"film": Path("nowhere/film.mp4")}, "--film: there is no folder nowhere"),
+    ({"film": Path("film.mp4"), "size": "161x120"}, "--size: 161x120: films need even numbers"),
+    ({"size": "31x31"}, "--size: must be WIDTHxHEIGHT"),
+    ({"size": "1280"}, "--size: must be WIDTHxHEIGHT"),
+    ({"size": "99999x99999"}, "--size: must be WIDTHxHEIGHT"),
+    ({"fps": float("nan")}, "--fps: must be from 0.1 to 240"),
+    ({"speed": 0.0}, "--speed: must be > 0"),
+    ({"speed": float("inf")}, "--speed: must be > 0"),
+    ({"film": Path("film.mp4"), "speed": 1e-9}, "--film: .* more than 20000; give a larger --speed"),
+    ({"field": "strian"}, "--field: no field 'strian', did you mean 'strain'"),
+    ({"field": "speed", "texture": Path("a.png")}, "--field: covers what --texture shows"),
+    ({"texture": Path("a.png")}, "a.png: --texture: cannot be read: No such file"),
+    ({"texture": Path("text.png")}, "text.png: --texture: is not a picture"),
+    ({"range": "0,1"}, "--range: is the range of what --field shows"),
+    ({"field": "speed", "range": "1,0"}, "--range: must be two"),
+    ({"field": "speed", "range": "1"}, "--range: must be two"),
+    ({"colors": "red"}, "--colors: must be two colours"),
+    ({"colors": "red,nocolour"}, "--colors: must be two colours"),
+    ({"handles": True}, "--handles: this run's scene has no handles"),
+    ({"wind": True}, "--wind: this run's scene has no wind"),
+    ({"out": Path("text.png")}, "--out: cannot be made"),
+    ({"settings": ("time.end=3",)}, "--set: 'time.end=3': the run is done, only render"),
+    ({"settings": ("render.camera.angel=3",)}, "render.camera.angel: unknown key, did you mean 'angle'"),
+    ({"settings": ("render.camera.angle=0",)}, "render.camera.angle: must be from 1 to 120 degrees"),
+    ({"run": Path("nowhere")}, "nowhere: no such folder"),
+    ({"run": Path("text.png")}, "text.png: is a file"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), MISTAKES, ids=[words[:40] for _, words in MISTAKES])
+def test_bad_input_is_one_line_and_leaves_nothing(options, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "run")
+    (tmp_path / "text.png").write_text("no picture")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match=words) as caught:
+        make_plan(Asked(**{"run": Path("run"), **options}))
+    assert "\n" not in str(caught.value)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_scene_with_a_camera_runs_and_is_drawn(tmp_path):
+    """The camera of the scene is the one of the picture; without it another picture comes out."""
+    camera = "render: {camera: {position: [0.5, -3, 0], target: [0.5, 0.5, 0], angle: 30}}\n"
+    write_scene(tmp_path, SCENE + camera)
+    left = lyra(["run", "scene.yaml", "--out", "run"], tmp_path)
+    assert left.code == 0, left.err
+    left = lyra(["render", "run", "--at", "0.05", "--size", "160x120"], tmp_path)
+    assert left.code == 0, left.err
+    assert left.out == "picture  run/picture-0.05.png\n"
+    again = lyra(
+        ["render", "run", "--at", "0.05", "--size", "160x120", "--out", "other", "--set", "render="], tmp_path
+    )
+    assert again.code == 0, again.err
+    pictures = [(tmp_path / folder / "picture-0.05.png").read_bytes() for folder in ("run", "other")]
+    assert pictures[0] != pictures[1]
+
+
+@pytest.mark.slow
+def test_two_ranks_make_a_film_and_refuse_as_one(tmp_path):
+    written(tmp_path / "run", states=4)
+    left = lyra(
+        ["render", "run", "--film", "film.mp4", "--size", "160x120", "--fps", "10"], tmp_path, ranks=2
+    )
+    assert left.code == 0, left.err
+    assert left.out == "film     film.mp4  (0.4 s, 4 frames, 10 a second)\n"
+    left = lyra(["render", "run", "--at", "9"], tmp_path, ranks=2)
+    assert left.code == 2
+    assert left.ours == ["lyra-petsc: --at: 9 s is outside the run, whose states go from 0 to 0.3 s"]
+
+
+def test_a_signal_ends_a_film_without_a_trace(tmp_path):
+    written(tmp_path / "run", states=200)
+    process = start(["render", "run", "--film", "film.mp4"], tmp_path)
+    part = tmp_path / ".film.part.mp4"
+    while process.poll() is None and not part.exists():
+        pass
+    process.terminate()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 143, err
+    assert "stopped by SIGTERM after" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_missing_package_is_one_line(tmp_path):
+    written(tmp_path / "run")
+    program = (
+        "import sys, importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name == 'pyvista' else real(name, *rest);"
+        "from lyra_petsc.cli.app import run_command_line;"
+        "sys.exit(run_command_line(['lyra-petsc', 'render', 'run']))"
+    )
+    left = lyra([], tmp_path, program=("-c", program))
+    assert left.code == 2
+    assert (
+        left.err
+        == "lyra-petsc: render: pyvista is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
+    )
+
+
+def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
+    writer = Writer(tmp_path / "run")
+    for _ in range(3):
+        writer.write()
+    plan = make_plan(Asked(tmp_path / "run"))
+    assert plan.states == [0, 1, 2]
+    writer.write()
+    assert make_plan(Asked(tmp_path / "run")).states == [0, 1, 2, 3]
+
+
+def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for stream, expected in (
+        (Terminal(), "50 of 100 states drawn"),
+        (io.StringIO(), "50 of 100 states drawn"),
+    ):
+        with FrameProgress(MPI.COMM_SELF, stream=stream) as progress:
+            progress.LINE_SECONDS = 0.0
+            progress.update(0, 100)
+            progress.update(50, 100)
+        assert expected in stream.getvalue()
+        assert ("━" in stream.getvalue()) == stream.isatty()
+
+
+def test_nothing_optional_is_imported_unless_something_is_drawn(tmp_path):
+    written(tmp_path / "run")
+    program = (
+        "import sys; from lyra_petsc.cli.app import run_command_line;"
+        "code = run_command_line(['lyra-petsc', 'render', 'run', '--paraview']);"
+        "print([name for name in ('pyvista', 'vtkmodules', 'PIL', 'imageio_ffmpeg') if name in sys.modules]);"
+        "sys.exit(code)"
+    )
+    left = lyra([], tmp_path, program=("-c", program))
+    assert left.code == 0, left.err
+    assert left.out.splitlines()[-1] == "[]"
+    assert (tmp_path / "run" / SCRIPT).exists()
+
+
+@pytest.mark.parametrize("fields", [True, False])
+def test_the_script_for_paraview_is_python_and_names_what_is_there(tmp_path, fields, monkeypatch):
+    path = write_script(written(tmp_path / "run with 'quotes'", fields=fields))
+    text = path.read_text(encoding="utf-8")
+    tree = compile(text, str(path), "exec")
+    # with ParaView's functions replaced by ones that note their calls
+    calls: list[tuple[str, tuple, dict]] = []
+    monkeypatch.setitem(sys.modules, "paraview", SimpleNamespace(simple=_Recorder(calls)))
+    exec(tree, {"__file__": str(path)})
+    reader = next(keywords for name, _, keywords in calls if name == "Xdmf3ReaderS")
+    assert reader["FileName"] == [str(path.parent / "states.xdmf")]
+    colour = next(arguments for name, arguments, _ in calls if name == "ColorBy")[1]
+    assert colour == (("POINTS", "velocity", "Magnitude") if fields else None)
+    assert np.array_equal(
+        next(k for n, _, k in calls if n == "Calculator")["registrationName"], "displacement"
+    )
+
+
+class _Thing:
+    """Stands for whatever ParaView returns."""
+
+    TimestepValues = (0.0, 0.1)
+    CameraFocalPoint = (0.0, 0.0, 0.0)
+
+    def __getattr__(self, name: str) -> object:
+        if name == "PointData":
+            return {"velocity": None}
+        return lambda *arguments, **keywords: _Thing()
+
+
+class _Recorder:
+    """Stands for paraview.simple."""
+
+    def __init__(self, calls: list) -> None:
+        self._calls = calls
+
+    def __getattr__(self, name: str) -> object:
+        def call(*arguments: object, **keywords: object) -> _Thing:
+            self._calls.append((name, arguments, keywords))
+            return _Thing()
+
+        return call
