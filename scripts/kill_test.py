@@ -47,7 +47,7 @@ handles:
 motions:
   lift: [{time: 0.3, translate: [0, 0, 0]}, {time: 0.9, translate: [0, 0, 0.2]}]
 time: {end: 0.4, step: 0.005}
-output: {every: 0.02, checkpoint: {seconds: 0.05}, fields: [velocity], reactions: true}
+output: {every: 0.02, checkpoint: {seconds: 0.05}, fields: [velocity], reactions: true, vtkhdf: true}
 probes: {middle: {nodes: [24]}}
 """
 
@@ -183,7 +183,22 @@ def check_announced(out: Path) -> int:
                     raise Wrong(f"{name}: {path} has shape {data.shape}")
                 if not np.isfinite(data[()]).all():
                     raise Wrong(f"{name}: {path} is not finite")
+    check_vtkhdf(out, times)
     return len(grids)
+
+
+def check_vtkhdf(out: Path, times: list[float]) -> None:
+    """The same states, as VTK finds them; a kill may have come before the last was announced there, too."""
+    path = out / "states.vtkhdf"
+    found: list[float] = []
+    if path.exists():
+        with h5py.File(path, "r") as file:
+            found = file["VTKHDF/Steps/Values"][()].tolist()
+            for name in ("Points", "PointData/velocity", "PointData/rest"):
+                if not np.isfinite(file[f"VTKHDF/{name}"][()]).all():
+                    raise Wrong(f"{path.name}: {name} is not finite")
+    if found not in (times, times[:-1]):
+        raise Wrong(f"{path.name} has the times {found}, not {times}")
 
 
 def table(path: Path) -> np.ndarray:
