@@ -1,26 +1,34 @@
-"""What ``run --live`` costs: the same run with and without the page, one after the other, and their ratios.
+"""What ``run --live`` costs: one run whose page is stopped and let go on again and again.
 
-    python scripts/live_benchmark.py [--ranks 2] [--pairs 5] [--watch chromium] [SCENE [--set KEY=VALUE …]]
+    python scripts/live_benchmark.py [--ranks 2] [--pairs 20] [--seconds 2] [--watch chromium]
+        [SCENE [--set KEY=VALUE …]]
 
-Without SCENE the default one, to t = 1 s. With ``--watch`` that browser, without a screen and at the lowest
-priority, has the page open throughout, so that each state is drawn on this machine as well. Printed for each
-pair are the wall seconds of the steps and of the output, from summary.json; the median of the ratios is the
-answer, as other work on the machine comes and goes.
+The page's process is stopped (SIGSTOP) for some seconds and goes on (SIGCONT) for as many. Two neighbouring
+spells make a pair: wall time for each iteration of the linear solver with the page over that without it,
+from history.csv. Other work on the machine hits both alike; the median of the ratios is the answer. With
+``--watch`` that browser, without a screen and at the lowest priority, has the page open, and is stopped too.
 """
 
 from __future__ import annotations
 
-import json
+import contextlib
+import itertools
 import os
 import re
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
+import threading
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
+import numpy as np
 
+from lyra_petsc.results.run import Run
 from lyra_petsc.study.launch import environment, find_launcher
 
 BROWSER = (
@@ -31,69 +39,123 @@ BROWSER = (
 )
 
 
-def seconds(words: list[str], out: Path, browser: str | None) -> float:
-    """Wall seconds of the steps and of the output of one run."""
-    run = subprocess.Popen(
-        [*words, "--out", str(out)],
-        env=environment(),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    watching: subprocess.Popen[bytes] | None = None
+def page_process(out: Path) -> int:
+    """The page's process of the run in that folder."""
+    for entry in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            words = entry.joinpath("cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
+            if b"lyra_petsc.view.live" in words and os.fsencode(out) in words:
+                return int(entry.name)
+    raise SystemExit("the run has no page")
+
+
+def processor_seconds(process: int) -> float:
+    """User and system time of a process so far [s]."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def address(run: subprocess.Popen[str]) -> str:
+    """Where the page is."""
     told = []
     for line in run.stderr or ():
         told.append(line)
         found = re.match(r"view: (\S+)", line)
-        if found and browser:
-            root = ["--no-sandbox"] if os.geteuid() == 0 else []
-            profile = f"--user-data-dir={out}.browser"
-            command = [
-                "nice",
-                "-n",
-                "19",
-                browser,
-                *BROWSER,
-                *root,
-                profile,
-                "--remote-debugging-port=0",
-                found[1],
-            ]
-            watching = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    if run.wait() != 0:
-        raise SystemExit("".join(told))
-    if watching is not None:
-        watching.terminate()
-        watching.wait()
-    elif browser and "--live" in words:
-        raise SystemExit("the run ended before its page was there: give a longer one")
-    phases = json.loads((out / "summary.json").read_text())["wall_seconds"]
-    return float(phases["solve"] + phases["assembly"] + phases["output"])
+        if found:
+            # the run must not wait for someone to read what it says
+            threading.Thread(target=lambda: list(run.stderr or ()), daemon=True).start()
+            return found[1]
+    raise SystemExit("".join(told))
+
+
+def open_page(browser: str, url: str, folder: str) -> subprocess.Popen[bytes]:
+    """A browser without a screen, in a group of its own."""
+    root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    words = [
+        "nice",
+        "-n",
+        "19",
+        browser,
+        *BROWSER,
+        *root,
+        f"--user-data-dir={folder}",
+        "--remote-debugging-port=0",
+    ]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen([*words, url], stdout=quiet, stderr=quiet, start_new_session=True)
+
+
+def spells(page: int, group: int | None, out: Path, seconds: float, count: int) -> list[int]:
+    """Rows of history.csv at the ends of the spells; in the first, third, … the page is stopped."""
+    rows = [len(Run(out).history["step"])]
+    for spell in range(count):
+        number = signal.SIGCONT if spell % 2 else signal.SIGSTOP
+        os.kill(page, number)
+        if group is not None:
+            os.killpg(group, number)
+        time.sleep(seconds)
+        rows.append(len(Run(out).history["step"]))
+    os.kill(page, signal.SIGCONT)
+    return rows
+
+
+def ratios(out: Path, rows: Sequence[int]) -> list[float]:
+    """Time for each linear iteration with the page over that without, of neighbouring spells."""
+    history = Run(out).history
+    wall, work = np.asarray(history["wall_seconds"]), np.asarray(history["linear_iterations"])
+    # a step at the border belongs to neither
+    costs = [wall[a + 1 : b].sum() / max(work[a + 1 : b].sum(), 1) for a, b in itertools.pairwise(rows)]
+    return [on / off for off, on in zip(costs[::2], costs[1::2], strict=True) if on > 0 and off > 0]
 
 
 @click.command()
 @click.argument("scene", required=False)
 @click.option("--set", "settings", multiple=True)
 @click.option("--ranks", default=2)
-@click.option("--pairs", default=5)
+@click.option("--pairs", default=20)
+@click.option("--seconds", default=2.0)
 @click.option("--watch", metavar="BROWSER")
-def main(scene: str | None, settings: tuple[str, ...], ranks: int, pairs: int, watch: str | None) -> None:
-    """Run the pairs and print a table."""
-    if scene is None and not settings:
-        settings = ("time.end=1",)
+def main(
+    scene: str | None, settings: tuple[str, ...], ranks: int, pairs: int, seconds: float, watch: str | None
+) -> None:
+    """Run once and print the ratio."""
     words = [*(find_launcher(ranks) if ranks > 1 else []), sys.executable, "-m", "lyra_petsc", "run"]
     words += [scene] if scene else []
-    words += [word for setting in settings for word in ("--set", setting)]
-    ratios = []
-    print("| without [s] | --live [s] | ratio |\n| --- | --- | --- |")
-    with tempfile.TemporaryDirectory() as folder:
-        for pair in range(pairs):
-            # who goes first alternates: what slows down over time hits both
-            order = [["--live", "--no-browser"], []] if pair % 2 else [[], ["--live", "--no-browser"]]
-            took = {bool(o): seconds([*words, *o], Path(folder) / f"{pair}-{len(o)}", watch) for o in order}
-            ratios.append(took[True] / took[False])
-            print(f"| {took[False]:.2f} | {took[True]:.2f} | {ratios[-1]:.3f} |", flush=True)
-    print(f"median {statistics.median(ratios):.3f} on {ranks} rank(s), {os.cpu_count()} processors")
+    words += [word for setting in ("time.end=1000", *settings) for word in ("--set", setting)]
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        out = Path(folder) / "run"
+        words += ["--out", str(out), "--live", "--no-browser"]
+        run = subprocess.Popen(
+            words, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        browser = None
+        try:
+            url = address(run)
+            page = page_process(out)
+            began = processor_seconds(page)
+            if watch:
+                browser = open_page(watch, url, f"{folder}/browser")
+                time.sleep(10.0)
+            rows = spells(page, browser and browser.pid, out, seconds, 2 * pairs)
+            used = processor_seconds(page) - began
+        finally:
+            if browser is not None:
+                os.killpg(browser.pid, signal.SIGCONT)
+                os.killpg(browser.pid, signal.SIGTERM)
+                browser.wait()
+            run.terminate()
+            run.wait()
+        found = ratios(out, rows)
+    low, middle, high = np.percentile(found, [25, 50, 75])
+    print(
+        f"{ranks} rank(s), {os.cpu_count()} processors, {rows[-1] - rows[0]} steps, {len(found)} pairs: "
+        f"time with the page over time without {middle:.3f} (half of the pairs: {low:.3f} to {high:.3f}; "
+        f"mean {statistics.mean(found):.3f})"
+    )
+    print(
+        f"processor time of the page: {began:.1f} s to start, then {used:.1f} s "
+        f"in the {pairs * seconds:g} s that it was let run"
+    )
 
 
 if __name__ == "__main__":

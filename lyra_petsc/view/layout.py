@@ -28,7 +28,7 @@ def build(page: Page) -> Any:
                     view = vtk.VtkLocalView(
                         page.cloth.window, ref="cloth", after_scene_loaded=(page.drawn, "[]")
                     )
-                html.Div("{{ notice }}", v_if="notice", classes="notice", id="notice")
+                html.Div("{{ notice || farewell }}", v_if="notice || farewell", classes="notice", id="notice")
             with html.Div(classes="plots"):
                 for name in ("energies", "iterations"):
                     with html.Div(classes="plot", id=name):
@@ -46,7 +46,7 @@ def build(page: Page) -> Any:
 def _top(page: Page) -> None:
     with html.Div(classes="bar"):
         html.H1("{{ title }}", id="title")
-        html.Div("{{ status }}", classes="status", id="status")
+        html.Div("{{ status }}", classes="status", id="status", title=("status",))
         v.VSelect(
             v_model=("quantity",),
             items=("quantities",),

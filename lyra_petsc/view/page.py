@@ -89,7 +89,7 @@ class Page:
         run, state, player = self._run, self._state, self._player
         state.trame__title = f"{run.name} – lyra_petsc"
         state.title = run.scene.title or run.name
-        state.status, state.notice = self._outcome(), ""
+        state.status, state.notice, state.farewell = self._outcome(), "", ""
         state.frame, state.last = player.shown, player.last
         state.playing, state.edges = False, False
         state.clock, state.bar = "", None
@@ -254,10 +254,10 @@ class Page:
             with self._state as state:
                 state.notice = str(error)
 
-    def close(self, words: str) -> None:
-        """Tell those who look that the page goes no further."""
+    def say_goodbye(self, words: str) -> None:
+        """Tell those who look that the run has ended."""
         with self._state as state:
-            state.notice = words
+            state.farewell = words
 
 
 async def _wait(event: asyncio.Event, seconds: float) -> None:

@@ -8,6 +8,7 @@ import secrets
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,12 @@ from lyra_petsc.view.access import Access
 LOCAL = "127.0.0.1"
 
 CLOSING_SECONDS = 1.0
+
+RELOAD_SECONDS = 3.0
+"""How long a page that nobody has open waits for someone who only loads it again."""
+
+LONGEST_STAY = 1800.0
+"""Seconds after the end of its run that a page stays for those who have it open."""
 
 
 def check_address(host: str, port: int) -> None:
@@ -59,7 +66,7 @@ def serve(
     ready: Callable[[str], None],
     ended: Callable[[], str] | None = None,
 ) -> int:
-    """Serve the page of a run until a signal, or until what it shows is over.
+    """Serve the page of a run until a signal; or until the run has ended and nobody looks any more.
 
     Parameters
     ----------
@@ -129,7 +136,7 @@ async def _serve(
         sys.argv[1:] = words
     tasks = [asyncio.create_task(page.animate()), asyncio.create_task(page.follow())]
     if ended is not None:
-        tasks.append(asyncio.create_task(_watch(ended, page, over)))
+        tasks.append(asyncio.create_task(_watch(ended, page, access, over)))
     await asyncio.wait({listening, over}, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks:
         task.cancel()
@@ -145,12 +152,15 @@ async def _serve(
     return over.result() if over.done() else 0
 
 
-async def _watch(ended: Callable[[], str], page: Any, over: asyncio.Future[int]) -> None:
+async def _watch(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
     words = await asyncio.to_thread(ended)
     await asyncio.sleep(CLOSING_SECONDS)  # for the run to write its last words
     page.look()
-    page.close(words)
-    await asyncio.sleep(CLOSING_SECONDS)  # for them to arrive
+    page.say_goodbye(words)
+    deadline, unseen = time.monotonic() + LONGEST_STAY, 0.0
+    while unseen < RELOAD_SECONDS and time.monotonic() < deadline:
+        await asyncio.sleep(CLOSING_SECONDS)
+        unseen = 0.0 if access.watching else unseen + CLOSING_SECONDS
     _settle(over, 0)
 
 

@@ -180,6 +180,28 @@ def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
     assert seen.complaints() == []
 
 
+def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(browser, tmp_path):
+    from lyra_petsc.view.live import LivePage
+
+    writer = Writer(tmp_path / "run")
+    writer.write()
+    told = []
+    page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
+    try:
+        while not told:
+            time.sleep(0.1)
+        seen = Seen(browser, told[0])
+        writer.write()
+    finally:
+        page.end()
+    seen.until(lambda: f"later: lyra-petsc view {tmp_path / 'run'}" in seen.text("notice"))
+    assert seen.time() == pytest.approx(0.1)
+    seen.element("first").click()
+    seen.until(lambda: seen.time() == 0.0)
+    assert "The run has ended" in seen.text("notice")
+    assert seen.complaints() == []
+
+
 @pytest.mark.parametrize("width", [1280, 820, 420])
 def test_nothing_lies_over_another_at_any_width(serve, browser, tmp_path, width):
     page = serve(written(tmp_path / "run"))

@@ -131,14 +131,27 @@ def test_a_page_that_cannot_be_served_is_told(tmp_path):
     assert "nowhere: no such folder" in told[0]
 
 
-def test_who_looks_is_told_that_the_run_has_ended(tmp_path):
+def test_the_page_stays_while_it_is_open_and_goes_with_the_last_who_looks(tmp_path):
+    import http.client
+    from urllib.parse import urlsplit
+
     writer = Writer(tmp_path / "run")
     writer.write()
     told = []
     page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
     until(lambda: told, "nothing is said")
-    assert told[0].startswith("http://127.0.0.1:")
-    assert pages(tmp_path)
+    url = urlsplit(told[0])
+    connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    connection.request(
+        "GET", "/ws?" + url.query, headers=headers | {"Sec-WebSocket-Key": "c29tZSBub25zZW5zZSAgIA=="}
+    )
+    assert connection.getresponse().status == 101
+
     page.end()
+    time.sleep(6.0)
+    assert pages(tmp_path), "the page left those who look"
+    connection.close()
+    connection.sock = None
     until(lambda: not pages(tmp_path), "the page outlives its run")
     assert len(told) == 1
