@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.output.claim import Claim
@@ -19,6 +20,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.recorder import Recorder
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation, StepReport
+from lyra_petsc.solvers.options import unused
 
 StopAsked = Callable[[], int]
 """The signal by which any rank was asked to stop, else 0; collective."""
@@ -205,6 +207,8 @@ class _Journey:
             "terms": model.outline.terms,
             "partitioner": model.partitioner,
             "linear_solver": simulation.stepper.preset,
+            "petsc_options": PETSc.Options().getAll(),
+            "unused_petsc_options": unused(simulation.stepper.our_options) if outcome == "done" else [],
             "integrator": simulation.scene.time.scheme,
             "time": simulation.time,
             "estimated_error": simulation.estimated_error if simulation.local_error else None,

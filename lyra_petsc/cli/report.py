@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lyra_petsc.cli.options import SETTINGS, helped, results
 
+if TYPE_CHECKING:
+    from lyra_petsc.report.document import Drawing
+    from lyra_petsc.results.run import Run
+
 PAGE = "report.html"
+PICTURE_SIZE = "960x540"
 
 
 @click.command(context_settings=SETTINGS)
@@ -19,8 +25,8 @@ PAGE = "report.html"
 @click.pass_obj
 def report(comm: Any, run: Path, out: Path | None) -> None:
     """One HTML page about RUN: pictures, energy, steps, time, settings, notes, what to change."""
-    from lyra_petsc.parallel import on_root
     from lyra_petsc.extras import require
+    from lyra_petsc.parallel import on_root
 
     require("report", ("matplotlib", "jinja2"))
     path = on_root(comm, lambda: write_page(run, out))
@@ -40,12 +46,42 @@ def write_page(folder: Path, out: Path | None) -> Path:
     """
     from lyra_petsc.errors import InputError
     from lyra_petsc.output.atomic import replace_text
-    from lyra_petsc.report.run_page import run_page
+    from lyra_petsc.report.run_page import plain_pictures, run_page
     from lyra_petsc.results.run import Run
 
     path = folder / PAGE if out is None else out
     if path.is_dir() or not path.absolute().parent.is_dir():
         what = "is a folder; name a file" if path.is_dir() else "cannot be written: there is no such folder"
         raise InputError(what, file=path, key="--out")
-    replace_text(path, run_page(Run(folder)).html())
+    run = Run(folder)
+    pictures = _rendered(run) or plain_pictures(run)
+    replace_text(path, run_page(run, pictures).html())
     return path
+
+
+def _rendered(run: Run) -> list[Drawing]:
+    """Pictures of a few states as ``render`` draws them; none where that cannot be."""
+    from mpi4py import MPI
+
+    from lyra_petsc.cli.render import PACKAGES
+    from lyra_petsc.errors import LyraError
+    from lyra_petsc.extras import missing
+    from lyra_petsc.report.document import Drawing
+    from lyra_petsc.report.run_page import chosen_states, state_caption
+
+    if missing(PACKAGES):
+        return []
+    from lyra_petsc.render.draw import draw
+    from lyra_petsc.render.plan import Asked, make_plan
+
+    states = chosen_states(run)
+    with tempfile.TemporaryDirectory() as folder:
+        times = ",".join(repr(float(run.times[i])) for i in states)
+        asked = Asked(run.folder, at=times, out=Path(folder), size=PICTURE_SIZE, label=False)
+        try:
+            plan = make_plan(asked)
+            draw(MPI.COMM_SELF, asked, plan, lambda done, count: None)
+            drawn = {state: path.read_bytes() for path, state in plan.pictures}
+        except LyraError:  # no OpenGL: the page has plain pictures
+            return []
+    return [Drawing(f"state-{i}", state_caption(run, i), drawn[i], b"") for i in states]

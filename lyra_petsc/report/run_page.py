@@ -21,14 +21,14 @@ SLOWEST = 5
 PICTURES = 3
 
 
-def run_page(run: Run, pictures: Sequence[Drawing] | None = None) -> Report:
+def run_page(run: Run, pictures: Sequence[Drawing]) -> Report:
     """The page of a run that goes on, has ended, failed, or was killed.
 
     Parameters
     ----------
     run : Run
-    pictures : sequence of Drawing, optional
-        Of the sheet; without, plain ones are drawn.
+    pictures : sequence of Drawing
+        Of the sheet.
     """
     facts = Facts.of(run)
     page = Report(run.scene.title or run.name)
@@ -39,7 +39,7 @@ def run_page(run: Run, pictures: Sequence[Drawing] | None = None) -> Report:
     if not hints:
         page.paragraph("Nothing stands out: few iterations, no needless steps, little time in output.")
     page.heading("Pictures")
-    for drawing in plain_pictures(run) if pictures is None else pictures:
+    for drawing in pictures:
         page.figure(drawing)
     _energy(page, facts)
     _steps(page, facts)

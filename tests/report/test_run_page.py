@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -21,7 +22,7 @@ pytest.importorskip("jinja2")
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "cli"))
 
-from launch import SCENE, done, finish, lyra, start, without_pictures, write_scene
+from launch import SCENE, done, environment, finish, lyra, start, without_pictures, write_scene
 
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.report.run_advice import OPTIONS, advice
@@ -44,7 +45,7 @@ def page_of(folder: Path, *options: object) -> str:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     write_scene(folder, "title: A <b>small</b> sheet\n" + SCENE)
-    done(["run", "scene.yaml", "--out", "sheet"], folder, ranks=2)
+    done(["run", "scene.yaml", "--out", "sheet", "-ksp_rtol", "1e-5", "-ksp_rtoll", "1"], folder, ranks=2)
     return folder / "sheet"
 
 
@@ -68,6 +69,20 @@ def test_a_finished_run_has_all_sections(finished: Path) -> None:
     assert page.count("data:image/") == 3 + 2 + 1 + 1
     assert "A &lt;b&gt;small" in page
     assert "bending_scale: 1.0" in text  # the resolved scene
+    assert "-ksp_rtol 1e-5" in text
+    assert "PETSc options that nothing used: -ksp_rtoll" in text
+
+
+def test_the_page_does_without_what_draws_films(finished: Path, tmp_path: Path) -> None:
+    run = copied(finished, tmp_path)
+    program = (
+        "import sys; import lyra_petsc.cli.render as r; r.PACKAGES = ('no_such_package',);"
+        "from lyra_petsc.cli.report import write_page; from pathlib import Path;"
+        f"write_page(Path({str(run)!r}), None)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, env=environment(), timeout=60)
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/svg+xml") == 3 + 2 + 1 + 1
 
 
 def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> None:
