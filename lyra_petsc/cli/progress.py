@@ -61,6 +61,7 @@ class Progress:
         self._clock = clock
         self._stream = stream or sys.stderr
         self._began = clock()
+        self._first: tuple[float, float] | None = None
         self._last_shown: float | None = None
         self._fraction_shown = 0.0
         self._latest: str | None = None
@@ -91,7 +92,10 @@ class Progress:
         now = self._clock()
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
-        left = (now - self._began) * (1 - fraction) / fraction if fraction > 0 else math.nan
+        began, done = self._first or (self._began, 0.0)
+        left = (now - began) * (1 - fraction) / (fraction - done) if fraction > done else math.nan
+        # the first step compiles and loads what the others find ready: it is no measure for them
+        self._first = self._first or (now, fraction)
         state = (
             f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
             f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"

@@ -72,6 +72,17 @@ def test_other_ranks_are_silent():
     assert stream.getvalue() == ""
 
 
+def test_time_left_forgets_the_first_step_which_compiles():
+    stream, clock = io.StringIO(), Clock()
+    with Progress(FIRST, 4.0, stream=stream, clock=clock) as progress:
+        for now, time in ((60.0, 1.0), (70.0, 2.0), (100.0, 3.0)):
+            clock.now = now
+            progress.update(1, time, 1, 1, 0.0)
+    assert [line.split("  ")[-1] for line in stream.getvalue().splitlines()] == [
+        "3:00 left", "0:20 left", "0:20 left"
+    ]  # fmt: skip
+
+
 def test_time_left_on_resume_counts_from_where_it_goes_on():
     stream, clock = io.StringIO(), Clock()
     with Progress(FIRST, 4.0, start=3.0, stream=stream, clock=clock) as progress:
