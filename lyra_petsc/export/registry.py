@@ -39,7 +39,7 @@ FORMATS = {
         Format("ply", "a binary PLY file for each state, with the fields on vertices", ("meshio",)),
         Format("gltf", "an animated .glb: a morph target for each state", ("pygltflib",)),
         Format("usd", "an animated .usdc, with all fields", ("pxr",)),
-        Format("vtkhdf", "one file for ParaView and PyVista, with all fields"),
+        Format("vtkhdf", "one file for ParaView and VTK, with all fields"),
         Format("npz", "NumPy arrays of all states, with names and units"),
     )
 }

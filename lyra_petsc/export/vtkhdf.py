@@ -1,4 +1,4 @@
-"""VTKHDF: all states in one file of VTK's own HDF5 layout, for ParaView and PyVista."""
+"""VTKHDF: all states in one file of VTK's own HDF5 layout, for ParaView and programs that use VTK."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""states.vtkhdf: the states as one time series in VTK's own HDF5 layout, read by ParaView and PyVista.
+"""states.vtkhdf: the states as one time series in VTK's own HDF5 layout, read by ParaView and VTK.
 
 The file holds no state. Its datasets are *virtual*: they map onto those of ``states-NNNN.h5``, so that it is
 small, is replaced in one instant like ``states.xdmf``, and stands for exactly the states that it announces.

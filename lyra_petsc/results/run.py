@@ -172,6 +172,18 @@ class Run:
         """Number of the state nearest to a time [s]."""
         return int(np.abs(self.times - time).argmin())
 
+    def dataset(self, every: int = 1) -> Any:
+        """The states as an ``xarray.Dataset``, in memory; the extra ``export`` brings xarray.
+
+        Parameters
+        ----------
+        every : int
+            Take every so manieth state.
+        """
+        from lyra_petsc.results.dataset import dataset
+
+        return dataset(self, range(0, len(self), every))
+
     # -- tables --------------------------------------------------------------------------------------
 
     @property

@@ -169,7 +169,7 @@ class Output(Block):
     reactions : bool
         Write the forces at the handles to reactions.csv.
     vtkhdf : bool
-        Announce the states also in states.vtkhdf, which newer ParaView and PyVista read faster than the XDMF.
+        Announce the states also in states.vtkhdf, which newer ParaView reads faster than the XDMF.
     """
 
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})

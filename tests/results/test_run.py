@@ -107,6 +107,18 @@ def test_history_is_a_frame_where_pandas_is(tmp_path, monkeypatch, pandas):
     assert len(run.reactions) == 0
 
 
+def test_dataset(tmp_path):
+    pytest.importorskip("xarray")
+    data = Run(written(tmp_path, states=5)).dataset(every=2)
+    np.testing.assert_array_equal(data.time, [0.0, 0.2, 0.4])
+    np.testing.assert_array_equal(data.position.sel(time=0.4), position(4))
+    np.testing.assert_array_equal(data.velocity.sel(axis="z", time=0.2), velocity(2)[:, 2])
+    np.testing.assert_array_equal(data.stress[1], stress(2))
+    assert data.stress.dims == ("time", "triangle", "component")
+    assert data.stress.attrs["units"] == "N/m"
+    np.testing.assert_array_equal(data.triangles, TRIANGLES)
+
+
 def test_units_of_all_fields(tmp_path):
     run = Run(written(tmp_path))
     assert [run.field_units(name) for name in ("position", "velocity", "stress")] == ["m", "m/s", "N/m"]
