@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +33,17 @@ def new(comm: Any, name: str, mesh: Path | None) -> None:
 
     path = on_root(comm, lambda: write_starter(name, mesh))
     if comm.rank == 0:
-        word = shlex.quote(str(path))
-        click.echo(f"{path} written; next: lyra-petsc check {word}, then: mpirun -n 2 lyra-petsc run {word}")
+        word, (one, several) = shlex.quote(str(path)), ways_to_start()
+        click.echo(f"{path} written; next: {one} check {word}, then: {several} run {word}")
+
+
+def ways_to_start() -> tuple[str, str]:
+    """What a reader types to start the program, on one rank and on two (the script's choice for ``run``)."""
+    script = Path(__file__).resolve().parents[2] / "scripts" / "lyra.sh"
+    if shutil.which("lyra-petsc") is None and script.is_file():
+        command = f"bash {shlex.quote(os.path.relpath(script))}"
+        return command, command
+    return "lyra-petsc", "mpirun -n 2 lyra-petsc"
 
 
 def write_starter(name: str, mesh: Path | None) -> Path:
@@ -52,7 +62,7 @@ def write_starter(name: str, mesh: Path | None) -> Path:
     path = given if given.suffix.lower() in (".yaml", ".yml") else given.with_name(f"{given.name}.yaml")
     if os.path.lexists(path):  # before the mesh, which may take long
         raise InputError("exists and is left as it is; choose another name", file=path)
-    text = starter(path, None if mesh is None else _own_mesh(mesh))
+    text = starter(path, ways_to_start(), None if mesh is None else _own_mesh(mesh))
     try:
         # two at the same time: only one makes the file
         with open(path, "x", encoding="utf-8") as file:

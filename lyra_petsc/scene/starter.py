@@ -55,19 +55,23 @@ class OwnMesh:
     span: Box
 
 
-def starter(scene: Path, mesh: OwnMesh | None = None) -> str:
+def starter(scene: Path, commands: tuple[str, str], mesh: OwnMesh | None = None) -> str:
     """A commented scene that can be run as it stands.
 
     Parameters
     ----------
     scene : Path
         Where it will be written; the mesh file is named relative to it.
+    commands : pair of str
+        How the program is started on one rank and on two.
     mesh : OwnMesh, optional
         Without it, a grid.
     """
     text = files("lyra_petsc.scene").joinpath("starter.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(
         schema=SCHEMA_FILE,
+        one=commands[0],
+        two=commands[1],
         file=shlex.quote(scene.name),
         title=_quoted(scene.stem),
         mesh=_GRID if mesh is None else _mesh(mesh, scene),
