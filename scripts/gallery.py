@@ -1,6 +1,6 @@
 """Runs the scenes in configs/ and makes the pictures and films of docs/gallery.
 
-    python scripts/gallery.py [NAME…] [--runs FOLDER] [--ranks P]
+    .venv/bin/python scripts/gallery.py [NAME…] [--runs FOLDER] [--ranks P]
 
 Runs that are in the folder of runs (runs/gallery) already are not repeated. Ends with an error if the gallery
 grows beyond 5 MB.
@@ -19,6 +19,8 @@ GALLERY = ROOT / "docs" / "gallery"
 LIMIT = 5_000_000
 """Bytes of all pictures and films."""
 SIZE = "640x360"
+GIF = "flag"
+"""The scene that moves in the README."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,8 @@ ENTRIES = {
     "flag": Entry(1.5, ("--handles", "--wind")),
     "sail": Entry(1.0, ("--handles", "--field", "stress", "--range", "0,120"), speed=0.5),
     "drape": Entry(2.0, ("--handles", "--colors", "#2f6f9f,#f3e7d3")),
-    "swing": Entry(0.28, ("--handles", "--field", "speed"), ("output.every=0.01",), speed=0.2),
-    "spin": Entry(5.4, ("--handles", "--colors", "#7d3c74,#f0d49a"), ("time.end=7.4",)),
+    "swing": Entry(0.36, ("--handles", "--field", "speed"), ("output.every=0.01",), speed=0.2),
+    "spin": Entry(4.4, ("--handles", "--colors", "#7d3c74,#f0d49a"), ("time.end=7.2",)),
     "paper": Entry(0.4, ("--handles", "--colors", "#eee9dc,#c9a86a"), ("output.every=0.01",), speed=0.2),
     "plate": Entry(1.0, ("--handles", "--field", "curvature"), speed=0.5),
 }
@@ -89,19 +91,9 @@ def main() -> None:
     GALLERY.mkdir(parents=True, exist_ok=True)
     for name in asked.names or ENTRIES:
         make(name, ENTRIES[name], asked.runs.absolute(), asked.ranks)
-    if not asked.names or "flag" in asked.names:
-        run = str(asked.runs.absolute() / "flag")
-        lyra(
-            "render",
-            run,
-            "--film",
-            str(GALLERY / "flag.gif"),
-            "--size",
-            "480x270",
-            "--fps",
-            "20",
-            "--handles",
-        )
+    if not asked.names or GIF in asked.names:
+        look = ("--size", "480x270", "--fps", "20", "--handles")
+        lyra("render", str(asked.runs.absolute() / GIF), "--film", str(GALLERY / f"{GIF}.gif"), *look)
     size = sum(path.stat().st_size for path in GALLERY.iterdir())
     print(f"gallery      {GALLERY}: {size / 1e6:.2f} MB")
     if size > LIMIT:

@@ -1,0 +1,55 @@
+"""The gallery: every shipped scene is in it, it is small, and its script makes it."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def gallery() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("gallery", ROOT / "scripts" / "gallery.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["gallery"] = module  # dataclasses look themselves up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_scene_is_shown_and_all_is_small(gallery):
+    names = {path.stem for path in (ROOT / "configs").glob("*.yaml")}
+    assert set(gallery.ENTRIES) == names
+    page = (gallery.GALLERY.parent / "gallery.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"gallery/(\w+)\.png", page)) == names
+    files = {path.name for path in gallery.GALLERY.iterdir()}
+    assert files == {f"{name}.{ending}" for name in names for ending in ("png", "mp4")} | {"flag.gif"}
+    assert sum(path.stat().st_size for path in gallery.GALLERY.iterdir()) < gallery.LIMIT
+    for name in names:
+        with Image.open(gallery.GALLERY / f"{name}.png") as picture:
+            assert picture.size == (640, 360)
+
+
+@pytest.mark.slow
+def test_the_script_makes_pictures_and_films(gallery, tmp_path, monkeypatch):
+    small = (
+        "mesh.grid.nx=4",
+        "mesh.grid.ny=4",
+        "handles=[{nodes: [0, 4]}]",
+        "time.end=0.02",
+        "output.every=0.01",
+    )
+    monkeypatch.setattr(gallery, "ENTRIES", {"paper": gallery.Entry(0.02, ("--handles",), small)})
+    monkeypatch.setattr(gallery, "GALLERY", tmp_path / "gallery")
+    monkeypatch.setattr(sys, "argv", ["gallery.py", "--runs", str(tmp_path / "runs")])
+    monkeypatch.setattr(gallery, "GIF", "paper")
+    gallery.main()
+    assert {path.name for path in (tmp_path / "gallery").iterdir()} == {"paper.png", "paper.mp4", "paper.gif"}
