@@ -11,8 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
-    {"errors", "extras", "nearest"},
-    {"kernel_cache", "parallel", "profiling"},
+    {"errors", "nearest"},
+    {"extras", "kernel_cache", "parallel", "profiling"},
     {"materials"},
     {"scene"},
     {"meshing"},
