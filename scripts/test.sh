@@ -23,7 +23,7 @@ for argument in "$@"; do
     previous=$argument
 done
 
-set_up test study view
+set_up test study view export
 cd -- "$root"
 logs=$(mktemp -d)
 trap 'rm -rf -- "$logs"' EXIT
