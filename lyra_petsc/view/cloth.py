@@ -38,12 +38,8 @@ class Cloth:
 
     def __init__(self, triangles: NDArray[np.int64], n_vertices: int) -> None:
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # no display is nothing to worry about
-        self._surface = Surface(triangles, n_vertices)
-        cells = vtkCellArray()
-        cells.SetData(3, _as_vtk(triangles.ravel()))
         self._data = vtkPolyData()
-        self._data.SetPoints(vtkPoints())
-        self._data.SetPolys(cells)
+        self.set_mesh(triangles, n_vertices)
         self._mapper = vtkPolyDataMapper()
         self._mapper.SetInputData(self._data)
         self._mapper.SetColorModeToDirectScalars()
@@ -61,6 +57,15 @@ class Cloth:
         self._renderer.AddActor(actor)
         self.window = vtkRenderWindow()
         self.window.AddRenderer(self._renderer)
+
+    def set_mesh(self, triangles: NDArray[np.int64], n_vertices: int) -> None:
+        """Replace the triangles; the vertices have no place until the next `show`."""
+        self._surface = Surface(triangles, n_vertices)
+        cells = vtkCellArray()
+        cells.SetData(3, _as_vtk(triangles.ravel()))
+        self._data.Initialize()
+        self._data.SetPoints(vtkPoints())
+        self._data.SetPolys(cells)
 
     def show(self, positions: Array, colours: Colours | None, *, on_triangles: bool = False) -> None:
         """Put the cloth there.

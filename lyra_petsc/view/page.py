@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from trame.app import get_server
 
-from lyra_petsc.errors import LyraError
+from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.output.lock import in_use
 from lyra_petsc.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.results.run import Run
 from lyra_petsc.view import plots
@@ -65,7 +66,8 @@ class Page:
         self._run, self._access = run, access
         self.server = get_server("lyra-petsc")
         self._state = self.server.state
-        self.cloth = Cloth(run.triangles, len(run.rest))
+        self._triangles = run.triangles
+        self.cloth = Cloth(self._triangles, len(run.rest))
         self._player = Player(run)
         self._palette: Palette | None = None
         self._aspect = FIRST_ASPECT
@@ -93,21 +95,29 @@ class Page:
         state.frame, state.last = player.shown, player.last
         state.playing, state.edges = False, False
         state.clock, state.bar = "", None
-        choices = names(run)
-        state.quantities = [{"title": name.replace("_", " "), "value": name} for name in (PLAIN, *choices)]
-        state.quantity = "speed" if "speed" in choices else PLAIN
+        state.quantity = "speed"
         unit = "×" if self._unit else "/s"
         state.speeds = [
             {"title": f"{pace * player.speed:g} {unit}", "value": pace * player.speed} for pace in PACES
         ]
         state.speed = player.speed
-        self._choose(state.quantity)
+        self._offer_quantities()
         self._draw_plots()
         self._show()
+
+    def _offer_quantities(self) -> None:
+        """What this run can be coloured by, and the palette of what is chosen."""
+        known, state = names(self._run), self._state
+        state.quantities = [{"title": name.replace("_", " "), "value": name} for name in (PLAIN, *known)]
+        if state.quantity not in known:
+            state.quantity = PLAIN
+        self._choose(state.quantity)
 
     def _outcome(self) -> str:
         summary = self._run.summary
         outcome = str(summary.get("outcome", ""))
+        if outcome == "running" and not in_use(self._run.folder):
+            outcome = "broken off"
         ranks = summary.get("ranks", 0)
         words = [f"{len(self._run.rest):,} vertices", f"{len(self._run)} states"]
         if ranks:
@@ -181,6 +191,8 @@ class Page:
         index = self._shown = self._player.due()
         try:
             positions = run.positions[index]
+            if len(positions) != len(run.rest):  # `look` will find out
+                raise InputError("was replaced by another run", file=run.folder)
             colours, on_triangles = self._palette.colours(index) if self._palette else (None, False)
             state.notice = ""
         except LyraError as error:
@@ -212,8 +224,9 @@ class Page:
 
     def _mark(self) -> None:
         self._marked = clock.monotonic()
+        time = float(self._run.times[self._player.shown])
         for name, figure in self._figures.items():
-            self._state[name] = plots.at_time(figure, float(self._run.times[self._shown]))
+            self._state[name] = plots.at_time(figure, time)
 
     # -- as time goes by ---------------------------------------------------------------------------
 
@@ -241,18 +254,27 @@ class Page:
 
     def look(self) -> None:
         """See what the run has written meanwhile."""
-        try:
-            with self._state as state:
+        with self._state as state:
+            try:
                 if self._player.follow():
-                    if self._palette:
-                        self._palette.renew()
-                    self._draw_plots()
-                    self._mark()
+                    self._renew()
                     state.last, state.notice = self._player.last, ""
                 state.status = self._outcome()
-        except LyraError as error:
-            with self._state as state:
+            except LyraError as error:
                 state.notice = str(error)
+
+    def _renew(self) -> None:
+        """Take in what is new in the run, or that it is another one."""
+        if self._run.triangles is not self._triangles:
+            self._triangles = self._run.triangles
+            self.cloth.set_mesh(self._triangles, len(self._run.rest))
+            self._offer_quantities()
+            self.fit()
+            self._again()
+        elif self._palette:
+            self._palette.renew()
+        self._draw_plots()
+        self._mark()
 
     def say_goodbye(self, words: str) -> None:
         """Tell those who look that the run has ended."""

@@ -8,6 +8,7 @@ import secrets
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -117,7 +118,8 @@ async def _serve(
     loop = asyncio.get_running_loop()
     over: asyncio.Future[int] = loop.create_future()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, _settle, over, int(number))
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
+            loop.add_signal_handler(number, _settle, over, int(number))
     words, sys.argv[1:] = sys.argv[1:], []  # trame reads them, too
     try:
         listening = asyncio.create_task(
@@ -137,9 +139,12 @@ async def _serve(
     tasks = [asyncio.create_task(page.animate()), asyncio.create_task(page.follow())]
     if ended is not None:
         tasks.append(asyncio.create_task(_watch(ended, page, access, over)))
-    await asyncio.wait({listening, over}, return_when=asyncio.FIRST_COMPLETED)
+    await asyncio.wait({listening, over, *tasks}, return_when=asyncio.FIRST_COMPLETED)
+    failed = [task for task in tasks if task.done() and task.exception()]
     for task in tasks:
         task.cancel()
+    if failed:
+        await failed[0]
     if listening.done():
         try:
             listening.result()
@@ -153,7 +158,12 @@ async def _serve(
 
 
 async def _watch(ended: Callable[[], str], page: Any, access: Access, over: asyncio.Future[int]) -> None:
-    words = await asyncio.to_thread(ended)
+    loop = asyncio.get_running_loop()
+    told: asyncio.Future[str] = loop.create_future()
+    # a thread that waits for ever must not keep the process from ending
+    wait = threading.Thread(target=lambda: loop.call_soon_threadsafe(told.set_result, ended()), daemon=True)
+    wait.start()
+    words = await told
     await asyncio.sleep(CLOSING_SECONDS)  # for the run to write its last words
     page.look()
     page.say_goodbye(words)

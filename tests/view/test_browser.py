@@ -11,7 +11,7 @@ from written_run import Writer, written
 
 pytestmark = pytest.mark.slow
 
-PATIENCE = 30.0
+PATIENCE = 60.0
 """Seconds; the browser draws by software, on a machine that may have other work."""
 
 
@@ -115,9 +115,11 @@ def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
     assert seen.time() == pytest.approx(0.8)
 
     # plays: the picture and the time change, and it stops at the end
+    seen.choose("speed", "0.1 ×")
     seen.element("play").click()
     seen.until(lambda: seen.time() < 0.7)
     seen.until_drawn(last)
+    seen.choose("speed", "4 ×")
     seen.until(lambda: seen.time() == pytest.approx(0.8))
     seen.until_drawn(last, differs=False)
 
@@ -177,6 +179,17 @@ def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
     for file in (tmp_path / "run").iterdir():
         file.unlink()
     seen.until(lambda: "is not the folder of a run" in seen.text("notice"))
+
+    # another run takes its place, with fewer states and without velocities
+    writer = Writer(tmp_path / "run", fields=False)
+    writer.write()
+    writer.write()
+    seen.until(lambda: "2 states" in seen.text("status"))
+    seen.until(lambda: not seen.elements("#notice"))
+    seen.until(lambda: not seen.elements("#colours"))
+    seen.element("first").click()
+    seen.until(lambda: seen.time() == 0.0)
+    seen.until(lambda: seen.has_cloth(seen.picture()))
     assert seen.complaints() == []
 
 
