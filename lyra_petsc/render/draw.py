@@ -22,7 +22,7 @@ from lyra_petsc.render.quantities import Quantity, material_coordinates, quantit
 from lyra_petsc.render.stage import Look, Stage, wind_arrows
 from lyra_petsc.render.surface import over_whole_sheet
 from lyra_petsc.render.survey import Survey, survey
-from lyra_petsc.render.timing import spread_states
+from lyra_petsc.render.timing import decimals, spread_states
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -137,6 +137,7 @@ def _stage(
         ground=asked.ground and scene.gravity is not None,
         label=asked.label,
         unit="" if scene.time.analysis == "static" else "s",
+        decimals=decimals(run.times),
     )
     share_cores(comm.Split_type(_shared()).size if comm.size > 1 else 1)
     return Stage(look, fit.view(reach), bounds, run.triangles, len(run.rest))

@@ -148,7 +148,7 @@ def make_plan(asked: Asked) -> Plan:
         size=size,
         colors=colors,
         pictures=[
-            (folder / f"picture-{time:g}.png", state) for time, state in zip(times, states, strict=True)
+            (folder / f"picture-{time:.12g}.png", state) for time, state in zip(times, states, strict=True)
         ],
         film=(film, timing) if film is not None and timing is not None else None,
         sheet=(folder / SHEET, spread_states(run.times, TILES)) if asked.sheet or everything else None,

@@ -53,7 +53,9 @@ class Look:
     ground, label : bool
         Whether there is a floor, and the time in a corner.
     unit : str
-        Of the time.
+        Of the time; empty: it is a load factor.
+    decimals : int
+        That the time is shown with.
     """
 
     size: tuple[int, int]
@@ -67,6 +69,7 @@ class Look:
     ground: bool = True
     label: bool = True
     unit: str = "s"
+    decimals: int = 2
 
 
 class Stage:
@@ -159,9 +162,9 @@ class Stage:
             self._floor.texture = floor
         if look.held is not None:
             self._move_handles(look.held, time, x)
-        unit = f" {look.unit}" if look.unit else ""
         name = "t" if look.unit else "load"
-        self._text.input = f"{name} = {time:.4g}{unit}" if look.label else ""
+        text = f"{name} = {time:.{look.decimals}f} {look.unit}"
+        self._text.input = text if look.label else ""
         if self._first:
             self._plotter.show(auto_close=False)
             self._first = False

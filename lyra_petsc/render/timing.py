@@ -124,3 +124,13 @@ def spread_states(times: Array, count: int) -> tuple[int, ...]:
     """Up to ``count`` different states, at equal intervals from the first to the last."""
     wanted = np.linspace(times[0], times[-1], count)
     return tuple(int(i) for i in np.unique(nearest_states(times, wanted)))
+
+
+def decimals(times: Array) -> int:
+    """How many tell the states apart: those of their interval where that is a short number."""
+    if len(times) == 1:
+        return 2
+    interval = float(np.median(np.diff(times)))
+    least = max(0, math.ceil(-math.log10(interval) - 1e-9))
+    short = abs(round(interval, least) - interval) < 1e-3 * interval
+    return least if short else least + 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.render.timing import film_timing, nearest_states, pick_state, spread_states
+from lyra_petsc.render.timing import decimals, film_timing, nearest_states, pick_state, spread_states
 
 
 @pytest.mark.parametrize(
@@ -93,3 +93,12 @@ def test_pictures_of_a_sheet_are_spread():
     assert spread_states(0.1 * np.arange(11), 6) == (0, 2, 4, 6, 8, 10)
     assert spread_states(0.1 * np.arange(2), 6) == (0, 1)
     assert spread_states(np.array([0.0]), 6) == (0,)
+
+
+@pytest.mark.parametrize(
+    ("interval", "expected"), [(0.04, 2), (0.025, 3), (0.1, 1), (1.0, 0), (30.0, 0), (0.001, 3), (1 / 60, 3)]
+)
+def test_the_time_in_the_corner_tells_states_apart(interval, expected):
+    times = np.cumsum(np.r_[0.0, np.full(9, interval)])
+    assert decimals(times) == expected
+    assert len({f"{time:.{expected}f}" for time in times}) == 10
