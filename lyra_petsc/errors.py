@@ -76,3 +76,6 @@ class Interrupted(LyraError):
         super().__init__(message)
         self.signal_number = signal_number
         self.exit_code = 130 if signal_number == 2 else 143
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (Interrupted, (str(self), self.signal_number))

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import click
 
 from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.signals import watched
 
 
 @click.command(context_settings=SETTINGS)
 @helped
 @results
-@click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, npz or vtkhdf.")
+@click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")
 @click.option(
     "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the files (RUN/FORMAT)."
 )
@@ -26,9 +29,17 @@ def export(comm: Any, /, run: Path, **asked: Any) -> None:
     from lyra_petsc.export.export import export_run
     from lyra_petsc.parallel import on_root
 
+    for number in watched():  # rank 0 works, and speaks for all
+        signal.signal(number, _give_up if comm.rank == 0 else signal.SIG_IGN)
     done = on_root(comm, lambda: export_run(run, **asked))
     if comm.rank == 0 and done is not None:
         states = f"{done.states} state{'s' if done.states > 1 else ''}"
         files = [name for name in done.files if name != "times.csv"]
         named = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"
         click.echo(f"{states} in {done.folder}: {named}")
+
+
+def _give_up(number: int, frame: FrameType | None) -> None:
+    from lyra_petsc.errors import Interrupted
+
+    raise Interrupted(f"stopped by {signal.Signals(number).name}; nothing was written", number)

@@ -1,0 +1,74 @@
+"""The command ``export``, on one rank and on two."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from launch import done, finish, lyra, start
+from written_run import position, written
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_states_are_written_and_named(tmp_path: Path, ranks: int) -> None:
+    written(tmp_path / "run", states=3)
+    left = done(["export", "run", "--to", "npz", "--every", "2"], tmp_path, ranks)
+    assert "2 states in run/npz: run.npz" in left.out
+    found = np.load(tmp_path / "run" / "npz" / "run.npz")["position"]
+    np.testing.assert_array_equal(found, [position(0), position(2)])
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run"], "Missing option '--to'"),
+        (["run", "--to", "objj"], "--to: unknown format 'objj', did you mean 'obj'"),
+        (["nowhere", "--to", "obj"], "nowhere: no such folder"),
+        (["run", "--to", "obj", "--every", "x"], "Invalid value for '--every'"),
+        (["run", "--to", "obj", "--out", "run"], "run: --out: exists"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, words: list[str], said: str, ranks: int) -> None:
+    written(tmp_path / "run")
+    before = sorted(tmp_path.rglob("*"))
+    left = lyra(["export", *words], tmp_path, ranks)
+    assert left.code == 2, left.err
+    (line,) = left.ours
+    assert said in line
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+SLOW = """
+import sys, time
+from lyra_petsc.export import obj
+from lyra_petsc.cli.app import run_command_line
+
+write = obj.write
+
+def slowly(frames, folder, name):
+    write(frames, folder, name)
+    time.sleep(60)
+
+obj.write = slowly
+sys.exit(run_command_line(sys.argv))
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_nothing(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    written(tmp_path / "run")
+    process = start(["export", "run", "--to", "obj", "--out", "out"], tmp_path, program=("-c", SLOW))
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "out.part" / "run_0002.obj").exists():
+        assert time.monotonic() < deadline, sys.argv
+        time.sleep(0.02)
+    process.send_signal(number)
+    left = finish(process)
+    assert left.code == code
+    assert f"stopped by {number.name}; nothing was written" in left.err
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
