@@ -1,0 +1,44 @@
+"""``output: {vtkhdf: true}`` in a run: what VTK finds in it is what the states hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from launch import done, write_scene
+from vtkhdf_reader import read
+
+from lyra_petsc.results.run import Run
+from lyra_petsc.scene.control import FIELDS
+
+ON = ["--set", "output.vtkhdf=true", "--set", f"output.fields=[{', '.join(FIELDS)}]"]
+
+
+def check(folder: Path) -> None:
+    run = Run(folder)
+    found = read(folder / "states.vtkhdf")
+    np.testing.assert_array_equal([time for time, *_ in found], run.times)
+    for i, (_, points, triangles, arrays) in enumerate(found):
+        np.testing.assert_array_equal(points, run.positions[i])
+        np.testing.assert_array_equal(triangles, run.triangles)
+        assert {*arrays["vertex"], *arrays["triangle"]} == {"rest", *FIELDS}
+        for name in FIELDS:
+            np.testing.assert_array_equal(arrays[run.field_on(name)][name], run.field(name)[i])
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_every_time_and_field(tmp_path: Path, ranks: int) -> None:
+    scene = write_scene(tmp_path)
+    done(["run", scene, "--out", "out", "--set", "time.end=0.03", *ON], tmp_path, ranks)
+    check(tmp_path / "out")
+    done(["run", scene, "--out", "out", "--resume", *ON], tmp_path, ranks)
+    check(tmp_path / "out")
+    assert len(Run(tmp_path / "out")) > 3
+
+
+def test_a_scene_that_does_not_name_it_has_no_such_files(tmp_path: Path) -> None:
+    done(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
+    names = {entry.name for entry in (tmp_path / "out").iterdir()}
+    assert "states.xdmf" in names
+    assert not {"states.vtkhdf", "cells.h5"} & names
