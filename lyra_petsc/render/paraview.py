@@ -125,8 +125,8 @@ def write_script(folder: Path) -> Path:
         vectors=repr({name: True for name in names if len(run.field(name)[0].shape) > 1}),
         units=repr({name: f" [{unit}]" for name in names if (unit := run.field_units(name)) != "1"}),
         unit="" if static else " s",
-        up=repr([float(v) for v in up]),
-        sight=repr([round(float(v), 6) for v in sight]),
+        up=repr([float(v) + 0.0 for v in up]),
+        sight=repr([round(float(v), 6) + 0.0 for v in sight]),
     )
     replace_text(path, text)
     return path
