@@ -95,3 +95,23 @@ def test_options_of_the_page_without_a_page(tmp_path, option):
     assert len(left.ours) == 1
     assert f"{option[0]}: says where the page of --live is" in left.ours[0]
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("variables", "opened"),
+    [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "firefox"}, True)],
+)
+def test_a_browser_is_opened_where_there_is_a_desktop(monkeypatch, variables, opened):
+    import webbrowser
+
+    from lyra_petsc.view import server
+
+    asked = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
+    monkeypatch.setattr(server.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert server.open_browser("http://127.0.0.1:1/") is opened
+    assert asked == ["http://127.0.0.1:1/"] * opened
