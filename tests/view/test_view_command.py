@@ -99,7 +99,7 @@ def test_options_of_the_page_without_a_page(tmp_path, option):
 
 @pytest.mark.parametrize(
     ("variables", "opened"),
-    [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "firefox"}, True)],
+    [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "b"}, True)],
 )
 def test_a_browser_is_opened_where_there_is_a_desktop(monkeypatch, variables, opened):
     import webbrowser
