@@ -115,6 +115,27 @@ def test_gltf(tmp_path, vt):
     np.testing.assert_allclose(gltf.nodes[0].rotation, [-half, 0, 0, half])  # z, against gravity, up
 
 
+@pytest.mark.parametrize("vt", ["none", "each vertex"])
+def test_gltf_as_another_program_animates_it(tmp_path, vt):
+    geometry = pytest.importorskip("vtkmodules.vtkIOGeometry")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    done = export_run(written(tmp_path / "run", states=4, vt=vt), "gltf")
+    reader = geometry.vtkGLTFReader()
+    reader.SetFileName(str(done.folder / "run.glb"))
+    reader.SetFrameRate(1000)
+    reader.UpdateInformation()
+    reader.EnableAnimation(0)
+    for state in range(4):
+        reader.UpdateTimeStep(0.1 * state)
+        block = reader.GetOutputDataObject(0)
+        while block.IsA("vtkMultiBlockDataSet"):
+            block = block.GetBlock(0)
+        x, y, z = position(state).T
+        shown = vtk_to_numpy(block.GetPoints().GetData())
+        np.testing.assert_allclose(shown, np.stack([x, z, -y], axis=1), rtol=0, atol=1e-6)
+
+
 def usd_errors(stage):
     """What the library's own validators have against a stage."""
     validation = pytest.importorskip("pxr.UsdValidation")
