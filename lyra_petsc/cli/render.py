@@ -71,6 +71,7 @@ def render_run(comm: MPI.Comm, asked: Asked) -> None:
     from lyra_petsc.cli.signals import StopRequest
     from lyra_petsc.errors import Interrupted
     from lyra_petsc.parallel import on_root
+    from lyra_petsc.render.opengl import share_cores
     from lyra_petsc.render.paraview import write_script
 
     if asked.paraview:
@@ -79,6 +80,7 @@ def render_run(comm: MPI.Comm, asked: Asked) -> None:
             print(f"script   {path}\nopen     paraview --script={path}", flush=True)
         if not (asked.at or asked.film or asked.sheet):
             return
+    share_cores(comm)
     plan = on_root(comm, lambda: _plan(asked))
     assert plan is not None
     stop = StopRequest(comm)

@@ -16,7 +16,6 @@ from lyra_petsc.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.render.files import PictureFiles
 from lyra_petsc.render.ground import Bounds
 from lyra_petsc.render.held import HeldVertices
-from lyra_petsc.render.opengl import share_cores
 from lyra_petsc.render.plan import Asked, Plan
 from lyra_petsc.render.quantities import Quantity, material_coordinates, quantity
 from lyra_petsc.render.stage import Look, Stage, wind_arrows
@@ -67,7 +66,7 @@ def draw(comm: MPI.Comm, asked: Asked, plan: Plan, tell: Callable[[int, int], No
     part = _together(comm, lambda: survey(plan.run, mine, around, shown if plan.limits is None else None))
     whole = comm.bcast(_joined(comm.gather(part)))
     with ExitStack() as open_now:
-        stage = _together(comm, lambda: _stage(comm, asked, plan, shown, fit, whole))
+        stage = _together(comm, lambda: _stage(asked, plan, shown, fit, whole))
         open_now.callback(stage.close)
         files = PictureFiles(plan) if comm.rank == 0 else None
         if files is not None:
@@ -109,9 +108,7 @@ def _joined(parts: list[Survey] | None) -> Survey | None:
     return whole
 
 
-def _stage(
-    comm: MPI.Comm, asked: Asked, plan: Plan, shown: Quantity | None, fit: Fit, whole: Survey
-) -> Stage:
+def _stage(asked: Asked, plan: Plan, shown: Quantity | None, fit: Fit, whole: Survey) -> Stage:
     run, scene = plan.run, plan.scene
     n_fit = len(fit.normals)
     reach, up = whole.reach[:n_fit], upwards(scene)
@@ -139,14 +136,7 @@ def _stage(
         unit="" if scene.time.analysis == "static" else "s",
         decimals=decimals(run.times),
     )
-    share_cores(comm.Split_type(_shared()).size if comm.size > 1 else 1)
     return Stage(look, fit.view(reach), bounds, run.triangles, len(run.rest))
-
-
-def _shared() -> int:
-    from mpi4py import MPI
-
-    return int(MPI.COMM_TYPE_SHARED)
 
 
 def _image(stage: Stage, plan: Plan, states: list[int], rank: int) -> NDArray[np.uint8] | None:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import ctypes.util
 import os
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import InputError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 REMEDY = (
     "OpenGL cannot be started without a display; install libegl1 "
@@ -15,8 +18,13 @@ REMEDY = (
 )
 
 
-def share_cores(ranks_here: int) -> None:
-    """Let the software renderer of this rank take its part of the cores; before anything is drawn."""
+def share_cores(comm: MPI.Comm) -> None:
+    """Let each rank draw with its part of the cores; collective, before anything is drawn."""
+    from mpi4py import MPI
+
+    here = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    ranks_here = here.size
+    here.Free()
     if ranks_here > 1:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         os.environ.setdefault("LP_NUM_THREADS", str(max(1, cores // ranks_here)))
@@ -24,10 +32,11 @@ def share_cores(ranks_here: int) -> None:
 
 def import_pyvista() -> Any:
     """The package, told to draw off-screen and to leave the terminal alone."""
+    # which devices Mesa and which windows VTK try in vain is nothing to worry about
+    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")
     import pyvista
     from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
 
-    # which windows VTK tries in vain before it finds one is nothing to worry about
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     vtkObject.GlobalWarningDisplayOff()
     pyvista.OFF_SCREEN = True

@@ -134,14 +134,14 @@ def make_plan(asked: Asked) -> Plan:
     film = asked.film or (folder / FILM if everything else None)
     colors = colors_of(asked.colors)
     texture = None if asked.texture is None else read_texture(asked.texture)
-    if asked.out is not None:
-        _make(asked.out)
     timing = None
     if film is not None:
-        check_film(film, size)
+        check_film(asked.film or Path(FILM), size)
         gif = film.suffix.lower() == ".gif"
         timing = film_timing(run.times, fps=asked.fps, speed=asked.speed, static=static, gif=gif)
     check_opengl()
+    if asked.out is not None:
+        _make(asked.out)
     return Plan(
         run=run,
         scene=scene,

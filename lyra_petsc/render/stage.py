@@ -14,7 +14,7 @@ from lyra_petsc.render.ground import Bounds, Ground
 from lyra_petsc.render.held import HeldVertices
 from lyra_petsc.render.opengl import import_pyvista
 from lyra_petsc.render.quantities import Quantity
-from lyra_petsc.render.surface import Surface, over_whole_sheet
+from lyra_petsc.render.surface import Surface
 from lyra_petsc.render.window import image_of
 
 Array = NDArray[np.float64]
@@ -294,8 +294,3 @@ def _towards(front: Array, right: Array, up: Array, *, azimuth: float, elevation
 
 def _only_light(common: dict[str, Any]) -> dict[str, Any]:
     return {key: common[key] for key in ("interpolation", "ambient", "diffuse", "specular", "specular_power")}
-
-
-def texture_coordinates(corner_uv: Array, *, given: bool) -> Array:
-    """(F, 3, 2) the mesh's own ``vt`` as they stand; without, the picture covers the sheet once."""
-    return corner_uv if given else over_whole_sheet(corner_uv)
