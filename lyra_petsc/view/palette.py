@@ -72,9 +72,14 @@ class Palette:
         ends = (self._high, self._low) if self._low <= self._high else (0.0, 0.0)
         return {
             "title": self._quantity.label,
-            "ticks": [f"{value:.3g}" for value in np.linspace(*ends, 5)],
+            "ticks": [_number(value, ends[0] - ends[1]) for value in np.linspace(*ends, 5)],
             "shades": shades,
         }
+
+
+def _number(value: float, span: float) -> str:
+    """Three digits; what is rounding beside the span is zero."""
+    return f"{float(f'{value:.3g}'):g}" if abs(value) > 1e-6 * span else "0"
 
 
 def sample(count: int, most: int) -> list[int]:

@@ -6,7 +6,7 @@ from written_run import TRIANGLES, velocity, written
 
 from lyra_petsc.results.run import Run
 from lyra_petsc.view import plots
-from lyra_petsc.view.palette import Palette, names, sample
+from lyra_petsc.view.palette import Palette, _number, names, sample
 
 
 def test_colours_follow_the_values(tmp_path):
@@ -34,6 +34,20 @@ def test_the_bar_names_quantity_unit_and_range(tmp_path):
     assert bar["shades"].count("rgb(") == 16
     assert Palette(run, "stress").colours(1)[1]
     assert Palette(run, "stress").colours(1)[0].shape == (len(TRIANGLES), 3)
+
+
+@pytest.mark.parametrize(
+    ("value", "span", "text"),
+    [
+        (2184.3, 2200.0, "2180"),
+        (-1.9e-8, 2200.0, "0"),
+        (0.00126, 0.3, "0.00126"),
+        (0.0, 0.0, "0"),
+        (3e7, 3e7, "3e+07"),
+    ],
+)
+def test_numbers_of_the_bar_are_short(value, span, text):
+    assert _number(value, span) == text
 
 
 def test_without_velocities_there_is_no_speed(tmp_path):
