@@ -15,12 +15,17 @@ A block whose first line of fences has ``title="NAME"`` is a file, written befor
 from __future__ import annotations
 
 import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
+_INLINE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+_STARTS = re.compile(
+    r"(?:lyra-petsc|python -m lyra_petsc|bash scripts/lyra\.sh|bash scripts/(run)\.sh) +([^;|>#]*)"
+)
 _FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)(?P<rest>[^\n`]*)$")
 _TITLE = re.compile(r'title="([^"]+)"')
 _SAID = re.compile(r"^ *<!-- test: (.*) -->$")
@@ -94,4 +99,17 @@ def blocks_of(page: Path) -> list[Block]:
             )
         )
         number = end + 1
+    return found
+
+
+def commands_of(page: Path) -> list[tuple[str, list[str]]]:
+    """Each call of the program on a page, in blocks or in the text: as it begins, and its words."""
+    texts = [block.text.replace("\\\n", " ") for block in blocks_of(page) if block.language == "sh"]
+    texts += _INLINE.findall(page.read_text(encoding="utf-8"))
+    found = []
+    for text in texts:
+        for line in text.splitlines():
+            for match in _STARTS.finditer(line):
+                words = shlex.split(match[2])
+                found.append((match[0], ["run", *words] if match[1] else words))
     return found

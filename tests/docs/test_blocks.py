@@ -7,14 +7,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import click
 import pytest
-from blocks import PAGES, ROOT, Block, blocks_of
+from blocks import PAGES, ROOT, Block, blocks_of, commands_of
 
+from lyra_petsc.cli.arguments import split
+from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml
 
-END = 0.05
+END = 0.03
 """Seconds that runs are shortened to."""
 
 PATIENCE = 300.0
@@ -135,7 +139,27 @@ def test_what_is_shown_is_well_formed(block: Block) -> None:
         assert block.title.endswith(".geo"), "a .geo is shown as a file, for the commands that mesh it"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=shown)
+def test_verbs_and_options_that_are_named_exist(page: Path) -> None:
+    """Also those in the text, and of commands that are not run."""
+    for command, words in commands_of(page):
+        ours, _ = split(words)
+        verb = ours[0] if ours else "VERB"
+        if verb.isupper() or "…" in ours:  # VERB stands for any; … for whatever follows
+            continue
+        assert verb in verbs.commands or verb.startswith("--"), f"{shown(page)}: {command}"
+        if verb in verbs.commands:
+            try:
+                verbs.commands[verb].make_context(verb, ours[1:], obj=SimpleNamespace(rank=1))
+            except click.NoSuchOption as error:
+                pytest.fail(f"{shown(page)}: {command}: {error.format_message()}")
+            except click.UsageError:  # a verb by itself is named, or a script's variables stand for words
+                pass
+
+
 def test_the_blocks_are_found() -> None:
+    assert sum(len(commands_of(page)) for page in PAGES) > 80
+
     assert len(PAGES) > 15
     assert sum(block.runs for block in EVERY) > 20
     assert sum(block.language == "yaml" for block in EVERY) > 15
