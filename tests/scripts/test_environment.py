@@ -172,7 +172,7 @@ def test_a_layer_shows_the_packages_below_and_pins_them(environment, tmp_path):
     assert shown.stdout.startswith(str(environment))
 
 
-@pytest.mark.parametrize("script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", ".ci/run"])
+@pytest.mark.parametrize("script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", "scripts/lyra.sh", ".ci/run"])
 def test_shell_syntax(script):
     done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
@@ -187,3 +187,16 @@ def test_the_bench_is_started_with_its_arguments_and_the_launcher(environment, t
     words = [program, "--peer", "a=b {obj}", "-pc_type", "gamg"]
     assert done.stdout.strip() == f"{words} {environment / 'bin' / 'mpirun'} {tmp_path}", done.stderr
     assert done.returncode == 5
+
+
+def test_any_verb_runs_by_one_script(environment: Path, tmp_path: Path) -> None:
+    variables = {**activated(environment), "RANKS": "3"}
+    done = call("lyra.sh", "check", "a scene.yaml", "-ksp_view", cwd=tmp_path, **variables)
+    assert done.returncode == 0, done.stderr
+    assert f"launched in {tmp_path}: -n 3 " in done.stdout
+    assert done.stdout.strip().endswith("-m lyra_petsc check a scene.yaml -ksp_view")
+    done = call("lyra.sh", "run", cwd=tmp_path, **activated(environment))
+    assert ": -n 2 " in done.stdout
+    done = call("lyra.sh", "report", "x", cwd=tmp_path, **{**variables, "RANKS": "many"})
+    assert done.returncode == 1
+    assert "RANKS=many is not a number of ranks" in done.stderr
