@@ -172,7 +172,9 @@ def test_a_layer_shows_the_packages_below_and_pins_them(environment, tmp_path):
     assert shown.stdout.startswith(str(environment))
 
 
-@pytest.mark.parametrize("script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", "scripts/lyra.sh", ".ci/run"])
+@pytest.mark.parametrize(
+    "script", ["scripts/environment.sh", "scripts/run.sh", "scripts/test.sh", "scripts/lyra.sh", ".ci/run"]
+)
 def test_shell_syntax(script):
     done = subprocess.run(["bash", "-n", str(ROOT / script)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
