@@ -64,6 +64,7 @@ def test_links_of_the_readme_lead_somewhere() -> None:
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
     pytest.importorskip("material")
+    pytest.importorskip("latex2mathml")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", "scripts/docs/mkdocs.yml"]
     built = subprocess.run(
         [*command, "--site-dir", str(tmp_path / "site")],
