@@ -17,4 +17,5 @@ def on_page_content(content: str, **_: Any) -> str:
 
 
 def _in_mathml(equation: re.Match[str]) -> str:
-    return str(convert(html.unescape(equation[3]).strip(), display="block" if equation[2] == "[" else "inline"))
+    display = "block" if equation[2] == "[" else "inline"
+    return str(convert(html.unescape(equation[3]).strip(), display=display))
