@@ -80,6 +80,7 @@ class Ground:
         self._pyvista = pyvista = import_pyvista()
         self._sheet = pyvista.PolyData.from_regular_faces(np.zeros((n_vertices, 3)), triangles)
         self._above = pyvista.Plotter(off_screen=True, window_size=(PIXELS, PIXELS), lighting="none")
+        self._above.disable_anti_aliasing()  # it is blurred anyway
         self._above.set_background("black")
         self._above.add_mesh(self._sheet, color="white", lighting=False)
         self._above.camera.parallel_projection = True
