@@ -69,7 +69,7 @@ def starter(scene: Path, commands: tuple[str, str], mesh: OwnMesh | None = None)
     """
     text = files("lyra_petsc.scene").joinpath("starter.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(
-        schema=SCHEMA_FILE,
+        schema=SCHEMA_FILE.as_uri() if " " in str(SCHEMA_FILE) else SCHEMA_FILE,
         one=commands[0],
         two=commands[1],
         file=shlex.quote(scene.name),
