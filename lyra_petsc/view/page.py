@@ -15,6 +15,7 @@ from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.lock import in_use
 from lyra_petsc.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.results.run import Run
+from lyra_petsc.results.tables import read_table
 from lyra_petsc.view import plots
 from lyra_petsc.view.access import Access
 from lyra_petsc.view.cloth import Cloth
@@ -216,7 +217,7 @@ class Page:
         self.cloth.look_from(fit.view(np.max([(x @ fit.normals.T).max(axis=0) for x in motion], axis=0)))
 
     def _draw_plots(self) -> None:
-        history = {name: np.asarray(self._run.history[name]) for name in self._run.history}
+        history = read_table(self._run.folder / "history.csv")
         self._figures = {
             "energies": plots.energies(history, self._unit),
             "iterations": plots.iterations(history, self._unit),

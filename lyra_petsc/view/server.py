@@ -18,6 +18,7 @@ from typing import Any
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.results.run import Run
+from lyra_petsc.results.tables import read_table
 from lyra_petsc.view.access import Access
 
 LOCAL = "127.0.0.1"
@@ -117,9 +118,9 @@ async def _serve(
     server.controller.on_server_ready.add(tell)
     loop = asyncio.get_running_loop()
     over: asyncio.Future[int] = loop.create_future()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup has it
-            loop.add_signal_handler(number, _settle, over, int(number))
+    nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    for number in (signal.SIGINT, signal.SIGTERM, *([] if nohup else [signal.SIGHUP])):
+        loop.add_signal_handler(number, _settle, over, int(number))
     words, sys.argv[1:] = sys.argv[1:], []  # trame reads them, too
     try:
         listening = asyncio.create_task(
@@ -203,7 +204,8 @@ def find_run(folder: Path) -> Run:
         If what the page needs of it cannot be read.
     """
     run = Run(folder)
-    for needed in ("triangles", "rest", "scene", "history"):
+    for needed in ("triangles", "rest", "scene"):
         getattr(run, needed)
     run.positions[0]
+    read_table(run.folder / "history.csv")
     return run
