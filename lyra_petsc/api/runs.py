@@ -13,6 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from lyra_petsc.api.scenes import SceneLike, load
+from lyra_petsc.api.simulations import refuse_mixed_options
 from lyra_petsc.errors import Interrupted
 from lyra_petsc.output.folder import choose
 from lyra_petsc.parallel import on_root
@@ -65,6 +66,7 @@ def run(
     comm = MPI.COMM_WORLD if comm is None else comm
     loaded = on_root(comm, lambda: load(scene))
     assert loaded is not None
+    refuse_mixed_options(loaded)
     choice = choose(comm, loaded.source.stem if loaded.source else "scene", out, force=force, resume=resume)
     try:
         with _Interrupt(comm) as interrupt, np.errstate(over="ignore", invalid="ignore"):

@@ -100,7 +100,7 @@ class Simulation:
         loaded = on_root(self.comm, lambda: load(scene))
         assert loaded is not None
         self.scene: Scene = loaded
-        _refuse_mixed_options(loaded)
+        refuse_mixed_options(loaded)
         with np.errstate(over="ignore", invalid="ignore"):
             stepping = Stepping(self.comm, loaded)
         self._stepping: Stepping | None = stepping
@@ -251,7 +251,7 @@ class Simulation:
             self.close()
 
 
-def _refuse_mixed_options(scene: Scene) -> None:
+def refuse_mixed_options(scene: Scene) -> None:
     """PETSc has one set of options: two simulations at a time cannot have different ones.
 
     Raises

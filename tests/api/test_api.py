@@ -122,7 +122,7 @@ def test_mistakes_are_one_line(changes, words):
     assert "--set" not in str(caught.value)
 
 
-def test_many_simulations_in_one_process():
+def test_many_simulations_in_one_process(tmp_path):
     def options():
         from petsc4py import PETSc
 
@@ -138,6 +138,8 @@ def test_many_simulations_in_one_process():
             np.testing.assert_allclose(other.step().positions, first.positions, atol=1e-12)
             with pytest.raises(lyra_petsc.InputError, match="has other PETSc options"):
                 lyra_petsc.Simulation(SCENE)
+            with pytest.raises(lyra_petsc.InputError, match="has other PETSc options"):
+                lyra_petsc.run(SCENE, tmp_path / "out")
             other.close()
     assert options() == before
     # forgotten without being closed
