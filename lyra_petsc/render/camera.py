@@ -82,8 +82,8 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: N
         areas = normals @ candidates.T
         seen += np.abs(areas).sum(axis=0)
         facing += areas.sum(axis=0)
-    # of two sides that show much the same, the one that shows the front
-    best = int(np.argmax(seen * (1.0 + 0.1 * np.sign(facing))))
+    # of sides that show much the same, the one where the sheet's front is seen, then that from the front
+    best = int(np.argmax(seen * (1.0 + 0.1 * np.sign(facing) + 0.05 * candidates @ horizon(up)[1])))
     azimuth = 2.0 * math.pi * (best // len(ELEVATIONS)) / AZIMUTHS + math.radians(ASIDE)
     return direction(up, azimuth, math.radians(ELEVATIONS[best % len(ELEVATIONS)]))
 

@@ -94,3 +94,11 @@ def test_without_a_camera_a_standing_sheet_is_seen_from_its_front(degrees):
     assert np.cross(along, UP) @ sight > 0.8
     assert sight @ UP > 0.2
     assert np.linalg.norm(sight) == pytest.approx(1.0)
+
+
+def test_a_lying_sheet_is_seen_from_the_front_and_above():
+    """Against y where z is up, so that its x points to the right."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.01], [0, 1, 0]])
+    sight = line_of_sight(with_camera(None), UP, [corners], np.array([[0, 1, 2], [0, 2, 3]]))
+    assert sight[1] < -0.5
+    assert sight[2] > 0.5
