@@ -27,6 +27,7 @@ from lyra_petsc.partition.distribute import Part, Whole, distribute
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.solvers.multigrid import Surface
 from lyra_petsc.solvers.options import petsc_number
 from lyra_petsc.start import start_positions, start_velocities
 from lyra_petsc.stepping.schemes.registry import scheme_of
@@ -72,6 +73,8 @@ class Model:
         The active ones.
     system : ReducedSystem
     pattern : BlockPattern
+    surface : Surface
+        The mesh as it was before the scene's start moved it.
     probes : dict of name → (n,) int
         Owned vertices of each probe, local numbering.
     mesh : Mesh or None
@@ -87,6 +90,7 @@ class Model:
     terms: dict[str, Term]
     system: ReducedSystem
     pattern: BlockPattern
+    surface: Surface
     probes: dict[str, Ints]
     mesh: Mesh | None
     partitioner: str
@@ -228,6 +232,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     data = part.vertex_data
     system.x[: points.n_owned] = data["position"]
     points.update_ghosts(system.x)
+    surface = Surface(system.x.copy(), terms["membrane"].stencil)
     # handles set out from the undisturbed shape
     system.begin(0.0)
     system.x[: points.n_owned] = data.get("start", data["position"])
@@ -236,7 +241,17 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     points.update_ghosts(system.v)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Model(
-        scene, outline, points, terms, system, pattern, probes, mesh, part.partitioner, data.get("tag")
+        scene,
+        outline,
+        points,
+        terms,
+        system,
+        pattern,
+        surface,
+        probes,
+        mesh,
+        part.partitioner,
+        data.get("tag"),
     )
 
 

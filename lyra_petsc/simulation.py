@@ -114,7 +114,9 @@ class Simulation:
                     file=scene.source,
                     key="material",
                 )
-            self.stepper = Stepper(scene, system, self.model.pattern, outline.spacing, floor)
+            self.stepper = Stepper(
+                scene, system, self.model.pattern, self.model.surface, outline.spacing, floor
+            )
         self._floor = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()

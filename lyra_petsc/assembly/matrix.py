@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -23,19 +24,24 @@ class SystemMatrix:
     pattern : BlockPattern
     kind : str
         PETSc matrix type where ``-mat_type`` says nothing (``baij``, ``aij``, ``sbaij``).
+    given : bool
+        Whether ``-mat_type`` and other options count.
 
     Attributes
     ----------
     mat : PETSc.Mat
+    followers : list of callables
+        Are given the block rows (n_blocks, 3, 3) whenever they change.
     """
 
-    def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
+    def __init__(self, points: Points, pattern: BlockPattern, kind: str, *, given: bool = True) -> None:
         comm, rows = points.comm, 3 * points.n_owned
         self.mat = PETSc.Mat().create(comm)
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
         self.mat.setType(kind)
         try:
-            self.mat.setFromOptions()
+            if given:
+                self.mat.setFromOptions()
         except PETSc.Error:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
@@ -47,6 +53,7 @@ class SystemMatrix:
         if self.kind == "sbaij":
             self._keep_upper(points)
         self.mat.setUp()
+        self.followers: list[Callable[[NDArray[np.float64]], None]] = []
         self._storage: Storage | None = None
         if self.kind in KINDS and PETSc.ScalarType == np.float64:
             with suppress(AttributeError, OSError):
@@ -70,6 +77,8 @@ class SystemMatrix:
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+        for follower in self.followers:
+            follower(values)
         if self._storage is not None and self.mat.assembled:
             self._storage.write(values)
             return

@@ -48,13 +48,24 @@ class BlockPattern:
             for a in range(stencil.shape[1]):  # one after the other: all couplings at once take much memory
                 keys = _union(keys, *_row_keys(stencil, a, n_owned, n_local, position))
         rows, places = np.divmod(keys, max(n_local, 1))
-        self.columns: Ints = order[places]
-        self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
-        np.cumsum(np.bincount(rows, minlength=n_owned), out=self.indptr[1:])
+        self._set(rows, order[places], n_owned)
         self.diagonal: Ints = np.searchsorted(keys, diagonal_keys)
         self.offsets: dict[str, Offsets] = {
             name: _offsets(s, keys, n_owned, n_local, position) for name, s in stencils.items()
         }
+
+    @classmethod
+    def of_rows(cls, rows: Ints, columns: Ints, diagonal: Ints, n_owned: int) -> BlockPattern:
+        """The pattern with blocks (rows, columns), in their order, which no elements add to."""
+        made = cls.__new__(cls)
+        made._set(rows, columns, n_owned)
+        made.diagonal, made.offsets = diagonal, {}
+        return made
+
+    def _set(self, rows: Ints, columns: Ints, n_owned: int) -> None:
+        self.columns: Ints = columns
+        self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
+        np.cumsum(np.bincount(rows, minlength=n_owned), out=self.indptr[1:])
 
     @property
     def n_blocks(self) -> int:

@@ -45,6 +45,27 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
+    # iterations that hardly grow with the mesh: PETSc's cycle on our coarse meshes. A forward sweep before and
+    # a backward one after the coarser level are symmetric; who takes hundreds of iterations has met a matrix
+    # close to singular, and needs another one
+    "multigrid": {
+        "mat_type": "baij",
+        "ksp_type": "cg",
+        "ksp_max_it": 300,
+        "pc_type": "mg",
+        "pc_mg_galerkin": "external",
+        "pc_mg_distinct_smoothup": True,
+        "mg_levels_ksp_type": "richardson",
+        "mg_levels_ksp_max_it": 1,
+        "mg_levels_pc_type": "sor",
+        "mg_levels_pc_sor_local_forward": True,
+        "mg_levels_up_ksp_type": "richardson",
+        "mg_levels_up_ksp_max_it": 1,
+        "mg_levels_up_pc_type": "sor",
+        "mg_levels_up_pc_sor_local_backward": True,
+        "mg_coarse_pc_type": "redundant",
+        "mg_coarse_redundant_pc_type": "cholesky",
+    },
     # symmetric sweeps instead of PETSc's Chebyshev default, whose bounds age within a step. No
     # rigid-body modes: held vertices are aggregates of their own, on which six modes are dependent
     "gamg": {
@@ -61,6 +82,9 @@ FACTORISATIONS = ("direct", "cholesky")
 ILU_FROM, ILU_UNTIL = 2000, 30_000
 """Vertices between which incomplete factors are tried first; from 0 on where a step is one linear solve."""
 
+MULTIGRID_FROM = 5000
+"""Vertices from which multigrid is tried first where a step is one linear solve."""
+
 BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 """What is used with block storage; every other ``-pc_type`` gets ``aij``."""
 
@@ -71,11 +95,15 @@ DIRECT_UNTIL = 30_000
 FACTOR_COST = 50.0, 6.5
 """Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
-GAMG_FROM = 8000
+MULTIGRID_AFTER_ILU = 8000
 """Vertices from which multigrid takes over from incomplete factors before a factorisation does."""
 
 WORTH_OF_ILU, PRICE_OF_ILU = 4.0, 3.0
 """How many iterations of block Jacobi one with incomplete factors is worth, at the least, and costs."""
+
+
+LAST = ("multigrid", "gamg", "block-jacobi")
+"""What is left where nothing else is known to be better."""
 
 
 def candidates(
@@ -90,18 +118,20 @@ def candidates(
         return ["user"]
     factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
     if static:
-        return [*factors, "gamg", "block-jacobi"]
+        return [*factors, *LAST]
     if n_vertices > ILU_UNTIL:
-        return ["gamg", *factors, "block-jacobi"]
+        return list(LAST)
     incomplete = "ilu" if ranks == 1 else "block-ilu"
     small = n_vertices < ILU_FROM
     if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH_OF_ILU):
-        return [*factors, incomplete, "gamg", "block-jacobi"]
+        return [*factors, incomplete, *LAST]
     if small and newton:
-        return ["block-jacobi", *factors, "gamg"]
-    if n_vertices < GAMG_FROM:
-        return [incomplete, *factors, "gamg", "block-jacobi"]
-    return [incomplete, "gamg", *factors, "block-jacobi"]
+        return ["block-jacobi", *factors, "multigrid", "gamg"]
+    if not newton and n_vertices >= MULTIGRID_FROM:
+        return ["multigrid", incomplete, *factors, "block-jacobi"]
+    if n_vertices < MULTIGRID_AFTER_ILU:
+        return [incomplete, *factors, *LAST]
+    return [incomplete, "multigrid", *factors, "gamg", "block-jacobi"]
 
 
 def _factorisations(ranks: int) -> list[str]:
@@ -130,7 +160,7 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
     chosen = PETSc.Options().getString("pc_type", "")
     if chosen in ("lu", "cholesky") and not is_set("mat_type"):
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
-    for preset in ("block-jacobi", "gamg"):
+    for preset in ("block-jacobi", "gamg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
             return PRESETS[preset]
     return {"mat_type": "baij" if chosen in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}

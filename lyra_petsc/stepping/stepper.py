@@ -18,6 +18,7 @@ from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
+from lyra_petsc.solvers.multigrid import Hierarchy, Surface
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
@@ -63,6 +64,7 @@ class Stepper:
     scene : Scene
     system : ReducedSystem
     pattern : BlockPattern
+    surface : Surface
     spacing : float
         Mean edge length [m], for the step tolerance.
     floor : float
@@ -86,9 +88,15 @@ class Stepper:
     """
 
     def __init__(
-        self, scene: Scene, system: ReducedSystem, pattern: BlockPattern, spacing: float, floor: float
+        self,
+        scene: Scene,
+        system: ReducedSystem,
+        pattern: BlockPattern,
+        surface: Surface,
+        spacing: float,
+        floor: float,
     ) -> None:
-        self._scene, self._system, self._pattern = scene, system, pattern
+        self._scene, self._system, self._pattern, self._surface = scene, system, pattern, surface
         self._spacing, self._floor = spacing, floor
         self._iterates = scene.time.scheme != "semi-implicit"
         points = system.points
@@ -149,6 +157,11 @@ class Stepper:
             linear_limit=linear_limit(points.n_global, self.presets),
         )
         ksp.setType(PETSc.KSP.Type.CG)
+        self._hierarchy: Hierarchy | None = None
+        if PETSc.Options().getString("pc_type", "") == PETSc.PC.Type.MG:
+            self._hierarchy = coarse = Hierarchy(points, self._pattern, self._surface)
+            coarse.attach(ksp.getPC())
+            self.preconditioner.followers.append(lambda values: coarse.set(values, system.mask))
         self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
@@ -221,6 +234,8 @@ class Stepper:
         self.matrix.destroy()
         if self.preconditioner is not self.matrix:
             self.preconditioner.destroy()
+        if self._hierarchy is not None:
+            self._hierarchy.destroy()
         self.velocity.destroy()
         self.residual.destroy()
 
