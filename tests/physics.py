@@ -115,6 +115,7 @@ class Simulation:
             self.scene,
             self.system,
             self.model.pattern,
+            self.model.surface,
             outline.spacing,
             residual_roundoff(self.system, outline.reach),
         )

@@ -6,6 +6,7 @@ and those a mesh gives for free. Coarse matrices are Galerkin products in block 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.partition.points import Points
 from lyra_petsc.solvers.coarsening import coarsen
+from lyra_petsc.solvers.options import is_set
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -42,7 +44,7 @@ class Surface:
     """
 
     x: Array
-    triangles: NDArray[np.int32]
+    triangles: Ints
 
 
 MOST_LEVELS = 20
@@ -110,15 +112,15 @@ class Hierarchy:
     def __init__(self, points: Points, pattern: BlockPattern, surface: Surface) -> None:
         self.levels: list[Level] = []
         n = points.n_owned
-        most = PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS)
+        most = max(2, PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS))
         x, triangles = surface.x[:n], surface.triangles
-        triangles = triangles[(triangles < n).all(axis=1)].astype(np.int64)
-        while points.n_global > COARSEST and len(self.levels) + 1 < most:
+        triangles = triangles[(triangles < n).all(axis=1)]
+        while len(self.levels) + 1 < most and (points.n_global > COARSEST or not self.levels):
             coarse = coarsen(x, triangles)
             left = points.comm.allreduce(len(coarse.vertices))
             if left > WORTH * points.n_global:
                 break
-            last = left <= COARSEST
+            last = left <= COARSEST or len(self.levels) + 2 == most
             galerkin = Galerkin(points, pattern, coarse.parents, coarse.weights, len(coarse.vertices))
             level = Level(points, galerkin, coarse.parents, coarse.weights, "aij" if last else "baij")
             self.levels.append(level)
@@ -130,6 +132,9 @@ class Hierarchy:
         pc.setType(PETSc.PC.Type.MG)
         count = len(self.levels) + 1
         pc.setMGLevels(count)
+        if is_set("pc_mg_levels"):
+            # another number than there are levels would make PCMG throw them away
+            PETSc.Options().setValue("pc_mg_levels", count)
         for below, level in enumerate(self.levels):
             number = count - 1 - below
             pc.setMGInterpolation(number, level.interpolation)
@@ -144,7 +149,7 @@ class Hierarchy:
             pc.setMGX(number - 1, right.duplicate())
 
     def set(self, values: Array, held: Mask) -> None:
-        """Coarse matrices of new block rows; ``held`` (n_local, 3) are the prescribed coordinates; collective."""
+        """Coarse matrices of new block rows; held (n_local, 3) are the prescribed coordinates; collective."""
         if self.levels:
             free = np.where(held, 0.0, 1.0)
             first = self.levels[0]
@@ -153,6 +158,24 @@ class Hierarchy:
                 first.set_free(free)
         for level in self.levels:
             values = level.set(values)
+
+    @classmethod
+    def where_asked_for(
+        cls,
+        ksp: PETSc.KSP,
+        matrix: SystemMatrix,
+        points: Points,
+        pattern: BlockPattern,
+        surface: Surface,
+        held: Callable[[], Mask],
+    ) -> Hierarchy | None:
+        """Levels that follow ``matrix``, attached to the solver; None unless ``-pc_type mg``; collective."""
+        if PETSc.Options().getString("pc_type", "") != PETSc.PC.Type.MG:
+            return None
+        made = cls(points, pattern, surface)
+        made.attach(ksp.getPC())
+        matrix.followers.append(lambda values: made.set(values, held()))
+        return made
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""

@@ -45,9 +45,9 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
-    # iterations that hardly grow with the mesh: PETSc's cycle on our coarse meshes. A forward sweep before and
-    # a backward one after the coarser level are symmetric; who takes hundreds of iterations has met a matrix
-    # close to singular, and needs another one
+    # iterations that hardly grow with the mesh: PETSc's cycle on our coarse meshes, symmetric by a forward
+    # sweep before and a backward one after the coarser level. Hundreds of iterations mean a matrix close to
+    # singular, and another one is needed
     "multigrid": {
         "mat_type": "baij",
         "ksp_type": "cg",

@@ -144,24 +144,15 @@ class Stepper:
         self.snes = snes = ts.getSNES()
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
+        limit = linear_limit(points.n_global, self.presets)
+        matrices, judged_by = (self.matrix, self.preconditioner), (scene.solver, self._spacing, self._floor)
         self._newton = newton = Newton(
-            snes,
-            self._system,
-            self.matrix,
-            self.preconditioner,
-            self._blend,
-            scene.solver,
-            self._spacing,
-            self._floor,
-            iterates=self._iterates,
-            linear_limit=linear_limit(points.n_global, self.presets),
+            snes, system, *matrices, self._blend, *judged_by, iterates=self._iterates, linear_limit=limit
         )
         ksp.setType(PETSc.KSP.Type.CG)
-        self._hierarchy: Hierarchy | None = None
-        if PETSc.Options().getString("pc_type", "") == PETSc.PC.Type.MG:
-            self._hierarchy = coarse = Hierarchy(points, self._pattern, self._surface)
-            coarse.attach(ksp.getPC())
-            self.preconditioner.followers.append(lambda values: coarse.set(values, system.mask))
+        self._hierarchy = Hierarchy.where_asked_for(
+            ksp, self.preconditioner, points, self._pattern, self._surface, lambda: system.mask
+        )
         self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)

@@ -93,7 +93,7 @@ from lyra_petsc.stepping.stepper import Stepper
 
 scene = Scene.model_validate(json.loads(sys.argv[1]))
 model = build_model(MPI.COMM_SELF, scene, Phases())
-stepper = Stepper(scene, model.system, model.pattern, model.outline.spacing, 1e-12)
+stepper = Stepper(scene, model.system, model.pattern, model.surface, model.outline.spacing, 1e-12)
 stepper.start(0.0, 0)
 assert stepper.attempt(0.0, 0.01).converged
 print(json.dumps(sorted(m for m in sys.modules if m.startswith("lyra_petsc.") or m in HEAVY)))

@@ -1,0 +1,107 @@
+"""Multigrid on our coarse meshes: iterations against the mesh, the ranks, the stiffness; its options."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from physics import gathered
+
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.simulation import Simulation
+
+pytestmark = pytest.mark.parallel
+
+
+def hanging(cells: int, **time: Any) -> dict[str, Any]:
+    """A square of gray interlock, held at two corners and falling."""
+    corners = [cells * (cells + 1), (cells + 1) ** 2 - 1]
+    return {
+        "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells}},
+        "material": {"cloth": "gray-interlock", "damping": 0.03},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"nodes": corners}],
+        "time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"} | time,
+    }
+
+
+def stepped(
+    comm: MPI.Comm, content: dict[str, Any], steps: int, **petsc: Any
+) -> tuple[np.ndarray, list[int]]:
+    """Positions in mesh order and linear iterations of each step, with multigrid."""
+    options = PETSc.Options()
+    given = {"pc_type": "mg", **petsc}
+    for name, value in given.items():
+        options[name] = value
+    try:
+        simulation = Simulation(comm, Scene.model_validate(content))
+        counts = [simulation.step().linear_iterations for _ in range(steps)]
+        x = gathered(simulation.model.points, simulation.model.system.x)
+        simulation.destroy()
+    finally:
+        for name in given:
+            options.delValue(name)
+    return x, counts
+
+
+def test_iterations_hardly_grow_with_the_mesh(comm: MPI.Comm) -> None:
+    coarse, fine = (max(stepped(comm, hanging(cells), 3)[1]) for cells in (25, 75))
+    assert 3 <= coarse <= 9
+    assert fine <= 1.5 * coarse + 1
+
+
+def test_stiff_cloth_and_long_steps(comm: MPI.Comm) -> None:
+    content = hanging(50, step=0.04)
+    content["material"]["stretching_scale"] = 1000.0
+    assert max(stepped(comm, content, 3)[1]) <= 45
+
+
+def test_the_answer_is_that_of_a_factorisation(comm: MPI.Comm) -> None:
+    tight = {"ksp_rtol": 1e-11}
+    x, _ = stepped(comm, hanging(25), 5, **tight)
+    direct, _ = stepped(comm, hanging(25), 5, pc_type="cholesky", **tight)
+    assert np.abs(x - direct).max() < 1e-10
+
+
+def test_newton_with_an_exact_hessian(comm: MPI.Comm) -> None:
+    x, counts = stepped(comm, hanging(25, integrator="beuler"), 4)
+    other, _ = stepped(comm, hanging(25, integrator="beuler"), 4, pc_type="pbjacobi")
+    assert max(counts) < 40
+    assert np.abs(x - other).max() < 1e-6
+
+
+def test_handles_that_let_go(comm: MPI.Comm) -> None:
+    content = hanging(25)
+    content["handles"][0]["until"] = 0.015
+    x, counts = stepped(comm, content, 8)
+    direct, _ = stepped(comm, content, 8, pc_type="cholesky")
+    assert max(counts) <= 10
+    assert np.abs(x - direct).max() < 1e-6
+
+
+def test_a_mesh_of_a_few_triangles(comm: MPI.Comm) -> None:
+    x, counts = stepped(comm, hanging(2), 4)
+    direct, _ = stepped(comm, hanging(2), 4, pc_type="cholesky")
+    assert max(counts) <= 10
+    assert np.abs(x - direct).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"pc_mg_levels": 2},
+        {"pc_mg_levels": 1},
+        {"pc_mg_levels": 50},
+        {"mg_levels_ksp_type": "chebyshev", "mg_levels_pc_type": "jacobi", "pc_mg_distinct_smoothup": "0"},
+        {"mg_levels_ksp_max_it": 2, "mg_levels_up_ksp_max_it": 2},
+        {"mat_type": "aij"},
+        {"pc_mg_cycle_type": "w"},
+    ],
+    ids=lambda options: " ".join(options),
+)
+def test_options_reach_it(options: dict[str, Any], comm: MPI.Comm) -> None:
+    _, counts = stepped(comm, hanging(25), 2, **options)
+    assert 0 < max(counts) < 100
