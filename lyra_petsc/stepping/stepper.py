@@ -12,10 +12,9 @@ from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.errors import SolverError
 from lyra_petsc.parallel import all_here
 from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
-from lyra_petsc.scene.control import INTEGRATORS
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.multigrid import Hierarchy, Surface
@@ -28,6 +27,7 @@ from lyra_petsc.stepping.guess import first_guess
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.stepping.trace import Stuck, Trace
+from lyra_petsc.stepping.ts_options import refuse_contradictions
 
 Array = NDArray[np.float64]
 
@@ -145,9 +145,17 @@ class Stepper:
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
         limit = linear_limit(points.n_global, self.presets)
-        matrices, judged_by = (self.matrix, self.preconditioner), (scene.solver, self._spacing, self._floor)
         self._newton = newton = Newton(
-            snes, system, *matrices, self._blend, *judged_by, iterates=self._iterates, linear_limit=limit
+            snes,
+            system,
+            self.matrix,
+            self.preconditioner,
+            self._blend,
+            scene.solver,
+            self._spacing,
+            self._floor,
+            iterates=self._iterates,
+            linear_limit=limit,
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._hierarchy = Hierarchy.where_asked_for(
@@ -175,7 +183,7 @@ class Stepper:
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        self._refuse_contradictions()
+        refuse_contradictions(ts, system.scheme.ts_type)
         ts.setSolution(self.velocity)
 
     def _separate(self) -> bool:
@@ -190,20 +198,6 @@ class Stepper:
     def _fill(self, options: Mapping[str, Value]) -> None:
         self._filled = fill_gaps(options)
         self.our_options += [name for name in self._filled if name not in self.our_options]
-
-    def _refuse_contradictions(self) -> None:
-        kind = self.ts.getType()
-        if kind != self._system.scheme.ts_type:
-            raise InputError(
-                f"'{kind}' is not what solves the steps of this scene; choose time.integrator in the scene "
-                f"({', '.join(INTEGRATORS)}) and leave -ts_type out",
-                key="-ts_type",
-            )
-        for name in ("ts_theta_endpoint", "ts_theta_theta"):
-            if is_set(name):
-                raise InputError("has no meaning for the reduced velocity form; leave it out", key=f"-{name}")
-        if PETSc.Options().getString("ts_adapt_type", "none") != "none":
-            raise InputError("TS cannot judge steps of the reduced form; leave it out", key="-ts_adapt_type")
 
     def next_preset(self) -> str | None:
         """Change to the next linear solver; its name, or None if there is none left; collective."""
