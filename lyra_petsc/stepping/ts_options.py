@@ -10,7 +10,7 @@ from lyra_petsc.solvers.options import is_set
 
 
 def refuse_contradictions(ts: PETSc.TS, expected: str) -> None:
-    """Raise InputError for what would make TS, once its options are read, solve other than ``expected`` does."""
+    """Raise InputError for what would make TS, its options read, solve other than ``expected`` does."""
     kind = ts.getType()
     if kind != expected:
         raise InputError(
