@@ -71,16 +71,9 @@ def address(run: subprocess.Popen[str]) -> str:
 def open_page(browser: str, url: str, folder: str) -> subprocess.Popen[bytes]:
     """A browser without a screen, in a group of its own."""
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
-    words = [
-        "nice",
-        "-n",
-        "19",
-        browser,
-        *BROWSER,
-        *root,
-        f"--user-data-dir={folder}",
-        "--remote-debugging-port=0",
-    ]
+    # of low priority beside other sessions as well, where Linux groups processes by sessions
+    humble = ["sh", "-c", 'echo 19 >/proc/self/autogroup; exec nice -n 19 "$@"', "sh"]
+    words = [*humble, browser, *BROWSER, *root, f"--user-data-dir={folder}", "--remote-debugging-port=0"]
     quiet = subprocess.DEVNULL
     return subprocess.Popen([*words, url], stdout=quiet, stderr=quiet, start_new_session=True)
 

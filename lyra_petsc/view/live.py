@@ -100,8 +100,12 @@ def main(folder: Path, host: str, port: int) -> None:
 
 
 def _step_back() -> None:
-    """Leave the processors to the run: the last to get one, and not bound to that of rank 0."""
-    os.nice(15)
+    """Leave the processors to the run, and be bound to none: rank 0 is, perhaps."""
+    os.nice(NICENESS)
+    if os.getsid(0) == os.getpid():
+        # Linux may share the time out among sessions first, and this is one of its own
+        with suppress(OSError):
+            Path("/proc/self/autogroup").write_text(str(NICENESS), encoding="ascii")
     if hasattr(os, "sched_setaffinity"):
         with suppress(OSError):
             os.sched_setaffinity(0, range(os.cpu_count() or 1))

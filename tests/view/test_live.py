@@ -11,7 +11,7 @@ from launch import SCENE, done, finish, lyra, start, write_scene
 from written_run import Writer
 
 from lyra_petsc.results.run import Run
-from lyra_petsc.view.live import LivePage
+from lyra_petsc.view.live import NICENESS, LivePage
 
 SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
 """The same without an end in sight."""
@@ -140,6 +140,11 @@ def test_the_page_stays_while_it_is_open_and_goes_with_the_last_who_looks(tmp_pa
     told = []
     page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
     until(lambda: told, "nothing is said")
+    (process,) = pages(tmp_path)
+    assert os.getpriority(os.PRIO_PROCESS, process) >= NICENESS
+    group = Path(f"/proc/{process}/autogroup")  # where Linux shares the time out among sessions
+    if group.exists() and group.read_text().strip():
+        assert group.read_text().endswith(f"nice {NICENESS}\n")
     url = urlsplit(told[0])
     connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
     headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
