@@ -22,7 +22,7 @@ from lyra_petsc.scene.control import FIELDS
 from lyra_petsc.scene.describe import attributes, summary
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers.options import Value
-from lyra_petsc.solvers.presets import DIRECT_UNTIL, ILU_FROM, ILU_UNTIL, PRESETS
+from lyra_petsc.solvers.presets import DIRECT_UNTIL, PRESETS
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "reference"
@@ -50,6 +50,7 @@ OPTIONS = {
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
     "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
+    "pc_mg_levels": "Most levels of `-pc_type mg`, on coarse meshes of the program's.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
     "mat_type": "Storage of the matrix: `aij`, `baij`, `sbaij`; by default as the preconditioner needs.",
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
@@ -217,18 +218,16 @@ def petsc_page() -> str:
         "The program itself has to do with these:",
         "\n".join(rows),
         "## Named linear solvers",
-        f"Without `-pc_type` the program chooses among these: by size ({ILU_FROM} and {ILU_UNTIL} "
-        f"vertices), by how many "
-        f"iterations are expected and seen, and factorisations up to {DIRECT_UNTIL} vertices; when one "
-        f"breaks down, the "
-        "next takes over ([how](../newton.md)).",
+        "Without `-pc_type` the program chooses among these, by size, and by how many iterations are expected "
+        f"and seen; factorisations up to {DIRECT_UNTIL} vertices. When one breaks down, the next takes over "
+        "([how](../newton.md)).",
         "\n".join(presets),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _words(options: dict[str, Value]) -> str:
-    return " ".join(f"-{name} {value}" for name, value in options.items())
+    return " ".join(f"-{name}" if value is True else f"-{name} {value}" for name, value in options.items())
 
 
 # -- commands ----------------------------------------------------------------------------------------
