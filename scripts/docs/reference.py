@@ -218,7 +218,7 @@ def petsc_page() -> str:
         "The program itself has to do with these:",
         "\n".join(rows),
         "## Named linear solvers",
-        "Without `-pc_type` the program chooses among these, by size, and by how many iterations are expected "
+        "Without `-pc_type` the program chooses among these, by size and by how many iterations are expected "
         f"and seen; factorisations up to {DIRECT_UNTIL} vertices. When one breaks down, the next takes over "
         "([how](../newton.md)).",
         "\n".join(presets),
