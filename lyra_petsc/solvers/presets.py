@@ -45,9 +45,9 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
-    # iterations that hardly grow with the mesh: PETSc's cycle on our coarse meshes, symmetric by a forward
-    # sweep before and a backward one after the coarser level. Hundreds of iterations mean a matrix close to
-    # singular, and another one is needed
+    # iterations that grow little with the mesh: PETSc's cycle on our coarse meshes, symmetric by two forward
+    # sweeps before and two backward ones after the coarser level. Hundreds of iterations mean a matrix close
+    # to singular, and another one is needed
     "multigrid": {
         "mat_type": "baij",
         "ksp_type": "cg",
@@ -56,11 +56,11 @@ PRESETS: dict[str, dict[str, Value]] = {
         "pc_mg_galerkin": "external",
         "pc_mg_distinct_smoothup": True,
         "mg_levels_ksp_type": "richardson",
-        "mg_levels_ksp_max_it": 1,
+        "mg_levels_ksp_max_it": 2,
         "mg_levels_pc_type": "sor",
         "mg_levels_pc_sor_local_forward": True,
         "mg_levels_up_ksp_type": "richardson",
-        "mg_levels_up_ksp_max_it": 1,
+        "mg_levels_up_ksp_max_it": 2,
         "mg_levels_up_pc_type": "sor",
         "mg_levels_up_pc_sor_local_backward": True,
         "mg_coarse_pc_type": "redundant",
