@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, WithJsonSchema, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.rules import absent, given, when
-from lyra_petsc.scene.values import Count, Flag, Fraction, Positive, StepLength, problem, shown
+from lyra_petsc.scene.values import Count, Flag, Fraction, JsonSchema, Positive, StepLength, problem, shown
 
 INTEGRATORS = ("beuler", "semi-implicit", "midpoint", "alpha2", "bdf2")
 ANALYSES = ("dynamic", "static")
@@ -175,7 +175,7 @@ class Output(Block):
     null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
 
     every: Positive | None = 0.04
-    fields: Annotated[list[str], WithJsonSchema(_FIELDS)] = Field(default_factory=list)
+    fields: Annotated[list[str], JsonSchema(_FIELDS)] = Field(default_factory=list)
     checkpoint: Checkpoint = Field(default_factory=Checkpoint)
     reactions: Flag = False
     vtkhdf: Flag = False

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.scene.block import Block
@@ -17,6 +17,7 @@ from lyra_petsc.scene.values import (
     VECTOR,
     Flag,
     Index,
+    JsonSchema,
     Name,
     NonNegative,
     Number,
@@ -79,8 +80,8 @@ class _Vertices(Block):
     """
 
     group: Name | None = None
-    nodes: Annotated[list[Index], BeforeValidator(_vertex_list), WithJsonSchema(_VERTICES)] | None = None
-    box: Annotated[tuple[Vec3, Vec3], WithJsonSchema(_BOX)] | None = None
+    nodes: Annotated[list[Index], BeforeValidator(_vertex_list), JsonSchema(_VERTICES)] | None = None
+    box: Annotated[tuple[Vec3, Vec3], JsonSchema(_BOX)] | None = None
 
     @field_validator("nodes")
     @classmethod
@@ -137,7 +138,7 @@ class Handle(Selector):
         Per vertex and axis: a spring instead of a constraint.
     """
 
-    axes: Annotated[tuple[Direction, ...], WithJsonSchema(_AXES)] = AXES
+    axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
     clamp: Flag = False
     motion: Name | None = None
     interpolation: Literal["hermite", "linear"] = "hermite"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import PlainValidator, WithJsonSchema, model_validator
+from pydantic import PlainValidator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.rules import absent, given, when
-from lyra_petsc.scene.values import Axis, Positive, Vec3, Vector, number, problem, shown
+from lyra_petsc.scene.values import Axis, JsonSchema, Positive, Vec3, Vector, number, problem, shown
 
 SMALLEST_ANGLE, LARGEST_ANGLE = 1.0, 120.0
 PARALLEL = 1e-6
@@ -27,7 +27,7 @@ def _angle(value: object) -> float:
 Angle = Annotated[
     float,
     PlainValidator(_angle),
-    WithJsonSchema({"type": "number", "minimum": SMALLEST_ANGLE, "maximum": LARGEST_ANGLE}),
+    JsonSchema({"type": "number", "minimum": SMALLEST_ANGLE, "maximum": LARGEST_ANGLE}),
 ]
 
 

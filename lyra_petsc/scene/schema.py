@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, PrivateAttr, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.nearest import nearest
@@ -22,7 +22,7 @@ from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.render import Camera, Render
 from lyra_petsc.scene.rules import given, when
 from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
-from lyra_petsc.scene.values import Name, Text, Vec3, Vector, problem, shown
+from lyra_petsc.scene.values import JsonSchema, Name, Text, Vec3, Vector, problem, shown
 
 __all__ = [
     "Camera",
@@ -148,8 +148,8 @@ class Scene(Block):
     probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
     solver: Solver = Field(default_factory=Solver)
     render: Render | None = None
-    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), WithJsonSchema(PETSC_BLOCK)] = (
-        Field(default_factory=dict)
+    petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), JsonSchema(PETSC_BLOCK)] = Field(
+        default_factory=dict
     )
 
     _source: Path | None = PrivateAttr(default=None)

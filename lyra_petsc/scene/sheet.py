@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationInfo, WithJsonSchema, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.materials.tables import names
@@ -16,6 +16,7 @@ from lyra_petsc.scene.values import (
     Axis,
     Bending,
     Count,
+    JsonSchema,
     Name,
     NonNegative,
     Number,
@@ -108,7 +109,7 @@ class MeshSource(Block):
 
     rules = (one_of("file", "grid"), when(given("size"), given(file=_file("geo"))))
 
-    file: Annotated[Path, WithJsonSchema(_file("geo", "msh", "obj"))] | None = None
+    file: Annotated[Path, JsonSchema(_file("geo", "msh", "obj"))] | None = None
     grid: Grid | None = None
     size: Positive | None = None
     transform: Transform = Field(default_factory=Transform)
@@ -215,7 +216,7 @@ class Material(Block):
     )
 
     group: Name | None = None
-    cloth: Annotated[Name, WithJsonSchema({"enum": names()})] | None = None
+    cloth: Annotated[Name, JsonSchema({"enum": names()})] | None = None
     density: Positive | None = None
     membrane: Membrane | None = None
     bending: Bending | None = None

@@ -11,10 +11,12 @@ import math
 import reprlib
 import sys
 from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import PlainValidator, WithJsonSchema
-from pydantic_core import PydanticCustomError
+from pydantic import GetJsonSchemaHandler, PlainValidator
+from pydantic_core import CoreSchema, PydanticCustomError
 
 Vec3 = tuple[float, float, float]
 
@@ -183,6 +185,17 @@ def _step_length(value: Any) -> float | str:
 
 Schema = dict[str, Any]
 
+
+@dataclass(frozen=True, eq=False)
+class JsonSchema:
+    """What JSON Schema says of a value; pydantic gets a copy, as some versions write into what they get."""
+
+    schema: Schema
+
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
+        return deepcopy(self.schema)
+
+
 # what JSON Schema can say of the values; .inf is a number to YAML
 FINITE: Schema = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
 NAME: Schema = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
@@ -201,41 +214,37 @@ NON_NEGATIVE = FINITE | {"minimum": 0}
 NONZERO = FINITE | {"not": {"const": 0}}
 VECTOR = _triple(FINITE)
 
-Number = Annotated[float, PlainValidator(number), WithJsonSchema(FINITE)]
-Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0")), WithJsonSchema(POSITIVE)]
-NonNegative = Annotated[
-    float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0")), WithJsonSchema(NON_NEGATIVE)
-]
+Number = Annotated[float, PlainValidator(number), JsonSchema(FINITE)]
+Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0")), JsonSchema(POSITIVE)]
+NonNegative = Annotated[float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0")), JsonSchema(NON_NEGATIVE)]
 Fraction = Annotated[
     float,
     PlainValidator(_bounded(lambda x: 0 <= x <= 1, "from 0 to 1")),
-    WithJsonSchema({"type": "number", "minimum": 0, "maximum": 1}),
+    JsonSchema({"type": "number", "minimum": 0, "maximum": 1}),
 ]
 StepLength = Annotated[
     float | Literal["auto"],
     PlainValidator(_step_length),
-    WithJsonSchema({"anyOf": [POSITIVE, {"const": "auto"}]}),
+    JsonSchema({"anyOf": [POSITIVE, {"const": "auto"}]}),
 ]
 Poisson = Annotated[
     float,
     PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]")),
-    WithJsonSchema({"type": "number", "exclusiveMinimum": -1, "maximum": 0.5}),
+    JsonSchema({"type": "number", "exclusiveMinimum": -1, "maximum": 0.5}),
 ]
-Until = Annotated[float, PlainValidator(_until), WithJsonSchema({"type": "number"})]
-Vector = Annotated[Vec3, PlainValidator(vector), WithJsonSchema(VECTOR)]
-Axis = Annotated[Vec3, PlainValidator(_axis), WithJsonSchema(VECTOR | {"contains": {"not": {"const": 0}}})]
-Scale = Annotated[
-    float | Vec3, PlainValidator(_scale), WithJsonSchema({"anyOf": [NONZERO, _triple(NONZERO)]})
-]
+Until = Annotated[float, PlainValidator(_until), JsonSchema({"type": "number"})]
+Vector = Annotated[Vec3, PlainValidator(vector), JsonSchema(VECTOR)]
+Axis = Annotated[Vec3, PlainValidator(_axis), JsonSchema(VECTOR | {"contains": {"not": {"const": 0}}})]
+Scale = Annotated[float | Vec3, PlainValidator(_scale), JsonSchema({"anyOf": [NONZERO, _triple(NONZERO)]})]
 PositiveScale = Annotated[
-    float | Vec3, PlainValidator(_positive_scale), WithJsonSchema({"anyOf": [POSITIVE, _triple(POSITIVE)]})
+    float | Vec3, PlainValidator(_positive_scale), JsonSchema({"anyOf": [POSITIVE, _triple(POSITIVE)]})
 ]
 Bending = Annotated[
-    float | Vec3, PlainValidator(_bending), WithJsonSchema({"anyOf": [NON_NEGATIVE, _triple(NON_NEGATIVE)]})
+    float | Vec3, PlainValidator(_bending), JsonSchema({"anyOf": [NON_NEGATIVE, _triple(NON_NEGATIVE)]})
 ]
-Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX)), WithJsonSchema(whole(1, LARGEST_INDEX))]
-Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX)), WithJsonSchema(whole(0, LARGEST_INDEX))]
-Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1)), WithJsonSchema(whole(0, 2**63 - 1))]
-Text = Annotated[str, PlainValidator(_text), WithJsonSchema({"type": "string", "pattern": r"^[^\0]*$"})]
-Name = Annotated[str, PlainValidator(_name), WithJsonSchema(NAME)]
-Flag = Annotated[bool, PlainValidator(_flag), WithJsonSchema({"type": "boolean"})]
+Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX)), JsonSchema(whole(1, LARGEST_INDEX))]
+Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX)), JsonSchema(whole(0, LARGEST_INDEX))]
+Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1)), JsonSchema(whole(0, 2**63 - 1))]
+Text = Annotated[str, PlainValidator(_text), JsonSchema({"type": "string", "pattern": r"^[^\0]*$"})]
+Name = Annotated[str, PlainValidator(_name), JsonSchema(NAME)]
+Flag = Annotated[bool, PlainValidator(_flag), JsonSchema({"type": "boolean"})]
