@@ -39,12 +39,12 @@ BROWSER = (
 )
 
 
-def page_process(out: Path) -> int:
-    """The page's process of the run in that folder."""
+def page_process(folder: Path) -> int:
+    """The page's process of the run started in that folder."""
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
             words = entry.joinpath("cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
-            if b"lyra_petsc.view.live" in words and os.fsencode(out) in words:
+            if b"lyra_petsc.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
                 return int(entry.name)
     raise SystemExit("the run has no page")
 
@@ -113,18 +113,18 @@ def main(
 ) -> None:
     """Run once and print the ratio."""
     words = [*(find_launcher(ranks) if ranks > 1 else []), sys.executable, "-m", "lyra_petsc", "run"]
-    words += [scene] if scene else []
+    words += [str(Path(scene).absolute())] if scene else []
     words += [word for setting in ("time.end=1000", *settings) for word in ("--set", setting)]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         out = Path(folder) / "run"
         words += ["--out", str(out), "--live", "--no-browser"]
         run = subprocess.Popen(
-            words, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            words, cwd=folder, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
         browser = None
         try:
             url = address(run)
-            page = page_process(out)
+            page = page_process(Path(folder))
             began = processor_seconds(page)
             if watch:
                 browser = open_page(watch, url, f"{folder}/browser")

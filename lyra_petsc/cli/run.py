@@ -79,35 +79,38 @@ class Shown(Watcher):
     """
 
     def __init__(self, comm: MPI.Comm, served: Served | None = None) -> None:
-        self._comm, self._served = comm, served
+        self._comm = comm
         self._progress: Progress | None = None
         self._page: LivePage | None = None
+        if served is not None and comm.rank == 0:
+            from lyra_petsc.view.live import LivePage
+
+            self._page = LivePage(
+                served.host,
+                served.port,
+                ready=lambda url: served.announce(url, self._say),
+                failed=lambda why: self._say(f"note: no page: {why}"),
+            )
+
+    def _say(self, text: str) -> None:
+        if self._progress is not None:
+            self._progress.say(text)
 
     def begin(self, simulation: Simulation, folder: Path) -> None:
         """Begin the progress bar, and the page."""
-        self._progress = progress = Progress(
+        self._progress = Progress(
             self._comm,
             simulation.control.end,
             start=simulation.time,
             plain=_petsc_speaks(),
             unit="s" if simulation.model.system.scheme.moves else "",
         )
-        served = self._served
-        if served is not None and self._comm.rank == 0:
-            from lyra_petsc.view.live import LivePage
-
-            self._page = LivePage(
-                folder,
-                served.host,
-                served.port,
-                ready=lambda url: served.announce(url, progress.say),
-                failed=lambda why: progress.say(f"note: no page: {why}"),
-            )
+        if self._page is not None:
+            self._page.show(folder)
 
     def note(self, text: str) -> None:
         """A line above the bar."""
-        if self._progress is not None:
-            self._progress.say(f"note: {text}")
+        self._say(f"note: {text}")
 
     def step(self, simulation: Simulation, report: StepReport) -> None:
         """Move the bar."""

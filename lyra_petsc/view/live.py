@@ -1,8 +1,8 @@
 """The page of a run that goes on: a process of its own, which reads the run's folder.
 
-``python -m lyra_petsc.view.live FOLDER HOST PORT`` tells in one line on its standard output where the page
-is, or why there is none. When its standard input ends, the run has ended, however it did; the process ends
-when nobody has the page open any more.
+``python -m lyra_petsc.view.live HOST PORT`` reads the folder from its standard input, and tells in one line
+on its standard output where the page is, or why there is none. When its standard input ends, the run has
+ended, however it did; the process ends when nobody has the page open any more.
 """
 
 from __future__ import annotations
@@ -26,12 +26,10 @@ NICENESS = 15
 
 
 class LivePage:
-    """Starts the page's process, and lets go of it; for one rank. The run never waits for it.
+    """Starts the page's process, before the set-up, and lets go of it; for one rank. The run never waits.
 
     Parameters
     ----------
-    folder : Path
-        Of the run, with its first state.
     host : str
     port : int
     ready : callable
@@ -41,13 +39,13 @@ class LivePage:
     """
 
     def __init__(
-        self, folder: Path, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
+        self, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
     ) -> None:
         self._process: subprocess.Popen[str] | None = None
         self._ready, self._failed = ready, failed
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "lyra_petsc.view.live", str(folder.absolute()), host, str(port)],
+                [sys.executable, "-m", "lyra_petsc.view.live", host, str(port)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -68,6 +66,13 @@ class LivePage:
         elif process.stdin is not None and not process.stdin.closed:  # else the run was over before
             self._failed(line.removeprefix(FAILED) or "its process ended")
 
+    def show(self, folder: Path) -> None:
+        """The first state is in the run's folder: serve the page."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # `failed` is told
+                self._process.stdin.write(f"{folder.absolute()}\n")
+                self._process.stdin.flush()
+
     def end(self) -> None:
         """The run has ended: let the page show the last state, and go when nobody looks."""
         if self._process is not None and self._process.stdin is not None:
@@ -75,11 +80,17 @@ class LivePage:
                 self._process.stdin.close()
 
 
-def main(folder: Path, host: str, port: int) -> None:
-    """Serve the page until the standard input ends."""
+def main(host: str, port: int) -> None:
+    """Serve the page of the run whose folder comes first until the standard input ends."""
+    _step_back()
+    # what takes a second is done while the run sets itself up
+    from lyra_petsc.view import page  # noqa: F401
     from lyra_petsc.view.server import LONGEST_STAY, find_run, serve
 
-    _step_back()
+    line = sys.stdin.readline()
+    if not line:
+        return
+    folder = Path(line.removesuffix("\n"))
 
     def tell(line: str) -> None:
         with suppress(OSError):  # the run is gone already
@@ -112,4 +123,4 @@ def _step_back() -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]))

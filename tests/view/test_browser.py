@@ -199,7 +199,8 @@ def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(brows
     writer = Writer(tmp_path / "run")
     writer.write()
     told = []
-    page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "run")
     try:
         while not told:
             time.sleep(0.1)

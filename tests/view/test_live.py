@@ -20,16 +20,15 @@ PATIENCE = 60.0
 
 
 def pages(folder):
-    """Processes that serve the page of a run below ``folder``."""
+    """Processes that serve the page of a run started in ``folder``."""
     found = []
-    for entry in os.scandir("/proc"):
-        if entry.name.isdigit():
-            try:
-                words = Path(entry.path, "cmdline").read_bytes().split(b"\0")
-            except OSError:
-                continue
-            if b"lyra_petsc.view.live" in words and any(w.startswith(os.fsencode(folder)) for w in words):
+    for entry in Path("/proc").iterdir():
+        try:
+            words = entry.joinpath("cmdline").read_bytes().split(b"\0")
+            if b"lyra_petsc.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
                 found.append(int(entry.name))
+        except (OSError, ValueError):  # no process, or gone meanwhile
+            continue
     return found
 
 
@@ -52,8 +51,9 @@ def address(process):
 
 
 @pytest.fixture(autouse=True)
-def needs_the_extra():
+def in_its_folder(tmp_path, monkeypatch):
     pytest.importorskip("trame")
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.slow
@@ -125,7 +125,8 @@ def test_a_port_in_use_is_told_before_anything_is_written(tmp_path):
 
 def test_a_page_that_cannot_be_served_is_told(tmp_path):
     told = []
-    page = LivePage(tmp_path / "nowhere", "127.0.0.1", 0, told.append, told.append)
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "nowhere")
     until(lambda: told, "nothing is said")
     page.end()
     assert "nowhere: no such folder" in told[0]
@@ -138,7 +139,8 @@ def test_the_page_stays_while_it_is_open_and_goes_with_the_last_who_looks(tmp_pa
     writer = Writer(tmp_path / "run")
     writer.write()
     told = []
-    page = LivePage(tmp_path / "run", "127.0.0.1", 0, told.append, told.append)
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "run")
     until(lambda: told, "nothing is said")
     (process,) = pages(tmp_path)
     assert os.getpriority(os.PRIO_PROCESS, process) >= NICENESS
