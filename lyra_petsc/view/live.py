@@ -24,6 +24,9 @@ READY, FAILED = "ready ", "failed "
 NICENESS = 15
 """Linux: beside a rank on the same processor 36 / (1024 + 36) = 3.4 % of the time, of an idle one all."""
 
+NICENESS_AT_START = 10
+"""As long as there is no page: 10 % of the time, for a second's work that falls mostly into the set-up."""
+
 
 class LivePage:
     """Starts the page's process, before the set-up, and lets go of it; for one rank. The run never waits.
@@ -82,7 +85,7 @@ class LivePage:
 
 def main(host: str, port: int) -> None:
     """Serve the page of the run whose folder comes first until the standard input ends."""
-    _step_back()
+    _step_back(NICENESS_AT_START)
     # what takes a second is done while the run sets itself up
     from lyra_petsc.view import page  # noqa: F401
     from lyra_petsc.view.server import LONGEST_STAY, find_run, serve
@@ -104,19 +107,23 @@ def main(host: str, port: int) -> None:
             f"minutes; later: lyra-petsc view {folder}"
         )
 
+    def ready(url: str) -> None:
+        _step_back(NICENESS)
+        tell(READY + url)
+
     try:
-        serve(find_run(folder), host=host, port=port, ready=lambda url: tell(READY + url), ended=ended)
+        serve(find_run(folder), host=host, port=port, ready=ready, ended=ended)
     except LyraError as error:
         tell(FAILED + str(error))
 
 
-def _step_back() -> None:
+def _step_back(niceness: int) -> None:
     """Leave the processors to the run, and be bound to none: rank 0 is, perhaps."""
-    os.nice(NICENESS)
+    os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
     if os.getsid(0) == os.getpid():
         # Linux may share the time out among sessions first, and this is one of its own
         with suppress(OSError):
-            Path("/proc/self/autogroup").write_text(str(NICENESS), encoding="ascii")
+            Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
     if hasattr(os, "sched_setaffinity"):
         with suppress(OSError):
             os.sched_setaffinity(0, range(os.cpu_count() or 1))
