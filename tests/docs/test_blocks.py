@@ -18,7 +18,7 @@ from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml
 
-END = 0.03
+END = 0.05
 """Seconds that runs are shortened to."""
 
 PATIENCE = 300.0
