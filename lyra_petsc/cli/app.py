@@ -56,8 +56,6 @@ def run_command_line(argv: Sequence[str]) -> int:
     reserve = [bytes(RESERVE)]
     # numba would put colour codes on the standard output where it finds colorama
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-    # numba would put colour codes on the standard output where it finds colorama
-    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     # a number that overflows makes a step fail, which is told once and in words
     np.seterr(over="ignore", invalid="ignore")
     try:
