@@ -73,10 +73,7 @@ run_part() {
     if ((code == 0)); then code=$result; fi
 }
 
-# the whole suite by as many processes as there are cores (nproc minds the variable), module by module
-spread=()
-((${#arguments[@]})) || spread=(-n "$(env -u OMP_NUM_THREADS nproc || echo 1)" --maxprocesses 4 --dist loadscope)
-run_part 1 "${spread[@]}" "${arguments[@]}"
+run_part 1 "${arguments[@]}"
 run_part 2 "${arguments[@]}" -m "$selection"
 run_part 3 "${arguments[@]}" -m "$selection"
 
