@@ -45,6 +45,12 @@ def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.hookimpl(trylast=True)  # the terminal exists by then
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "parallel: runs on every rank of mpirun at the same time")
+    import petsc4py.PETSc  # noqa: F401
+
+    from lyra_petsc.cli.signals import take_back_from_petsc
+
+    # or a pipe that is closed, as by a film that cannot be written, ends pytest
+    take_back_from_petsc()
     if WORLD.size == 1:
         return
     capture = config.pluginmanager.getplugin("capturemanager")
