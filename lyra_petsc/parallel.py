@@ -1,9 +1,11 @@
-"""Decisions that all ranks share: made on one rank, told to all."""
+"""Ranks and their process: decisions made on one rank and told to all; signals."""
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
 from lyra_petsc.errors import LyraError
@@ -15,6 +17,13 @@ Result = TypeVar("Result")
 
 GRACE = 5.0
 """How long [s] a rank that failed waits for the others to fail alike."""
+
+
+def take_back_signals() -> None:
+    """Put back what PETSc's start replaces: a pipe or a terminal that goes away must not end the process."""
+    for number in (signal.SIGPIPE, signal.SIGHUP):
+        with suppress(ValueError):  # not in the main thread
+            signal.signal(number, signal.getsignal(number))
 
 
 def all_here(comm: MPI.Comm) -> bool:

@@ -47,10 +47,10 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "parallel: runs on every rank of mpirun at the same time")
     import petsc4py.PETSc  # noqa: F401
 
-    from lyra_petsc.cli.signals import take_back_from_petsc
+    from lyra_petsc.parallel import take_back_signals
 
     # or a pipe that is closed, as by a film that cannot be written, ends pytest
-    take_back_from_petsc()
+    take_back_signals()
     if WORLD.size == 1:
         return
     capture = config.pluginmanager.getplugin("capturemanager")

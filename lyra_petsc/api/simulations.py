@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import weakref
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any, Literal
@@ -19,13 +17,11 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.fields import FIELDS, check_field
 from lyra_petsc.meshing.mesh import Mesh
 from lyra_petsc.nearest import nearest
-from lyra_petsc.parallel import on_root
+from lyra_petsc.parallel import on_root, take_back_signals
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation as Stepping
 
-with suppress(ValueError):  # not in the main thread
-    # PETSc, imported by now, would end the process where some other library writes into a closed pipe
-    signal.signal(signal.SIGPIPE, signal.getsignal(signal.SIGPIPE))
+take_back_signals()  # PETSc is imported by now
 
 Array = NDArray[np.float64]
 

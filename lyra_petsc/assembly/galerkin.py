@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys, index_type, places, union
 from lyra_petsc.kernel_cache import cached
+from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.partition.points import Points
 
 Array = NDArray[np.float64]
@@ -108,35 +109,27 @@ class Galerkin:
         beyond = everyone[n:][everyone[n:] >= 0]
         ghosts = np.unique(beyond[(beyond < first) | (beyond >= first + n_coarse)])
         self.points = Points(comm, bounds, ghosts, np.arange(n_coarse))
-        order = np.argsort(self.points.global_number)
-        sorted_numbers = self.points.global_number[order]
-        found = np.searchsorted(sorted_numbers, np.maximum(everyone, 0)).clip(max=len(order) - 1)
-        self._parents = np.where(everyone >= 0, order[found] if len(order) else -1, -1)
+        numbers = local_numbers(everyone, ghosts, first, first + n_coarse)
+        self._parents = np.where(everyone >= 0, numbers, -1)
         self._fine = pattern
-        place = np.empty(len(order), dtype=np.int64)
-        place[order] = np.arange(len(order))
-        self._make_pattern(n_coarse, order, place)
+        self._make_pattern(n_coarse, places(self.points.global_number))
 
-    def _make_pattern(self, n_coarse: int, order: Ints, place: Ints) -> None:
-        fine, width = self._fine, max(len(order), 1)
-        n = len(fine.indptr) - 1
+    def _make_pattern(self, n_coarse: int, place: Ints) -> None:
+        n = len(self._fine.indptr) - 1
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
-        own = np.arange(n_coarse, dtype=np.int64)
-        diagonal = own * width + place[own]
-        keys = diagonal
+        keys = diagonal_keys(n_coarse, place)
         for lo, hi in chunks:
-            keys = np.unique(np.concatenate([keys, self._keys_of(lo, hi, place, width)]))
-        rows, places = np.divmod(keys, width)
-        self.pattern = BlockPattern.of_rows(rows, order[places], np.searchsorted(keys, diagonal), n_coarse)
-        found = [np.searchsorted(keys, self._keys_of(lo, hi, place, width)) for lo, hi in chunks]
-        kind = np.int32 if len(keys) < 2**31 else np.int64
-        self._target = np.concatenate([np.zeros(0, dtype=kind), *(part.astype(kind) for part in found)])
+            keys = union(keys, self._keys_of(lo, hi, place))
+        self.pattern = BlockPattern.of_keys(keys, n_coarse, place)
+        kind = index_type(len(keys))
+        found = [np.searchsorted(keys, self._keys_of(lo, hi, place)).astype(kind) for lo, hi in chunks]
+        self._target = np.concatenate([np.zeros(0, dtype=kind), *found])
         self.values = np.zeros((len(keys), 3, 3))
 
-    def _keys_of(self, lo: int, hi: int, place: Ints, width: int) -> Ints:
+    def _keys_of(self, lo: int, hi: int, place: Ints) -> Ints:
         fine = self._fine
         keys = np.empty(9 * int(fine.indptr[hi] - fine.indptr[lo]), dtype=np.int64)
-        return keys[: _keys(lo, hi, fine.indptr, fine.columns, self._parents, place, width, keys)]
+        return keys[: _keys(lo, hi, fine.indptr, fine.columns, self._parents, place, len(place), keys)]
 
     def project(self, values: Array, free: Array) -> Array:
         """Coarse block rows (C, 3, 3) of fine ones (n_blocks, 3, 3).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,38 +39,54 @@ class BlockPattern:
     def __init__(
         self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int, global_number: Ints
     ) -> None:
-        position = np.empty(n_local, dtype=np.int64)
-        order = np.argsort(global_number)
-        position[order] = np.arange(n_local)
-        own = np.arange(n_owned, dtype=np.int64)
-        diagonal_keys = own * n_local + position[own]
-        keys = np.sort(diagonal_keys)
+        position = places(global_number)
+        keys = diagonal_keys(n_owned, position)
         for stencil in stencils.values():
             for a in range(stencil.shape[1]):  # one after the other: all couplings at once take much memory
-                keys = _union(keys, *_row_keys(stencil, a, n_owned, n_local, position))
-        rows, places = np.divmod(keys, max(n_local, 1))
-        self._set(rows, order[places], n_owned)
-        self.diagonal: Ints = np.searchsorted(keys, diagonal_keys)
+                keys = union(keys, *_row_keys(stencil, a, n_owned, n_local, position))
+        self._set(keys, n_owned, position)
         self.offsets: dict[str, Offsets] = {
             name: _offsets(s, keys, n_owned, n_local, position) for name, s in stencils.items()
         }
 
     @classmethod
-    def of_rows(cls, rows: Ints, columns: Ints, diagonal: Ints, n_owned: int) -> BlockPattern:
-        """The pattern with blocks (rows, columns), in their order, which no elements add to."""
+    def of_keys(cls, keys: Ints, n_owned: int, position: Ints) -> BlockPattern:
+        """The pattern with these blocks, which no elements add to.
+
+        ``keys`` are ascending, row · n_local + ``position`` (n_local,) of the column.
+        """
         made = cls.__new__(cls)
-        made._set(rows, columns, n_owned)
-        made.diagonal, made.offsets = diagonal, {}
+        made._set(keys, n_owned, position)
+        made.offsets = {}
         return made
 
-    def _set(self, rows: Ints, columns: Ints, n_owned: int) -> None:
-        self.columns: Ints = columns
+    def _set(self, keys: Ints, n_owned: int, position: Ints) -> None:
+        rows, at = np.divmod(keys, max(len(position), 1))
+        self.columns: Ints = np.argsort(position)[at]
         self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
         np.cumsum(np.bincount(rows, minlength=n_owned), out=self.indptr[1:])
+        self.diagonal: Ints = np.searchsorted(keys, diagonal_keys(n_owned, position))
 
     @property
     def n_blocks(self) -> int:
         return len(self.columns)
+
+
+def places(global_number: Ints) -> Ints:
+    """Place of each local point in ascending global order, (n_local,)."""
+    position = np.empty(len(global_number), dtype=np.int64)
+    position[np.argsort(global_number)] = np.arange(len(global_number))
+    return position
+
+
+def diagonal_keys(n_owned: int, position: Ints) -> Ints:
+    """Keys of the diagonal blocks, ascending."""
+    return np.arange(n_owned, dtype=np.int64) * len(position) + position[:n_owned]
+
+
+def index_type(largest: int) -> np.dtype[Any]:
+    """The smaller kind of offsets that counts so far."""
+    return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
 
 
 def _pair_keys(stencil: NDArray[np.int32], a: int, b: int, n_local: int, position: Ints) -> Ints:
@@ -83,7 +100,7 @@ def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int, po
     return [_pair_keys(mine, a, b, n_local, position) for b in range(stencil.shape[1])]
 
 
-def _union(*parts: Ints) -> Ints:
+def union(*parts: Ints) -> Ints:
     """All numbers, ascending, each once; as ``np.unique``, with one copy less."""
     numbers = np.concatenate(parts)
     numbers.sort()
@@ -92,8 +109,7 @@ def _union(*parts: Ints) -> Ints:
 
 def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int, position: Ints) -> Offsets:
     n = stencil.shape[1]
-    kind = np.dtype("int32" if len(keys) <= LARGEST_INT32 else "int64")
-    out: Offsets = np.empty((len(stencil), n, n), dtype=kind)
+    out: Offsets = np.empty((len(stencil), n, n), dtype=index_type(len(keys)))
     for a in range(n):
         mine = stencil[:, a] < n_owned
         for b in range(n):

@@ -13,9 +13,9 @@ from typing import Any
 import click
 
 from lyra_petsc.cli.arguments import split
-from lyra_petsc.cli.signals import take_back_from_petsc
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError
+from lyra_petsc.parallel import take_back_signals
 
 PROGRAM = "lyra-petsc"
 
@@ -41,7 +41,7 @@ def run_command_line(argv: Sequence[str]) -> int:
         import petsc4py
 
         petsc4py.init([argv[0], *petsc])
-        take_back_from_petsc()
+        take_back_signals()
         import numpy as np
         from mpi4py import MPI
     except ImportError as error:

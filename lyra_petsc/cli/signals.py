@@ -30,12 +30,6 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(130 if number == signal.SIGINT else 143)
 
 
-def take_back_from_petsc() -> None:
-    """Put back what PETSc's start replaces: a reader of our output that goes away must not end a run."""
-    for number in (signal.SIGPIPE, LOST):
-        signal.signal(number, signal.getsignal(number))
-
-
 class StopRequest:
     """Notes the first signal that this rank gets; a second SIGINT ends it at once."""
 

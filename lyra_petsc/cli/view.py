@@ -98,18 +98,15 @@ class Served:
 def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: bool) -> None:
     """Play RUN, a folder of results, in the browser; follow it if it goes on."""
     problem: LyraError | None = None
-    number = 0
     if comm.rank == 0:
         try:
-            number = _serve(run, Served.of(host, port, no_browser))
+            _serve(run, Served.of(host, port, no_browser))
         except LyraError as error:
             problem = error
     _wait_for_rank_0(comm)
-    problem, number = comm.bcast((problem, number), root=0)
+    problem = comm.bcast(problem, root=0)
     if problem is not None:
         raise problem
-    if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
-        raise Interrupted(f"ended by {signal.Signals(number).name}", number)
 
 
 def _wait_for_rank_0(comm: MPI.Comm) -> None:
@@ -119,8 +116,8 @@ def _wait_for_rank_0(comm: MPI.Comm) -> None:
         time.sleep(0.2)
 
 
-def _serve(folder: Path, served: Served) -> int:
-    """Serve until a signal; the signal."""
+def _serve(folder: Path, served: Served) -> None:
+    """Serve until a signal."""
     served.check("view")
     from lyra_petsc.view.server import find_run, serve
 
@@ -128,4 +125,6 @@ def _serve(folder: Path, served: Served) -> int:
         served.announce(url, click.echo)
         click.echo("Ctrl-C ends")
 
-    return serve(find_run(folder), host=served.host, port=served.port, ready=ready)
+    number = serve(find_run(folder), host=served.host, port=served.port, ready=ready)
+    if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
+        raise Interrupted(f"ended by {signal.Signals(number).name}", number)

@@ -125,7 +125,7 @@ def _pieces(whole: Whole, numbering: Numbering, n_ranks: int):  # type: ignore[n
         ghosts = touched[(touched < lo) | (touched >= hi)]
         elements = {}
         for name, (index, n_owned) in ((n, s[rank]) for n, s in split.items()):
-            stencil = _local(stencils[name], ghosts, lo, hi)
+            stencil = local_numbers(stencils[name], ghosts, lo, hi)
             order = _by_locality(stencil, n_owned)
             index = index[order]
             data = {key: np.ascontiguousarray(v[index]) for key, v in whole.elements[name].data.items()}
@@ -135,7 +135,7 @@ def _pieces(whole: Whole, numbering: Numbering, n_ranks: int):  # type: ignore[n
         yield numbering.bounds, ghosts, original, elements, vertex_data
 
 
-def _local(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
+def local_numbers(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
     """Local numbers of global ones: owned from 0, ghosts after them."""
     inside = (numbers >= lo) & (numbers < hi)
     local: Ints = np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))

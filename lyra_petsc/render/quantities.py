@@ -71,15 +71,13 @@ def quantity(run: Run, name: str) -> Quantity:
             key="--field",
         )
     stored = run.field(name)
-    first = np.asarray(stored[0])
-    on_triangles = len(first) == len(run.triangles) and name not in _ON_VERTICES
     principal = name in _PRINCIPAL
     reduce = _largest_principal if principal else _magnitude
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
+    on_triangles = run.field_on(name) == "triangle"
     return Quantity(name, label, on_triangles, name in _SIGNED, lambda i: reduce(np.asarray(stored[i])))
 
 
-_ON_VERTICES = {"velocity", "bending_energy", "curvature", "rank"}
 _PRINCIPAL = {"green_strain", "stress"}
 _SIGNED = {"curvature"}
 

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernel_cache import cached
+from lyra_petsc.meshing.topology import boundary_edges
+from lyra_petsc.partition.partitioner import vertex_graph
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,7 +51,7 @@ class Coarse:
 def coarsen(x: Array, triangles: Ints) -> Coarse:
     """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3)."""
     n = len(x)
-    start, neighbours = _neighbours(n, triangles)
+    start, neighbours = vertex_graph([triangles], n)
     stays = _independent(start, neighbours, _borders(n, triangles))
     vertices = np.flatnonzero(stays)
     label = np.full(n, -1, dtype=np.int64)
@@ -66,22 +68,10 @@ def coarsen(x: Array, triangles: Ints) -> Coarse:
     return Coarse(vertices, coarse, parents, weights)
 
 
-def _neighbours(n: int, triangles: Ints) -> tuple[Ints, Ints]:
-    """Compressed rows of the vertices that share an edge with each."""
-    pairs = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    keys = np.unique(np.concatenate([pairs[:, 0] * n + pairs[:, 1], pairs[:, 1] * n + pairs[:, 0]]))
-    start = np.zeros(n + 1, dtype=np.int64)
-    rows, columns = np.divmod(keys, max(n, 1))
-    np.cumsum(np.bincount(rows, minlength=n), out=start[1:])
-    return start, columns
-
-
 def _borders(n: int, triangles: Ints) -> NDArray[np.int8]:
     """2 for corners of the border (ends of no or of one triangle), 1 for other border vertices, else 0."""
-    pairs = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys, counts = np.unique(pairs[:, 0] * n + pairs[:, 1], return_counts=True)
     border = np.zeros(n, dtype=np.int8)
-    border[np.concatenate(np.divmod(keys[counts == 1], max(n, 1)))] = 1
+    border[boundary_edges(triangles).edges] = 1
     border[np.bincount(triangles.ravel(), minlength=n) < 2] = 2
     return border
 

@@ -44,7 +44,7 @@ class Surface:
     """
 
     x: Array
-    triangles: Ints
+    triangles: NDArray[np.int32]
 
 
 MOST_LEVELS = 20
@@ -113,8 +113,8 @@ class Hierarchy:
         self.levels: list[Level] = []
         n = points.n_owned
         most = max(2, PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS))
-        x, triangles = surface.x[:n], surface.triangles
-        triangles = triangles[(triangles < n).all(axis=1)]
+        x = surface.x[:n]
+        triangles = surface.triangles[(surface.triangles < n).all(axis=1)].astype(np.int64)
         while len(self.levels) + 1 < most and (points.n_global > COARSEST or not self.levels):
             coarse = coarsen(x, triangles)
             left = points.comm.allreduce(len(coarse.vertices))

@@ -104,7 +104,7 @@ class Newton:
         self._stalled, self.too_slow, self.increment = 0, False, np.inf
         self._fell = self._kept = self._same = False
         # a step begins as the one before did
-        self._convex, self._first = self._began_convex, True
+        self._convex = self._began_convex
         self._spent = 0
         self._watchdog.begin()
         self.forcing.begin()
@@ -158,8 +158,8 @@ class Newton:
         residual = self._snes.getFunction()[0]
         useless = self._useless(residual, y)
         self._convex = not useless
-        if self._first:
-            self._began_convex, self._first = self._convex, False
+        if self._snes.getIterationNumber() == 0:
+            self._began_convex = self._convex
         while useless and (self._kept or self._same or self._blend.raise_()):
             self._assemble_again(x)
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)

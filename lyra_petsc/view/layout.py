@@ -47,26 +47,8 @@ def _top(page: Page) -> None:
     with html.Div(classes="bar"):
         html.H1("{{ title }}", id="title")
         html.Div("{{ status }}", classes="status", id="status", title=("status",))
-        v.VSelect(
-            v_model=("quantity",),
-            items=("quantities",),
-            label="colour",
-            id="quantity",
-            classes="choice",
-            density="compact",
-            hide_details=True,
-            variant="outlined",
-        )
-        v.VSelect(
-            v_model=("speed",),
-            items=("speeds",),
-            label="speed",
-            id="speed",
-            classes="pace",
-            density="compact",
-            hide_details=True,
-            variant="outlined",
-        )
+        _choice("quantity", "quantities", "colour", "choice")
+        _choice("speed", "speeds", "speed", "pace")
         _button("mdi-grid", "edges", "show the triangles", click="edges = !edges")
         _button("mdi-fit-to-screen-outline", "fit", "show the whole motion", click=page.fit)
 
@@ -88,6 +70,19 @@ def _bottom(page: Page) -> None:
             style="flex: 1 1 200px; min-width: 120px",
         )
         html.Div("{{ clock }}", classes="clock", id="clock")
+
+
+def _choice(name: str, items: str, label: str, classes: str) -> None:
+    v.VSelect(
+        v_model=(name,),
+        items=(items,),
+        label=label,
+        id=name,
+        classes=classes,
+        density="compact",
+        hide_details=True,
+        variant="outlined",
+    )
 
 
 def _button(icon: Any, name: str, says: str, *, click: Any) -> None:
