@@ -27,7 +27,7 @@ from lyra_petsc.partition.distribute import Part, Whole, distribute
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.partition.points import Points
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers.multigrid import Surface
+from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.options import petsc_number
 from lyra_petsc.start import start_positions, start_velocities
 from lyra_petsc.stepping.schemes.registry import scheme_of

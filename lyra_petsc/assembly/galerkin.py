@@ -1,11 +1,12 @@
-"""Block rows of a coarse matrix: interpolationᵀ · block rows · interpolation."""
+"""Block rows of a coarse matrix: interpolationᵀ · symmetric block rows · interpolation."""
 
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys, index_type, places, union
+from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys, index_type, union
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.partition.points import Points
@@ -13,68 +14,135 @@ from lyra_petsc.partition.points import Points
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-CHUNK_ROWS = 1 << 14
+Index = np.uintp
+
+CHUNK_ROWS = 1 << 13
 """Fine rows whose products are looked at together while the coarse pattern is made."""
 
 
 @cached()
-def _keys(lo, hi, indptr, columns, parents, place, width, keys):  # type: ignore[no-untyped-def]
-    """Keys row · width + column place of what fine rows lo..hi add to, in the order of `_project`."""
-    q = 0
+def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type: ignore[no-untyped-def]
+    """Of fine rows lo..hi: where a row's product with the interpolation is summed, and what it adds to.
+
+    A row of blocks times the interpolation has a block for each coarse point met, in the order in which
+    they are met; ``slots`` are their numbers. Of ``keys`` there is one for each parent of the row and each
+    of these: row · width + column of the coarse block, ~ of it if the product is to be transposed.
+    """
+    seen, at = np.full(width, -1, np.int64), np.zeros(width, np.int64)
+    met = np.empty(width, np.int64)
+    s = q = 0
     for row in range(lo, hi):
+        m = 0
         for k in range(indptr[row], indptr[row + 1]):
-            c = columns[k]
-            for a in range(3):
-                if parents[row, a] >= 0:
-                    for b in range(3):
-                        if parents[c, b] >= 0:
-                            keys[q] = parents[row, a] * width + place[parents[c, b]]
-                            q += 1
+            for p in range(start[columns[k]], start[columns[k] + 1]):
+                c = parents[p]
+                if seen[c] != row:
+                    seen[c], at[c], met[m] = row, m, c
+                    m += 1
+                slots[s] = at[c]
+                s += 1
+        for p in range(start[row], start[row + 1]):
+            a = parents[p]
+            for t in range(m):
+                c = met[t]
+                keys[q] = a * width + c if c >= a else ~(c * width + a)
+                q += 1
     return q
 
 
 @cached()
-def _project(indptr, columns, parents, weights, free, target, values, out):  # type: ignore[no-untyped-def]
-    """out[target] += weight · weight · block, coordinates that are not free left out."""
-    q = 0
+def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignore[no-untyped-def]
+    """Of each fine row, how many slots and keys it has."""
+    seen = np.full(width, -1, np.int64)
     for row in range(len(indptr) - 1):
-        r0, r1, r2 = free[row, 0], free[row, 1], free[row, 2]
+        m = n = 0
         for k in range(indptr[row], indptr[row + 1]):
-            c = columns[k]
-            c0, c1, c2 = free[c, 0], free[c, 1], free[c, 2]
-            v = values[k]
-            v00, v01, v02 = r0 * c0 * v[0, 0], r0 * c1 * v[0, 1], r0 * c2 * v[0, 2]
-            v10, v11, v12 = r1 * c0 * v[1, 0], r1 * c1 * v[1, 1], r1 * c2 * v[1, 2]
-            v20, v21, v22 = r2 * c0 * v[2, 0], r2 * c1 * v[2, 1], r2 * c2 * v[2, 2]
-            for a in range(3):
-                if parents[row, a] >= 0:
-                    for b in range(3):
-                        if parents[c, b] >= 0:
-                            w = weights[row, a] * weights[c, b]
-                            o = out[target[q]]
-                            q += 1
-                            o[0, 0] += w * v00
-                            o[0, 1] += w * v01
-                            o[0, 2] += w * v02
-                            o[1, 0] += w * v10
-                            o[1, 1] += w * v11
-                            o[1, 2] += w * v12
-                            o[2, 0] += w * v20
-                            o[2, 1] += w * v21
-                            o[2, 2] += w * v22
+            for p in range(start[columns[k]], start[columns[k] + 1]):
+                n += 1
+                if seen[parents[p]] != row:
+                    seen[parents[p]] = row
+                    m += 1
+        slots[row] = n
+        keys[row] = m * (start[row + 1] - start[row])
+
+
+@cached(fastmath=True)
+def _project(indptr, columns, start, weights, slots, most, target, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add what fine rows give to the coarse ones (C, 9); diagonal blocks are half what they are to be.
+
+    Rows and columns of coordinates that are not free are decoupled: only their diagonal must not count.
+    Unsigned indices, and no views: numba looks at the sign of others, which takes four times as long.
+    """
+    sums = np.empty((most, 9))
+    s = q = 0
+    for row in range(len(indptr) - 1):
+        m = 0
+        for k in range(Index(indptr[row]), Index(indptr[row + 1])):
+            j = Index(columns[k])
+            b0, b1, b2 = values[k, 0], values[k, 1], values[k, 2]
+            b3, b4, b5 = values[k, 3], values[k, 4], values[k, 5]
+            b6, b7, b8 = values[k, 6], values[k, 7], values[k, 8]
+            half = 1.0
+            if j == Index(row):
+                half = 0.5
+                b0, b4, b8 = free[row, 0] * b0, free[row, 1] * b4, free[row, 2] * b8
+            for p in range(start[j], start[j + Index(1)]):
+                w, t = half * weights[p], Index(slots[s])
+                s += 1
+                if t == Index(m):
+                    m += 1
+                    sums[t, 0], sums[t, 1], sums[t, 2] = w * b0, w * b1, w * b2
+                    sums[t, 3], sums[t, 4], sums[t, 5] = w * b3, w * b4, w * b5
+                    sums[t, 6], sums[t, 7], sums[t, 8] = w * b6, w * b7, w * b8
+                else:
+                    sums[t, 0] += w * b0
+                    sums[t, 1] += w * b1
+                    sums[t, 2] += w * b2
+                    sums[t, 3] += w * b3
+                    sums[t, 4] += w * b4
+                    sums[t, 5] += w * b5
+                    sums[t, 6] += w * b6
+                    sums[t, 7] += w * b7
+                    sums[t, 8] += w * b8
+        for p in range(start[row], start[row + 1]):
+            w = weights[p]
+            for t in range(Index(m)):
+                k = target[q]
+                q += 1
+                b0, b1, b2 = w * sums[t, 0], w * sums[t, 1], w * sums[t, 2]
+                b3, b4, b5 = w * sums[t, 3], w * sums[t, 4], w * sums[t, 5]
+                b6, b7, b8 = w * sums[t, 6], w * sums[t, 7], w * sums[t, 8]
+                if k < 0:
+                    k = ~k
+                    b1, b2, b3, b5, b6, b7 = b3, b6, b1, b7, b2, b5
+                o = Index(k)
+                out[o, 0] += b0
+                out[o, 1] += b1
+                out[o, 2] += b2
+                out[o, 3] += b3
+                out[o, 4] += b4
+                out[o, 5] += b5
+                out[o, 6] += b6
+                out[o, 7] += b7
+                out[o, 8] += b8
 
 
 @cached()
-def _fill_diagonal(diagonal, values):  # type: ignore[no-untyped-def]
-    """A one where nothing is interpolated from a coordinate."""
-    for k in diagonal:
+def _finish_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
+    """Add the transposed half; where nothing is interpolated from a coordinate, a one, and it is not free."""
+    for row in range(len(indptr) - 1):
+        v = values[indptr[row]]
         for i in range(3):
-            if values[k, i, i] == 0.0:
-                values[k, i, i] = 1.0
+            for j in range(i, 3):
+                v[i, j] = v[j, i] = v[i, j] + v[j, i]
+        for i in range(3):
+            free[row, i] = 1.0
+            if v[i, i] == 0.0:
+                v[i, i], free[row, i] = 1.0, 0.0
 
 
 class Galerkin:
-    """The coarse rows of a rank, whose vertices are interpolated from coarse ones of the same rank.
+    """The coarse rows of a rank, whose points are interpolated from coarse ones of the same rank.
 
     Parameters
     ----------
@@ -82,8 +150,10 @@ class Galerkin:
         The fine ones.
     pattern : BlockPattern
         Of the fine rows.
-    parents, weights : (n_owned, 3)
-        Interpolation from owned coarse points; −1 for none.
+    start : (n_owned + 1,)
+        Where each fine point's parents begin.
+    parents, weights : (P,)
+        Owned coarse points that it is interpolated from.
     n_coarse : int
         Coarse points of this rank.
 
@@ -93,53 +163,86 @@ class Galerkin:
         The coarse ones, with those of other ranks that the rows couple to as ghosts.
     pattern : BlockPattern
         Of the coarse rows.
+    values : (n_blocks, 3, 3)
+        The coarse rows.
+    free : (n_owned, 3)
+        1 for coarse coordinates that something is interpolated from, else 0.
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, parents: Ints, weights: Array, n_coarse: int
+        self, points: Points, pattern: BlockPattern, start: Ints, parents: Ints, weights: Array, n_coarse: int
     ) -> None:
-        comm, n = points.comm, points.n_owned
+        comm = points.comm
         bounds = np.concatenate([[0], np.cumsum(comm.allgather(n_coarse))]).astype(np.int64)
         first = int(bounds[comm.rank])
-        number, self._weights = np.empty((points.n_local, 3)), np.empty((points.n_local, 3))
-        number[:n], self._weights[:n] = np.where(parents >= 0, parents + first, -1), weights
-        for values in (number, self._weights):
-            points.update_ghosts(values)
-        everyone = number.astype(np.int64)
-        beyond = everyone[n:][everyone[n:] >= 0]
-        ghosts = np.unique(beyond[(beyond < first) | (beyond >= first + n_coarse)])
+        everyone, self._weights, self._start = _with_ghosts(points, start, parents + first, weights)
+        ghosts = np.unique(everyone[(everyone < first) | (everyone >= first + n_coarse)])
         self.points = Points(comm, bounds, ghosts, np.arange(n_coarse))
         numbers = local_numbers(everyone, ghosts, first, first + n_coarse)
-        self._parents = np.where(everyone >= 0, numbers, -1)
         self._fine = pattern
-        self._make_pattern(n_coarse, places(self.points.global_number))
+        self._make_pattern(n_coarse, self.points.n_local, numbers)
+        self.values = np.zeros((self.pattern.n_blocks, 3, 3))
+        self.free = np.ones((n_coarse, 3))
 
-    def _make_pattern(self, n_coarse: int, place: Ints) -> None:
-        n = len(self._fine.indptr) - 1
+    def _make_pattern(self, n_coarse: int, width: int, parents: Ints) -> None:
+        fine, n = self._fine, len(self._fine.indptr) - 1
+        rows = fine.indptr, fine.columns, self._start, parents
+        n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        _counts(*rows, width, n_slots, n_keys)
+        self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
+        self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
-        keys = diagonal_keys(n_coarse, place)
+
+        def made(lo: int, hi: int) -> Ints:
+            keys = np.empty(int(n_keys[lo:hi].sum()), dtype=np.int64)
+            at = int(n_slots[:lo].sum())
+            _slots(lo, hi, *rows, self._slots[at:], keys, width)
+            return keys
+
+        keys = diagonal_keys(n_coarse, width)
         for lo, hi in chunks:
-            keys = union(keys, self._keys_of(lo, hi, place))
-        self.pattern = BlockPattern.of_keys(keys, n_coarse, place)
-        kind = index_type(len(keys))
-        found = [np.searchsorted(keys, self._keys_of(lo, hi, place)).astype(kind) for lo, hi in chunks]
-        self._target = np.concatenate([np.zeros(0, dtype=kind), *found])
-        self.values = np.zeros((len(keys), 3, 3))
+            new = made(lo, hi)
+            keys = union(keys, np.where(new < 0, ~new, new))
+        self.pattern = BlockPattern.of_keys(keys, n_coarse, width)
+        self._target = np.empty(int(n_keys.sum()), dtype=index_type(len(keys)))
+        q = 0
+        for lo, hi in chunks:
+            new = made(lo, hi)
+            found = np.searchsorted(keys, np.where(new < 0, ~new, new))
+            self._target[q : q + len(new)] = np.where(new < 0, ~found, found)
+            q += len(new)
 
-    def _keys_of(self, lo: int, hi: int, place: Ints) -> Ints:
-        fine = self._fine
-        keys = np.empty(9 * int(fine.indptr[hi] - fine.indptr[lo]), dtype=np.int64)
-        return keys[: _keys(lo, hi, fine.indptr, fine.columns, self._parents, place, len(place), keys)]
+    def project(self, values: Array, free: Array) -> None:
+        """Make the coarse block rows of fine ones (n_blocks, 3, 3).
 
-    def project(self, values: Array, free: Array) -> Array:
-        """Coarse block rows (C, 3, 3) of fine ones (n_blocks, 3, 3).
-
-        ``free`` (n_local, 3) is 0 for coordinates that nothing is interpolated to, 1 for others.
+        ``free`` (n_owned, 3) is 0 for coordinates that nothing is interpolated to, 1 for others; those are
+        decoupled in ``values``.
         """
         fine = self._fine
         self.values[:] = 0.0
-        _project(
-            fine.indptr, fine.columns, self._parents, self._weights, free, self._target, values, self.values
-        )
-        _fill_diagonal(self.pattern.diagonal, self.values)
-        return self.values
+        rows = fine.indptr, fine.columns, self._start, self._weights
+        blocks, sums = values.reshape(-1, 9), self.values.reshape(-1, 9)
+        _project(*rows, self._slots, self._most, self._target, blocks, free, sums)
+        _finish_diagonal(self.pattern.indptr, self.values, self.free)
+
+
+def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:
+    """Parents and weights of all local points, and where those of each begin; collective."""
+    counts = np.zeros((points.n_local, 3))
+    counts[: points.n_owned, 0] = np.diff(start)
+    points.update_ghosts(counts)
+    number = counts[:, 0].astype(np.int64)
+    everywhere = np.concatenate([[0], np.cumsum(number)])
+    all_parents, all_weights = np.empty(everywhere[-1], dtype=np.int64), np.empty(everywhere[-1])
+    all_parents[: len(parents)], all_weights[: len(weights)] = parents, weights
+    row = np.zeros((points.n_local, 3))
+    for nth in range(points.comm.allreduce(int(number.max(initial=0)), MPI.MAX)):
+        there = number > nth
+        own = there[: points.n_owned]
+        at = start[:-1][own] + nth
+        row[: points.n_owned][own, 0], row[: points.n_owned][own, 1] = parents[at], weights[at]
+        points.update_ghosts(row)
+        ghosts = np.flatnonzero(there[points.n_owned :]) + points.n_owned
+        all_parents[everywhere[ghosts] + nth] = row[ghosts, 0].astype(np.int64)
+        all_weights[everywhere[ghosts] + nth] = row[ghosts, 1]
+    return all_parents, all_weights, everywhere

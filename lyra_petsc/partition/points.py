@@ -69,7 +69,8 @@ class Points:
         remote = np.column_stack([ranks, ghosts - bounds[ranks]]).astype(PETSc.IntType)
         self._forest = PETSc.SF().create(comm)
         self._forest.setGraph(self.n_owned, None, remote)
-        self._triple = MPI.DOUBLE.Create_contiguous(3).Commit()
+        types = {np.dtype(np.float64): MPI.DOUBLE, np.dtype(np.float32): MPI.FLOAT}
+        self._triples = {kind: unit.Create_contiguous(3).Commit() for kind, unit in types.items()}
 
     @property
     def global_number(self) -> Ints:
@@ -77,18 +78,20 @@ class Points:
         owned = np.arange(self.start, self.start + self.n_owned, dtype=np.int64)
         return np.concatenate([owned, self.ghosts])
 
-    def update_ghosts(self, values: NDArray[np.float64]) -> None:
+    def update_ghosts(self, values: NDArray[np.float64] | NDArray[np.float32]) -> None:
         """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
         if self.comm.size == 1:
             return
         owned, ghosts = values[: self.n_owned], values[self.n_owned :]
-        self._forest.bcastBegin(self._triple, owned, ghosts, MPI.REPLACE)
-        self._forest.bcastEnd(self._triple, owned, ghosts, MPI.REPLACE)
+        triple = self._triples[values.dtype]
+        self._forest.bcastBegin(triple, owned, ghosts, MPI.REPLACE)
+        self._forest.bcastEnd(triple, owned, ghosts, MPI.REPLACE)
 
     def destroy(self) -> None:
         """Free the communication objects; collective."""
         self._forest.destroy()
-        self._triple.Free()
+        for triple in self._triples.values():
+            triple.Free()
 
 
 class Layout:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg", "mg"})
+RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg", "mg", "python"})
 """Preconditioners that leave conjugate gradients something to find."""
 
 

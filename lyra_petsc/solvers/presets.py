@@ -12,6 +12,9 @@ from petsc4py import PETSc
 
 from lyra_petsc.solvers.options import Value, is_set
 
+PYTHON_TYPE = "lyra_petsc.solvers.vcycle.VCycle"
+"""Our V cycle as ``-pc_python_type`` wants it."""
+
 PRESETS: dict[str, dict[str, Value]] = {
     # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last four
     # have all pivots counted, leave out scaling and pivoting (an indefinite matrix is given up anyway) and
@@ -45,10 +48,19 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
-    # iterations that grow little with the mesh: PETSc's cycle on our coarse meshes, symmetric by two forward
-    # sweeps before and two backward ones after the coarser level. Hundreds of iterations mean a matrix close
-    # to singular, and another one is needed
+    # iterations that hardly grow with the mesh. Hundreds of them mean a matrix close to singular, and another
+    # one is needed
     "multigrid": {
+        "mat_type": "sbaij",
+        "ksp_type": "cg",
+        "ksp_max_it": 300,
+        "pc_type": "python",
+        "pc_python_type": PYTHON_TYPE,
+        "mg_coarse_pc_type": "redundant",
+        "mg_coarse_redundant_pc_type": "cholesky",
+    },
+    # the same levels with PETSc's cycle: a forward sweep before and a backward one after the coarser level
+    "pcmg": {
         "mat_type": "baij",
         "ksp_type": "cg",
         "ksp_max_it": 300,
@@ -56,11 +68,11 @@ PRESETS: dict[str, dict[str, Value]] = {
         "pc_mg_galerkin": "external",
         "pc_mg_distinct_smoothup": True,
         "mg_levels_ksp_type": "richardson",
-        "mg_levels_ksp_max_it": 2,
+        "mg_levels_ksp_max_it": 1,
         "mg_levels_pc_type": "sor",
         "mg_levels_pc_sor_local_forward": True,
         "mg_levels_up_ksp_type": "richardson",
-        "mg_levels_up_ksp_max_it": 2,
+        "mg_levels_up_ksp_max_it": 1,
         "mg_levels_up_pc_type": "sor",
         "mg_levels_up_pc_sor_local_backward": True,
         "mg_coarse_pc_type": "redundant",
@@ -160,7 +172,7 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
     chosen = PETSc.Options().getString("pc_type", "")
     if chosen in ("lu", "cholesky") and not is_set("mat_type"):
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
-    for preset in ("block-jacobi", "gamg", "multigrid"):
+    for preset in ("block-jacobi", "gamg", "pcmg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
             return PRESETS[preset]
     return {"mat_type": "baij" if chosen in BAIJ_PRECONDITIONERS else "aij", "ksp_type": "cg"}

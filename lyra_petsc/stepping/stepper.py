@@ -17,7 +17,8 @@ from lyra_petsc.parallel import all_here
 from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.solvers import reasons
-from lyra_petsc.solvers.multigrid import Hierarchy, Surface
+from lyra_petsc.solvers.hierarchy import Surface
+from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
@@ -158,9 +159,10 @@ class Stepper:
             linear_limit=limit,
         )
         ksp.setType(PETSc.KSP.Type.CG)
-        self._hierarchy = Hierarchy.where_asked_for(
-            ksp, self.preconditioner, points, self._pattern, self._surface, lambda: system.mask
-        )
+        self._multigrid: Multigrid | None = None
+        if kind_asked_for():
+            rows = self.preconditioner, points, self._pattern, self._surface
+            self._multigrid = Multigrid(ksp, *rows, held=lambda: system.mask)
         self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
@@ -180,6 +182,8 @@ class Stepper:
             ts.setFromOptions()
         except PETSc.Error as error:
             raise refused(error) from None
+        if self._multigrid is not None:
+            self._multigrid.after_options(ksp)
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
@@ -219,8 +223,8 @@ class Stepper:
         self.matrix.destroy()
         if self.preconditioner is not self.matrix:
             self.preconditioner.destroy()
-        if self._hierarchy is not None:
-            self._hierarchy.destroy()
+        if self._multigrid is not None:
+            self._multigrid.destroy()
         self.velocity.destroy()
         self.residual.destroy()
 

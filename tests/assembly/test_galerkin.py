@@ -9,7 +9,8 @@ from petsc4py import PETSc
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.assembly.matrix import SystemMatrix
-from lyra_petsc.solvers.multigrid import Hierarchy
+from lyra_petsc.solvers.hierarchy import Hierarchy
+from lyra_petsc.solvers.pcmg import Interpolation
 
 
 @pytest.mark.parallel
@@ -24,43 +25,52 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
             mask[points.global_number % 11 == 0] = True
         rng = np.random.default_rng(comm.rank)
         values = rng.standard_normal((pattern.n_blocks, 3, 3))
+        diagonal = values[pattern.indptr[:-1]]
+        values[pattern.indptr[:-1]] = diagonal + diagonal.transpose(0, 2, 1)
         model.system._blocks.constrain(values, mask, np.arange(points.n_owned))
-        hierarchy = Hierarchy(points, pattern, model.surface)
-        assert hierarchy.levels
-        fine = SystemMatrix(points, pattern, "aij")
-        fine.set(values)
+        hierarchy = Hierarchy(points, pattern, model.surface, most=3)
+        assert len(hierarchy.levels) == 3
         hierarchy.set(np.ones_like(values), ~mask)  # what is left from before must not show
         hierarchy.set(values, mask)
-        level = hierarchy.levels[0]
-        product = fine.mat.ptap(level.interpolation)
-        x, _ = product.createVecs()
-        x.setArray(rng.standard_normal(x.getLocalSize()))
-        expected, found, held_part = x.duplicate(), x.duplicate(), x.duplicate()
-        product.mult(x, expected)
-        # coordinates that nothing is interpolated from have a one on the diagonal
-        product.getDiagonal(held_part)
-        dead = held_part.getArray() == 0.0
-        expected.getArray()[dead] = x.getArray()[dead]
-        level.matrix.mat.mult(x, found)
-        np.testing.assert_allclose(found.getArray(), expected.getArray(), rtol=0.0, atol=1e-11)
+        for level, coarser in zip(hierarchy.levels, hierarchy.levels[1:], strict=False):
+            fine, coarse = (SystemMatrix(at.points, at.pattern, "aij") for at in (level, coarser))
+            fine.set(level.values)
+            coarse.set(coarser.values)
+            interpolation = Interpolation(level, coarser)
+            interpolation.set()
+            product = fine.mat.ptap(interpolation.mat)
+            x, _ = product.createVecs()
+            x.setArray(rng.standard_normal(x.getLocalSize()))
+            expected, found, diagonal_part = x.duplicate(), x.duplicate(), x.duplicate()
+            product.mult(x, expected)
+            # coordinates that nothing is interpolated from have a one on the diagonal
+            product.getDiagonal(diagonal_part)
+            dead = diagonal_part.getArray() == 0.0
+            assert np.array_equal(dead.reshape(-1, 3), coarser.free == 0.0)
+            expected.getArray()[dead] = x.getArray()[dead]
+            coarse.mat.mult(x, found)
+            np.testing.assert_allclose(found.getArray(), expected.getArray(), rtol=0.0, atol=1e-11)
+            for item in (fine, coarse, interpolation.mat, product):
+                item.destroy()
         hierarchy.destroy()
-        fine.destroy()
-        product.destroy()
 
 
 @pytest.mark.parallel
 def test_nothing_is_interpolated_to_held_coordinates(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
         points = simulation.model.points
-        hierarchy = Hierarchy(points, simulation.model.pattern, simulation.model.surface)
+        hierarchy = Hierarchy(points, simulation.model.pattern, simulation.model.surface, most=2)
         mask = np.zeros((points.n_local, 3), dtype=bool)
         mask[points.global_number % 3 == 0, 1] = True
-        hierarchy.set(np.zeros((simulation.model.pattern.n_blocks, 3, 3)), mask)
-        interpolation = hierarchy.levels[0].interpolation
-        ones, out = interpolation.createVecs()
-        ones.set(1.0)
-        interpolation.mult(ones, out)
-        expected = np.where(mask[: points.n_owned], 0.0, 1.0)
-        np.testing.assert_allclose(out.getArray().reshape(-1, 3), expected, atol=1e-12)
-        assert PETSc.Mat.Type.AIJ in interpolation.getType()
+        interpolation = Interpolation(*hierarchy.levels)
+        for held in (~mask, mask):
+            hierarchy.set(np.zeros((simulation.model.pattern.n_blocks, 3, 3)), held)
+            interpolation.set()
+            ones, out = interpolation.mat.createVecs()
+            ones.set(1.0)
+            interpolation.mat.mult(ones, out)
+            expected = np.where(held[: points.n_owned], 0.0, 1.0)
+            np.testing.assert_allclose(out.getArray().reshape(-1, 3), expected, atol=1e-12)
+        assert PETSc.Mat.Type.AIJ in interpolation.mat.getType()
+        interpolation.mat.destroy()
         hierarchy.destroy()

@@ -20,9 +20,9 @@ def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 def interpolation(coarse: Coarse) -> np.ndarray:
     """(N, C) dense."""
-    matrix = np.zeros((len(coarse.parents), len(coarse.vertices)))
-    for row, (parents, weights) in enumerate(zip(coarse.parents, coarse.weights, strict=True)):
-        matrix[row, parents[parents >= 0]] = weights[parents >= 0]
+    n = len(coarse.start) - 1
+    matrix = np.zeros((n, len(coarse.vertices)))
+    np.add.at(matrix, (np.repeat(np.arange(n), np.diff(coarse.start)), coarse.parents), coarse.weights)
     return matrix
 
 
@@ -47,25 +47,40 @@ def test_a_grid_is_coarsened_to_one_of_twice_the_spacing() -> None:
     assert len(coarse.triangles) == 2 * 8 * 8
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.3])
-def test_linear_functions_of_a_flat_sheet_are_interpolated_exactly(jitter: float) -> None:
+@pytest.mark.parametrize(("jitter", "most"), [(0.0, 1e-9), (0.3, 0.3)])
+def test_linear_functions_of_a_flat_sheet_are_followed(jitter: float, most: float) -> None:
     x, triangles = grid(17, jitter)
-    turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
-    x = x @ turn
+    turned = x @ np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
+    coarse = coarsen(turned, triangles)
+    matrix = interpolation(coarse)
+    error = np.linalg.norm(matrix @ turned[coarse.vertices] - turned, axis=1)
+    corner = ((x[:, :2] == 0) | (x[:, :2] == 16)).all(axis=1)  # smoothing cuts them off
+    assert error[~corner].max() < most
+    assert error.max() <= 0.5
+    assert np.abs(matrix.sum(axis=1) - 1.0).max() < 1e-12
+
+
+def folds(n: int, values: np.ndarray) -> float:
+    """Sum of squared second differences of values (n²,) along both axes of a grid."""
+    z = values.reshape(n, n)
+    return float((np.diff(z, 2, axis=0) ** 2).sum() + (np.diff(z, 2, axis=1) ** 2).sum())
+
+
+def test_what_is_interpolated_bends_as_smooth_functions_do() -> None:
+    x, triangles = grid(33)
+    wave = np.sin(2 * np.pi * x[:, 0] / 32) * np.sin(2 * np.pi * x[:, 1] / 32)
     coarse = coarsen(x, triangles)
-    found = interpolation(coarse) @ x[coarse.vertices]
-    exact = np.abs(found - x).max(axis=1) < 1e-9
-    # on borders that are not straight, and beyond what may be continued, the nearest is taken
-    assert exact.mean() > (0.999 if jitter == 0.0 else 0.95)
-    assert np.abs(coarse.weights.sum(axis=1) - 1.0).max() < 1e-12
-    assert coarse.weights.min() > -0.5
+    bent = interpolation(coarse) @ wave[coarse.vertices]
+    # linear interpolation would fold at every second line: twice the squares
+    assert folds(33, bent) < 1.4 * folds(33, wave)
 
 
 def test_a_curved_sheet_is_followed() -> None:
     x, triangles = grid(33)
     x[:, 2] = 4.0 * np.sin(x[:, 0] / 8.0)
     coarse = coarsen(x, triangles)
-    assert np.abs(interpolation(coarse) @ x[coarse.vertices] - x).max() < 0.15
+    # corners that two triangles meet in are rounded off by a quarter of the spacing
+    assert np.abs(interpolation(coarse) @ x[coarse.vertices] - x).max() < 0.26
 
 
 @pytest.mark.parametrize(

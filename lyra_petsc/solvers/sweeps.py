@@ -1,0 +1,144 @@
+"""Gauss-Seidel over symmetric block rows of which one half is stored: each sweep reads the matrix once.
+
+A = L + D + Lᵀ with the stored upper half Lᵀ; a sweep gathers with it and, as each unknown is found, scatters
+with it, so that no second pass is needed for the other half or for the residual. Sweeps of a rank see the
+values of others' points as they are given (block Jacobi between ranks). All in single precision: half the
+bytes, which are what a sweep costs, and a preconditioner need not be exact. Indices are unsigned: numba looks
+at the sign of others each time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lyra_petsc.kernel_cache import cached
+
+Index = np.uintp
+
+
+@cached()
+def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
+    """Inverses of the symmetric diagonal blocks of values (n_blocks, 9) into inverse (n, 9).
+
+    Of a singular block, of its diagonal.
+    """
+    for row in range(Index(len(inverse))):
+        k = Index(indptr[row])
+        a, b, c = values[k, 0], values[k, 1], values[k, 2]
+        d, e, f = values[k, 4], values[k, 5], values[k, 8]
+        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+        u, v, w = a * f - c * c, b * c - a * e, a * d - b * b
+        det = a * p + b * q + c * r
+        if abs(det) > 1e-14 * abs(a * d * f):
+            s = 1.0 / det
+            p, q, r, u, v, w = s * p, s * q, s * r, s * u, s * v, s * w
+        else:
+            q = r = v = 0.0
+            p = 1.0 / a if a != 0.0 else 0.0
+            u = 1.0 / d if d != 0.0 else 0.0
+            w = 1.0 / f if f != 0.0 else 0.0
+        inverse[row, 0], inverse[row, 1], inverse[row, 2] = p, q, r
+        inverse[row, 3], inverse[row, 4], inverse[row, 5] = q, u, v
+        inverse[row, 6], inverse[row, 7], inverse[row, 8] = r, v, w
+
+
+@cached(fastmath=True)
+def backward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
+    """x solves (D + Lᵀ) x = b over the owned points; r = b − A x but for couplings to ghosts, all (n, 3).
+
+    A backward sweep from zero.
+    """
+    for row in range(Index(n_owned)):
+        r[row, 0] = r[row, 1] = r[row, 2] = 0.0
+    for below in range(Index(n_owned)):
+        row = Index(n_owned - 1) - below
+        s0, s1, s2 = b[row, 0], b[row, 1], b[row, 2]
+        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
+        for k in range(lo, hi):
+            c = Index(columns[k])
+            if c >= Index(n_owned):
+                hi = k
+                break
+            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
+            s0 -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
+            s1 -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
+            s2 -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+        y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
+        y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
+        y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        for k in range(lo, hi):
+            c = Index(columns[k])
+            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 3] * y1 + blocks[k, 6] * y2
+            r[c, 1] -= blocks[k, 1] * y0 + blocks[k, 4] * y1 + blocks[k, 7] * y2
+            r[c, 2] -= blocks[k, 2] * y0 + blocks[k, 5] * y1 + blocks[k, 8] * y2
+
+
+@cached(fastmath=True)
+def subtract_ghosts(indptr, columns, n_owned, blocks, x, r):  # type: ignore[no-untyped-def]
+    """r −= the couplings of the owned rows to ghosts times x (n_local, 3)."""
+    for row in range(Index(n_owned)):
+        for k in range(indptr[row + Index(1)] - 1, indptr[row], -1):
+            c = Index(columns[k])
+            if c < Index(n_owned):
+                break
+            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
+            r[row, 0] -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
+            r[row, 1] -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
+            r[row, 2] -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+
+
+@cached(fastmath=True)
+def forward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
+    """A forward sweep from x (n_local, 3), ghosts as they are; r (n_owned, 3) is overwritten."""
+    for row in range(Index(n_owned)):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(Index(n_owned)):
+        s0, s1, s2 = r[row, 0], r[row, 1], r[row, 2]
+        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
+        for k in range(lo, hi):
+            c = Index(columns[k])
+            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
+            s0 -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
+            s1 -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
+            s2 -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+        y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
+        y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
+        y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        for k in range(lo, hi):
+            c = Index(columns[k])
+            if c >= Index(n_owned):
+                break
+            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 3] * y1 + blocks[k, 6] * y2
+            r[c, 1] -= blocks[k, 1] * y0 + blocks[k, 4] * y1 + blocks[k, 7] * y2
+            r[c, 2] -= blocks[k, 2] * y0 + blocks[k, 5] * y1 + blocks[k, 8] * y2
+
+
+@cached(fastmath=True)
+def restrict(start, parents, weights, free, r, out):  # type: ignore[no-untyped-def]
+    """out (C, 3) = interpolationᵀ · r (n, 3), without coordinates that are not free."""
+    for c in range(len(out)):
+        out[c, 0] = out[c, 1] = out[c, 2] = 0.0
+    for row in range(Index(len(start) - 1)):
+        r0, r1, r2 = free[row, 0] * r[row, 0], free[row, 1] * r[row, 1], free[row, 2] * r[row, 2]
+        for p in range(Index(start[row]), Index(start[row + Index(1)])):
+            c, w = Index(parents[p]), weights[p]
+            out[c, 0] += w * r0
+            out[c, 1] += w * r1
+            out[c, 2] += w * r2
+
+
+@cached(fastmath=True)
+def add_interpolated(start, parents, weights, free, coarse, x):  # type: ignore[no-untyped-def]
+    """x (n, 3) += interpolation · coarse (C, 3) in the free coordinates."""
+    for row in range(Index(len(start) - 1)):
+        e0 = e1 = e2 = np.float32(0.0)
+        for p in range(Index(start[row]), Index(start[row + Index(1)])):
+            c, w = Index(parents[p]), weights[p]
+            e0 += w * coarse[c, 0]
+            e1 += w * coarse[c, 1]
+            e2 += w * coarse[c, 2]
+        x[row, 0] += free[row, 0] * e0
+        x[row, 1] += free[row, 1] * e1
+        x[row, 2] += free[row, 2] * e2
