@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.pattern import BlockPattern, index_type
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.points import Points
 
@@ -23,120 +24,76 @@ KINDS = {"aij": "AIJ", "baij": "BAIJ", "sbaij": "SBAIJ"}
 """Matrix types whose storage is known here, as the C library spells them."""
 
 PORTIONS = 16
-"""In which entries go through ``MatSetValues``, for a copy of each is made."""
+"""In which transposed blocks go through ``MatSetValues``: it is given a copy of them."""
+
+
+@cached(inline="always")
+def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
+    """Rows of a block ``across`` apart, columns ``along``."""
+    for i in range(3):
+        for j in range(3):
+            out[at + across * i + along * j] = block[i, j]
 
 
 @cached()
-def _to_sbaij(indptr, columns, values, inside):  # type: ignore[no-untyped-def]
-    """Blocks of owned columns, column by column."""
-    n, at = len(indptr) - 1, 0
+def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+    """Blocks column by column; those of owned columns apart from those of ghosts."""
+    n, p, q = len(indptr) - 1, 0, 0
     for row in range(n):
+        for t in range(begin[row], begin[row + 1]):
+            _put(values[below[t]], inside, p, 3, 1)
+            p += 9
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                _put(values[k], inside, p, 1, 3)
+                p += 9
+            else:
+                _put(values[k], outside, q, 1, 3)
+                q += 9
+
+
+@cached()
+def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+    """Three scalar rows for each row of blocks; owned columns apart from ghosts."""
+    n, p, q = len(indptr) - 1, 0, 0
+    for row in range(n):
+        width, beyond = 3 * (begin[row + 1] - begin[row]), 0
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                width += 3
+            else:
+                beyond += 3
+        at = p
+        for t in range(begin[row], begin[row + 1]):
+            _put(values[below[t]], inside, at, 1, width)
+            at += 3
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                _put(values[k], inside, at, width, 1)
+                at += 3
+        at = q
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] >= n:
-                break
-            v = values[k]
-            for j in range(3):
-                for i in range(3):
-                    inside[at + 3 * j + i] = v[i, j]
-            at += 9
+                _put(values[k], outside, at, beyond, 1)
+                at += 3
+        p += 3 * width
+        q += 3 * beyond
 
 
 @cached()
-def _to_baij(indptr, columns, place, values, inside, outside):  # type: ignore[no-untyped-def]
-    """Blocks column by column; those of owned columns apart from those of ghosts.
-
-    ``place`` (n_owned,) is where each whole row begins; when a row's turn comes, all before its diagonal is
-    there, put by the rows of those columns.
-    """
-    n, q = len(indptr) - 1, 0
-    for row in range(n):
-        at = 9 * place[row]
-        for k in range(indptr[row], indptr[row + 1]):
-            c, v = columns[k], values[k]
-            if c >= n:
-                for j in range(3):
-                    for i in range(3):
-                        outside[q + 3 * j + i] = v[i, j]
-                q += 9
-                continue
-            for j in range(3):
-                for i in range(3):
-                    inside[at + 3 * j + i] = v[i, j]
-            at += 9
-            if c > row:
-                other = 9 * place[c]
-                for i in range(3):
-                    for j in range(3):
-                        inside[other + 3 * i + j] = v[i, j]
-                place[c] += 1
-
-
-@cached()
-def _to_aij(indptr, columns, place, begin, values, inside, outside):  # type: ignore[no-untyped-def]
-    """Three scalar rows for each row of blocks, otherwise as ``_to_baij``; ``begin`` (n_owned + 1,)."""
-    n, q = len(indptr) - 1, 0
-    for row in range(n):
-        first, end = indptr[row], indptr[row + 1]
-        ghosts = end - first
-        for k in range(first, end):
-            if columns[k] < n:
-                ghosts -= 1
-        at, beyond = 6 * begin[row] + 3 * place[row], 9 * q
-        width = 3 * (begin[row + 1] - begin[row])
-        for k in range(first, end):
-            c, v = columns[k], values[k]
-            if c >= n:
-                for i in range(3):
-                    for j in range(3):
-                        outside[beyond + 3 * i * ghosts + j] = v[i, j]
-                beyond += 3
-                continue
-            for i in range(3):
-                for j in range(3):
-                    inside[at + i * width + j] = v[i, j]
-            at += 3
-            if c > row:
-                other = 6 * begin[c] + 3 * place[c]
-                stride = 3 * (begin[c + 1] - begin[c])
-                for j in range(3):
-                    for i in range(3):
-                        inside[other + j * stride + i] = v[i, j]
-                place[c] += 1
-        q += ghosts
-
-
-@cached()
-def _count(indptr, columns, whole, first, inside, outside):  # type: ignore[no-untyped-def]
-    """Blocks of each row, whole or of the upper triangle; of the ghosts, those from number ``first`` on."""
+def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
+    """Blocks of the upper triangle by columns; ``place`` (n_owned,) is where those of each begin."""
     n = len(indptr) - 1
     for row in range(n):
-        for k in range(indptr[row], indptr[row + 1]):
+        for k in range(indptr[row] + 1, indptr[row + 1]):
             c = columns[k]
             if c < n:
-                inside[row] += 1
-                if whole and c > row:
-                    inside[c] += 1
-            elif c >= first:
-                outside[row] += 1
-
-
-@cached()
-def _index(indptr, columns, whole, first, place, column, block):  # type: ignore[no-untyped-def]
-    """Column and block of all that ``_count`` counts; ``place`` (n_owned,) is where each row begins."""
-    n = len(indptr) - 1
-    for row in range(n):
-        for k in range(indptr[row], indptr[row + 1]):
-            c = columns[k]
-            if c < n or c >= first:
-                column[place[row]], block[place[row]] = c, k
-                place[row] += 1
-                if whole and row < c < n:
-                    column[place[c]], block[place[c]] = row, ~k
-                    place[c] += 1
+                below[place[c]] = k
+                place[c] += 1
 
 
 class StoredRows:
-    """Which blocks a PETSc matrix of a pattern keeps: the whole rows, or of ``sbaij`` the upper triangle.
+    """The rows that a PETSc matrix of a pattern keeps: whole ones, or of ``sbaij`` the upper triangle.
 
     Parameters
     ----------
@@ -148,44 +105,55 @@ class StoredRows:
     ----------
     inside, outside : (n_owned,) int
         Blocks of each row in owned columns, and in columns of ghosts.
+    begin, below : (n_owned + 1,) int64, (n_below,) int
+        Compressed rows of what stands before the diagonal: blocks of the pattern, to be transposed.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
-        self._points, self._pattern, self._whole = points, pattern, kind != "sbaij"
-        below = 0 if self._whole else int(np.searchsorted(points.ghosts, points.start))
-        self._first = points.n_owned + below
-        self.inside, self.outside = np.zeros((2, points.n_owned), dtype=PETSc.IntType)
-        _count(pattern.indptr, pattern.columns, self._whole, self._first, self.inside, self.outside)
-
-    def index(self) -> tuple[Ints, Ints, Ints]:
-        """Compressed rows: indptr (n_owned + 1,), local columns (n,), blocks of the pattern (n,).
-
-        ~k instead of k stands for the transpose of a block.
-        """
-        indptr = begins(self.inside + self.outside)
-        column, block = np.empty((2, indptr[-1]), dtype=np.int64)
-        indices = self._pattern.indptr, self._pattern.columns
-        _index(*indices, self._whole, self._first, indptr[:-1].copy(), column, block)
-        return indptr, column, block
+        self._points, self._pattern = points, pattern
+        n, indptr, columns = points.n_owned, pattern.indptr, pattern.columns
+        own = columns < n
+        in_front = 0
+        if kind == "sbaij":
+            self.begin, self.below = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
+            in_front = int(np.searchsorted(points.ghosts, points.start))
+        else:
+            self.begin = begins(np.bincount(columns[own], minlength=n) - 1)
+            self.below = np.empty(self.begin[-1], dtype=index_type(len(columns)))
+            _transposes(indptr, columns, self.begin[:-1].copy(), self.below)
+        self._kept = own | (columns >= n + in_front)
+        self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
+        self.outside = _per_row(self._kept & ~own, indptr).astype(PETSc.IntType)
 
     def insert(self, values: Array, mat: PETSc.Mat) -> None:
         """Set all entries by ``MatSetValues``; collective."""
-        indptr, column, block = self.index()
+        indptr, columns, kept = self._pattern.indptr, self._pattern.columns, self._kept
         numbers = self._points.global_number
-        edges = indptr[np.linspace(0, len(indptr) - 1, PORTIONS + 1).astype(np.int64)]
+        if not kept.all():
+            columns, values, indptr = columns[kept], values[kept], begins(_per_row(kept, indptr))
+        _set(mat, indptr, numbers[columns], values)
+        edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
         for lo, hi in itertools.pairwise(edges):
-            turned = block[lo:hi] < 0
-            blocks = values[np.where(turned, ~block[lo:hi], block[lo:hi])]
-            blocks[turned] = blocks[turned].transpose(0, 2, 1)
+            part = self.below[lo:hi]
+            rows = np.searchsorted(indptr, part, side="right") - 1
             # all rows, most of them empty: petsc4py takes no others
-            begin = (np.clip(indptr, lo, hi) - lo).astype(PETSc.IntType)
-            columns = numbers[column[lo:hi]].astype(PETSc.IntType)
-            mat.setValuesBlockedCSR(begin, columns, blocks, PETSc.InsertMode.INSERT)
+            _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
         mat.assemble()
 
 
-def begins(counts: NDArray[np.int32]) -> Ints:
-    """Where each row begins and the last ends, (n + 1,), of rows with ``counts`` (n,) blocks."""
+def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
+    indices = indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType)
+    mat.setValuesBlockedCSR(*indices, np.ascontiguousarray(blocks), PETSc.InsertMode.INSERT)
+
+
+def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
+    """How many blocks (n_blocks,) of each row are flagged."""
+    counts: Ints = np.diff(begins(flags)[indptr])
+    return counts
+
+
+def begins(counts: NDArray[Any]) -> Ints:
+    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
@@ -213,9 +181,9 @@ class Storage:
         self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
         self._several = mat.getComm().size > 1
         self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if self._several else None
-        self._mat, self._pattern, self._kind = mat, pattern, kind
-        self._begin = begins(stored.inside)
-        self._sizes = 9 * int(self._begin[-1]), 9 * int(stored.outside.sum())
+        self._fill = _to_aij if kind == "aij" else _to_baij
+        self._mat, self._rows = mat, (pattern.indptr, pattern.columns, stored.begin, stored.below)
+        self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
 
     def write(self, values: Array) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
@@ -231,13 +199,7 @@ class Storage:
             self._get(part, ctypes.byref(pointer))
             if self._sizes[number]:
                 arrays[number] = np.ctypeslib.as_array(pointer, (self._sizes[number],))
-        indices, begin = (self._pattern.indptr, self._pattern.columns), self._begin
-        if self._kind == "sbaij":
-            _to_sbaij(*indices, values, arrays[0])
-        elif self._kind == "baij":
-            _to_baij(*indices, begin[:-1].copy(), values, *arrays)
-        else:
-            _to_aij(*indices, begin[:-1].copy(), begin, values, *arrays)
+        self._fill(*self._rows, values, *arrays)
         for part, pointer in zip(parts, pointers, strict=True):
             self._give_back(part, ctypes.byref(pointer))
         self._mat.assemble()
