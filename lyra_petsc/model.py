@@ -211,8 +211,8 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
         for name, term in terms.items()
         if isinstance(term, Elastic) or (isinstance(term, Viscous) and not scheme.explicit)
     }
-    pattern = BlockPattern(coupling, points.n_owned, points.n_local, points.global_number)
-    _check_indices(points, pattern.n_blocks)
+    pattern = BlockPattern(coupling, points.n_owned, points.n_local)
+    _check_indices(points, pattern.n_couplings)
     held = Held(
         scene,
         {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},

@@ -1,7 +1,11 @@
-"""Values of the block rows a rank owns: sums of element blocks, products, constraints."""
+"""Values of the block rows a rank owns: sums of element blocks, products, constraints.
+
+Of a symmetric matrix, in the half storage of ``pattern``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -20,30 +24,46 @@ CHUNK_VALUES = 32_768
 
 @cached()
 def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
-    """values[offsets[e, a, b]] += weight[e] blocks[e, a, b]."""
+    """Add weight[e] blocks[e, a, b], b ≥ a, where ``offsets`` of the pattern say."""
     for e in range(offsets.shape[0]):
-        w = weight[e]
-        for a in range(offsets.shape[1]):
-            for b in range(offsets.shape[2]):
-                k = offsets[e, a, b]
-                if k >= 0:
+        w, pair = weight[e], 0
+        for a in range(blocks.shape[1]):
+            for b in range(a, blocks.shape[1]):
+                at = offsets[e, pair]
+                pair += 1
+                if at >= 0:
+                    k, row, column = at >> 1, a, b
+                    if at & 1:
+                        row, column = b, a
                     for i in range(3):
                         for j in range(3):
-                            values[k, i, j] += w * blocks[e, a, b, i, j]
+                            values[k, i, j] += w * blocks[e, row, column, i, j]
 
 
 @cached()
 def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
-    """out (n_owned, 3) = values · x (n_local, 3)."""
-    for row in range(len(indptr) - 1):
+    """out (n_owned, 3) = whole rows · x (n_local, 3); ``out`` is 0 before."""
+    n = len(indptr) - 1
+    for row in range(n):
+        y0, y1, y2 = x[row, 0], x[row, 1], x[row, 2]
         s0 = s1 = s2 = 0.0
         for k in range(indptr[row], indptr[row + 1]):
             c = columns[k]
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            s0 += values[k, 0, 0] * x0 + values[k, 0, 1] * x1 + values[k, 0, 2] * x2
-            s1 += values[k, 1, 0] * x0 + values[k, 1, 1] * x1 + values[k, 1, 2] * x2
-            s2 += values[k, 2, 0] * x0 + values[k, 2, 1] * x1 + values[k, 2, 2] * x2
-        out[row, 0], out[row, 1], out[row, 2] = s0, s1, s2
+            v = values[k]
+            v00, v01, v02 = v[0, 0], v[0, 1], v[0, 2]
+            v10, v11, v12 = v[1, 0], v[1, 1], v[1, 2]
+            v20, v21, v22 = v[2, 0], v[2, 1], v[2, 2]
+            s0 += v00 * x0 + v01 * x1 + v02 * x2
+            s1 += v10 * x0 + v11 * x1 + v12 * x2
+            s2 += v20 * x0 + v21 * x1 + v22 * x2
+            if row < c < n:
+                out[c, 0] += v00 * y0 + v10 * y1 + v20 * y2
+                out[c, 1] += v01 * y0 + v11 * y1 + v21 * y2
+                out[c, 2] += v02 * y0 + v12 * y1 + v22 * y2
+        out[row, 0] += s0
+        out[row, 1] += s1
+        out[row, 2] += s2
 
 
 @cached()
@@ -90,7 +110,8 @@ class BlockRows:
         values : (n_blocks, 3, 3)
         """
         offsets = self.pattern.offsets[name]
-        n_elements, n = offsets.shape[:2]
+        n_elements = len(offsets)
+        n = (math.isqrt(8 * offsets.shape[1] + 1) - 1) // 2
         chunk = max(1, CHUNK_VALUES // (9 * n * n))
         buffer = np.empty((min(chunk, n_elements), n, n, 3, 3))
         weights = np.broadcast_to(np.asarray(weight, dtype=np.float64), (n_elements,))
@@ -113,18 +134,18 @@ class BlockRows:
     def add_diagonal(self, diagonal: Array, values: Array) -> None:
         """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""
         for axis in range(3):
-            values[self.pattern.diagonal, axis, axis] += diagonal
+            values[self.pattern.indptr[:-1], axis, axis] += diagonal
 
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
-        out = np.empty((len(self.pattern.indptr) - 1, 3))
+        out = np.zeros((self.pattern.n_owned, 3))
         _product(self.pattern.indptr, self.pattern.columns, values, x, out)
         return out
 
     def rows_beside(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Rows with a block whose row or column point has a prescribed coordinate; mask (n_local, 3)."""
+        """Rows with a stored block whose row or column has a prescribed coordinate; mask (n_local, 3)."""
         held = mask.any(axis=1)
-        rows = np.repeat(np.arange(len(self.pattern.indptr) - 1), np.diff(self.pattern.indptr))
+        rows = np.repeat(np.arange(self.pattern.n_owned), np.diff(self.pattern.indptr))
         beside: NDArray[np.int64] = np.unique(rows[held[self.pattern.columns] | held[rows]])
         return beside
 

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.assembly.storage import KINDS, Storage
+from lyra_petsc.assembly.storage import KINDS, Storage, StoredRows
 from lyra_petsc.errors import InputError
 from lyra_petsc.partition.points import Points
 
@@ -31,7 +32,7 @@ class SystemMatrix:
     ----------
     mat : PETSc.Mat
     followers : list of callables
-        Are given the block rows (n_blocks, 3, 3) whenever they change.
+        Are given the block rows (n_blocks, 3, 3) of the pattern whenever they change.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, kind: str, *, given: bool = True) -> None:
@@ -45,35 +46,22 @@ class SystemMatrix:
         except PETSc.Error:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
-        self._indptr = pattern.indptr.astype(PETSc.IntType)
-        self._columns = points.global_number[pattern.columns].astype(PETSc.IntType)
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
-        self._preallocate(pattern, points)
+        self._rows = StoredRows(points, pattern, self.kind)
+        self._preallocate(comm)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        if self.kind == "sbaij":
-            self._keep_upper(points)
         self.mat.setUp()
         self.followers: list[Callable[[NDArray[np.float64]], None]] = []
         self._storage: Storage | None = None
         if self.kind in KINDS and PETSc.ScalarType == np.float64:
             with suppress(AttributeError, OSError):
-                self._storage = Storage(self.mat, self.kind, pattern, points.n_owned)
+                self._storage = Storage(self.mat, self.kind, pattern, self._rows)
 
-    def _preallocate(self, pattern: BlockPattern, points: Points) -> None:
-        local = pattern.columns < points.n_owned
-        row = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr))
-        inside = np.bincount(row[local], minlength=points.n_owned).astype(PETSc.IntType)
-        outside = np.bincount(row[~local], minlength=points.n_owned).astype(PETSc.IntType)
+    def _preallocate(self, comm: MPI.Comm) -> None:
+        inside, outside = self._rows.inside, self._rows.outside
         if self.kind == "aij":
             inside, outside = np.repeat(3 * inside, 3), np.repeat(3 * outside, 3)
-        self.mat.setPreallocationNNZ((inside, outside) if points.comm.size > 1 else inside)
-
-    def _keep_upper(self, points: Points) -> None:
-        row = np.repeat(np.arange(points.n_owned), np.diff(self._indptr)) + points.start
-        self._upper: NDArray[np.bool_] | None = self._columns >= row
-        counts = np.bincount(row[self._upper] - points.start, minlength=points.n_owned)
-        self._indptr = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-        self._columns = self._columns[self._upper]
+        self.mat.setPreallocationNNZ((inside, outside) if comm.size > 1 else inside)
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
@@ -81,11 +69,8 @@ class SystemMatrix:
             follower(values)
         if self._storage is not None and self.mat.assembled:
             self._storage.write(values)
-            return
-        if self.kind == "sbaij":
-            values = values[self._upper]
-        self.mat.setValuesBlockedCSR(self._indptr, self._columns, values, PETSc.InsertMode.INSERT)
-        self.mat.assemble()
+        else:
+            self._rows.insert(values, self.mat)
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

@@ -1,8 +1,11 @@
-"""Block sparsity from the stencils of the active terms, and where each element block goes."""
+"""Block sparsity from the stencils of the active terms, and where each element block goes.
+
+The matrices are symmetric: of two blocks that are each other's transpose one is stored.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,73 +18,66 @@ LARGEST_INT32 = 2**31 - 1
 
 
 class BlockPattern:
-    """Compressed block rows of the owned points; columns in local numbering (owned and ghost).
+    """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
+
+    A row holds the columns from its own on: the upper triangle among owned points, and all ghosts.
 
     Parameters
     ----------
     stencils : mapping of name → (E, n) int
         Local numbering; only these couplings get an entry, and the diagonal.
     n_owned, n_local : int
-    global_number : (n_local,) int64
-        Columns of a row are in ascending global order.
 
     Attributes
     ----------
+    n_owned : int
     indptr : (n_owned + 1,) int64
-    columns : (n_blocks,) int64
-        Local column of each block.
-    diagonal : (n_owned,) int64
-        Index of each row's diagonal block.
-    offsets : dict of name → (E, n, n) int32, int64 where there are too many blocks
-        Index of the block that element e's coupling (a, b) adds to; −1 for rows of other ranks.
+        The first block of a row is the diagonal one.
+    columns : (n_blocks,) int32
+        Local column of each block, ascending within a row.
+    offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
+        Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
+        index of the block, plus 1 where that is of coupling (b, a); −1 where other ranks have both rows.
     """
 
-    def __init__(
-        self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int, global_number: Ints
-    ) -> None:
-        position = places(global_number)
-        keys = diagonal_keys(n_owned, position)
+    def __init__(self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int) -> None:
+        keys = diagonal_keys(n_owned, n_local)
         for stencil in stencils.values():
             for a in range(stencil.shape[1]):  # one after the other: all couplings at once take much memory
-                keys = union(keys, *_row_keys(stencil, a, n_owned, n_local, position))
-        self._set(keys, n_owned, position)
+                keys = union(keys, *_row_keys(stencil, a, n_owned, n_local))
+        self._set(keys, n_owned, n_local)
         self.offsets: dict[str, Offsets] = {
-            name: _offsets(s, keys, n_owned, n_local, position) for name, s in stencils.items()
+            name: _offsets(s, keys, n_owned, n_local) for name, s in stencils.items()
         }
 
     @classmethod
-    def of_keys(cls, keys: Ints, n_owned: int, position: Ints) -> BlockPattern:
-        """The pattern with these blocks, which no elements add to.
-
-        ``keys`` are ascending, row · n_local + ``position`` (n_local,) of the column.
-        """
+    def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:
+        """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""
         made = cls.__new__(cls)
-        made._set(keys, n_owned, position)
+        made._set(keys, n_owned, n_local)
         made.offsets = {}
         return made
 
-    def _set(self, keys: Ints, n_owned: int, position: Ints) -> None:
-        rows, at = np.divmod(keys, max(len(position), 1))
-        self.columns: Ints = np.argsort(position)[at]
+    def _set(self, keys: Ints, n_owned: int, n_local: int) -> None:
+        self.n_owned = n_owned
+        rows, columns = np.divmod(keys, max(n_local, 1))
+        self.columns: NDArray[np.int32] = columns.astype(np.int32)
         self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
         np.cumsum(np.bincount(rows, minlength=n_owned), out=self.indptr[1:])
-        self.diagonal: Ints = np.searchsorted(keys, diagonal_keys(n_owned, position))
 
     @property
     def n_blocks(self) -> int:
         return len(self.columns)
 
-
-def places(global_number: Ints) -> Ints:
-    """Place of each local point in ascending global order, (n_local,)."""
-    position = np.empty(len(global_number), dtype=np.int64)
-    position[np.argsort(global_number)] = np.arange(len(global_number))
-    return position
+    @property
+    def n_couplings(self) -> int:
+        """Blocks of the whole rows, both of those that are each other's transpose."""
+        return self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_owned
 
 
-def diagonal_keys(n_owned: int, position: Ints) -> Ints:
+def diagonal_keys(n_owned: int, n_local: int) -> Ints:
     """Keys of the diagonal blocks, ascending."""
-    return np.arange(n_owned, dtype=np.int64) * len(position) + position[:n_owned]
+    return np.arange(n_owned, dtype=np.int64) * (n_local + 1)
 
 
 def index_type(largest: int) -> np.dtype[Any]:
@@ -89,15 +85,16 @@ def index_type(largest: int) -> np.dtype[Any]:
     return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
 
 
-def _pair_keys(stencil: NDArray[np.int32], a: int, b: int, n_local: int, position: Ints) -> Ints:
-    key: Ints = stencil[:, a].astype(np.int64) * n_local + position[stencil[:, b]]
+def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Ints:
+    key: Ints = np.minimum(one, other).astype(np.int64) * n_local + np.maximum(one, other)
     return key
 
 
-def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int, position: Ints) -> list[Ints]:
-    """Keys row · n_local + column place of the couplings of each element's vertex a, where that is owned."""
-    mine = stencil[stencil[:, a] < n_owned]
-    return [_pair_keys(mine, a, b, n_local, position) for b in range(stencil.shape[1])]
+def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int) -> Iterator[Ints]:
+    """Keys row · n_local + column of the couplings of each element's vertices a and b ≥ a."""
+    for b in range(a, stencil.shape[1]):
+        keys = _keys(stencil[:, a], stencil[:, b], n_local)
+        yield keys[keys < n_owned * n_local]
 
 
 def union(*parts: Ints) -> Ints:
@@ -107,12 +104,11 @@ def union(*parts: Ints) -> Ints:
     return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers
 
 
-def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int, position: Ints) -> Offsets:
-    n = stencil.shape[1]
-    out: Offsets = np.empty((len(stencil), n, n), dtype=index_type(len(keys)))
-    for a in range(n):
-        mine = stencil[:, a] < n_owned
-        for b in range(n):
-            found = np.searchsorted(keys, _pair_keys(stencil, a, b, n_local, position))
-            out[:, a, b] = np.where(mine, found, -1)
+def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int) -> Offsets:
+    pairs = list(zip(*np.triu_indices(stencil.shape[1]), strict=True))
+    out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
+    for pair, (a, b) in enumerate(pairs):
+        one, other = stencil[:, a], stencil[:, b]
+        found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one > other)
+        out[:, pair] = np.where(np.minimum(one, other) < n_owned, found, -1)
     return out

@@ -6,59 +6,155 @@ petsc4py has no calls for them, the C library has. ``MatSetValues`` looks for ev
 from __future__ import annotations
 
 import ctypes
+import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.pattern import BlockPattern, index_type
 from lyra_petsc.kernel_cache import cached
+from lyra_petsc.partition.points import Points
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-KINDS = {"aij": "AIJ", "baij": "BAIJ"}
+KINDS = {"aij": "AIJ", "baij": "BAIJ", "sbaij": "SBAIJ"}
 """Matrix types whose storage is known here, as the C library spells them."""
 
+PORTIONS = 16
+"""In which transposed blocks go through ``MatSetValues``: it is given a copy of them."""
+
+
+@cached(inline="always")
+def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
+    """Rows of a block ``across`` apart, columns ``along``."""
+    for i in range(3):
+        for j in range(3):
+            out[at + across * i + along * j] = block[i, j]
+
 
 @cached()
-def _to_baij(indptr, columns, n_owned, values, inside, outside):  # type: ignore[no-untyped-def]
+def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
     """Blocks column by column; those of owned columns apart from those of ghosts."""
-    p = q = 0
-    for row in range(len(indptr) - 1):
+    n, p, q = len(indptr) - 1, 0, 0
+    for row in range(n):
+        for t in range(begin[row], begin[row + 1]):
+            _put(values[below[t]], inside, p, 3, 1)
+            p += 9
         for k in range(indptr[row], indptr[row + 1]):
-            own = columns[k] < n_owned
-            out, at = (inside, 9 * p) if own else (outside, 9 * q)
-            for i in range(3):
-                for j in range(3):
-                    out[at + 3 * j + i] = values[k, i, j]
-            if own:
-                p += 1
+            if columns[k] < n:
+                _put(values[k], inside, p, 1, 3)
+                p += 9
             else:
-                q += 1
+                _put(values[k], outside, q, 1, 3)
+                q += 9
 
 
 @cached()
-def _to_aij(indptr, columns, n_owned, values, inside, outside):  # type: ignore[no-untyped-def]
+def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
     """Three scalar rows for each row of blocks; owned columns apart from ghosts."""
-    p = q = 0
-    for row in range(len(indptr) - 1):
-        n_in = 0
+    n, p, q = len(indptr) - 1, 0, 0
+    for row in range(n):
+        width, beyond = 3 * (begin[row + 1] - begin[row]), 0
         for k in range(indptr[row], indptr[row + 1]):
-            n_in += columns[k] < n_owned
-        n_out = indptr[row + 1] - indptr[row] - n_in
-        a = b = 0
-        for k in range(indptr[row], indptr[row + 1]):
-            if columns[k] < n_owned:
-                out, at, width = inside, 9 * p + 3 * a, n_in
-                a += 1
+            if columns[k] < n:
+                width += 3
             else:
-                out, at, width = outside, 9 * q + 3 * b, n_out
-                b += 1
-            for i in range(3):
-                for j in range(3):
-                    out[at + 3 * i * width + j] = values[k, i, j]
-        p += n_in
-        q += n_out
+                beyond += 3
+        at = p
+        for t in range(begin[row], begin[row + 1]):
+            _put(values[below[t]], inside, at, 1, width)
+            at += 3
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                _put(values[k], inside, at, width, 1)
+                at += 3
+        at = q
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] >= n:
+                _put(values[k], outside, at, beyond, 1)
+                at += 3
+        p += 3 * width
+        q += 3 * beyond
+
+
+@cached()
+def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
+    """Blocks of the upper triangle by columns; ``place`` (n_owned,) is where those of each begin."""
+    n = len(indptr) - 1
+    for row in range(n):
+        for k in range(indptr[row] + 1, indptr[row + 1]):
+            c = columns[k]
+            if c < n:
+                below[place[c]] = k
+                place[c] += 1
+
+
+class StoredRows:
+    """The rows that a PETSc matrix of a pattern keeps: whole ones, or of ``sbaij`` the upper triangle.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+    kind : str
+
+    Attributes
+    ----------
+    inside, outside : (n_owned,) int
+        Blocks of each row in owned columns, and in columns of ghosts.
+    begin, below : (n_owned + 1,) int64, (n_below,) int
+        Compressed rows of what stands before the diagonal: blocks of the pattern, to be transposed.
+    """
+
+    def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
+        self._points, self._pattern = points, pattern
+        n, indptr, columns = points.n_owned, pattern.indptr, pattern.columns
+        own = columns < n
+        in_front = 0
+        if kind == "sbaij":
+            self.begin, self.below = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
+            in_front = int(np.searchsorted(points.ghosts, points.start))
+        else:
+            self.begin = begins(np.bincount(columns[own], minlength=n) - 1)
+            self.below = np.empty(self.begin[-1], dtype=index_type(len(columns)))
+            _transposes(indptr, columns, self.begin[:-1].copy(), self.below)
+        self._kept = own | (columns >= n + in_front)
+        self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
+        self.outside = _per_row(self._kept & ~own, indptr).astype(PETSc.IntType)
+
+    def insert(self, values: Array, mat: PETSc.Mat) -> None:
+        """Set all entries by ``MatSetValues``; collective."""
+        indptr, columns, kept = self._pattern.indptr, self._pattern.columns, self._kept
+        numbers = self._points.global_number
+        if not kept.all():
+            columns, values, indptr = columns[kept], values[kept], begins(_per_row(kept, indptr))
+        _set(mat, indptr, numbers[columns], values)
+        edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
+        for lo, hi in itertools.pairwise(edges):
+            part = self.below[lo:hi]
+            rows = np.searchsorted(indptr, part, side="right") - 1
+            # all rows, most of them empty: petsc4py takes no others
+            _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
+        mat.assemble()
+
+
+def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
+    indices = indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType)
+    mat.setValuesBlockedCSR(*indices, np.ascontiguousarray(blocks), PETSc.InsertMode.INSERT)
+
+
+def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
+    """How many blocks (n_blocks,) of each row are flagged."""
+    counts: Ints = np.diff(begins(flags)[indptr])
+    return counts
+
+
+def begins(counts: NDArray[Any]) -> Ints:
+    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
 class Storage:
@@ -69,9 +165,9 @@ class Storage:
     mat : PETSc.Mat
         With the entries of the pattern and no others; assembled when it is written to.
     kind : str
-        A key of ``KINDS``.
+        A key of ``KINDS``; on several ranks not ``sbaij``, which hides its second array.
     pattern : BlockPattern
-    n_owned : int
+    stored : StoredRows
 
     Raises
     ------
@@ -79,23 +175,23 @@ class Storage:
         If the C library does not offer the calls.
     """
 
-    def __init__(self, mat: PETSc.Mat, kind: str, pattern: BlockPattern, n_owned: int) -> None:
+    def __init__(self, mat: PETSc.Mat, kind: str, pattern: BlockPattern, stored: StoredRows) -> None:
         library, name = ctypes.CDLL(PETSc.__file__), KINDS[kind]
         self._get = getattr(library, f"MatSeq{name}GetArray")
         self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
-        self._parts = getattr(library, f"MatMPI{name}GetSeq{name}")
-        self._mat, self._pattern, self._n_owned = mat, pattern, n_owned
+        self._several = mat.getComm().size > 1
+        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if self._several else None
         self._fill = _to_aij if kind == "aij" else _to_baij
-        own = int(np.count_nonzero(pattern.columns < n_owned))
-        self._sizes = 9 * own, 9 * (pattern.n_blocks - own)
+        self._mat, self._rows = mat, (pattern.indptr, pattern.columns, stored.begin, stored.below)
+        self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
 
     def write(self, values: Array) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
         whole = ctypes.c_void_p(self._mat.handle)
         parts = [whole]
-        if self._mat.getComm().size > 1:
+        if self._split is not None:
             inside, outside, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
-            self._parts(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
+            self._split(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
             parts = [inside, outside]
         pointers = [ctypes.POINTER(ctypes.c_double)() for _ in parts]
         arrays = [np.empty(0), np.empty(0)]  # on one rank there is no outside
@@ -103,7 +199,7 @@ class Storage:
             self._get(part, ctypes.byref(pointer))
             if self._sizes[number]:
                 arrays[number] = np.ctypeslib.as_array(pointer, (self._sizes[number],))
-        self._fill(self._pattern.indptr, self._pattern.columns, self._n_owned, values, *arrays)
+        self._fill(*self._rows, values, *arrays)
         for part, pointer in zip(parts, pointers, strict=True):
             self._give_back(part, ctypes.byref(pointer))
         self._mat.assemble()

@@ -42,7 +42,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
     model = simulation.model
     points, pattern = model.points, model.pattern
     mine = np.array(
-        [points.n_owned, points.n_local - points.n_owned, pattern.n_blocks, _elements(simulation)]
+        [points.n_owned, points.n_local - points.n_owned, pattern.n_couplings, _elements(simulation)]
     )
     every = comm.gather(mine, root=0)
     if every is not None:
@@ -129,7 +129,7 @@ def _rank_table(ranks: Counts) -> Table:
 
 def _megabytes(ranks: Counts) -> float:
     """Matrix and preconditioner, their assembly buffers, and element constants, roughly."""
-    return float((ranks[:, 2] * 9 * 8 * 5 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
+    return float((ranks[:, 2] * 9 * 8 * 4 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 
 
 def _solver_options(simulation: Simulation) -> str:

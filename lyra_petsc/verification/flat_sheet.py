@@ -131,8 +131,16 @@ def stiffness(trial: Trial) -> Stiffness:
             term.prepare(0.0, 1.0, 1.0)
             rows.add(name, _filled_by(term, system.x), 1.0, values)
     numbers = mesh_numbers(trial)
-    row = np.repeat(numbers[: points.n_owned], np.diff(pattern.indptr))
-    pieces = points.comm.allgather((row, numbers[pattern.columns], np.ascontiguousarray(values[:, 2, 2])))
+    row, column = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
+    height = np.ascontiguousarray(values[:, 2, 2])
+    upper = (row < column) & (column < points.n_owned)
+    pieces = points.comm.allgather(
+        (
+            numbers[np.concatenate([row, column[upper]])],
+            numbers[np.concatenate([column, row[upper]])],
+            np.concatenate([height, height[upper]]),
+        )
+    )
     all_rows, columns, all_values = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     held = trial.gather(system.held.mask(0.0, 1.0, points.n_owned)[:, 2].astype(np.float64)) > 0.5
     return Stiffness(all_rows, columns, all_values, held)

@@ -1,4 +1,4 @@
-"""Rows, columns and offsets of the block pattern against dense sums; indices that pass 32 bits."""
+"""Half storage of block rows against dense sums; indices that pass 32 bits."""
 
 from __future__ import annotations
 
@@ -30,45 +30,91 @@ def dense(stencil: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     return total
 
 
+def symmetric(blocks: np.ndarray) -> np.ndarray:
+    """Element blocks (E, n, n, 3, 3) whose transposes are those of the exchanged vertices."""
+    return blocks + blocks.transpose(0, 2, 1, 4, 3)
+
+
 @pytest.mark.parametrize("largest", [room.LARGEST_INT32, 20])
 def test_sums_of_element_blocks(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
     monkeypatch.setattr(room, "LARGEST_INT32", largest)
     rng = np.random.default_rng(1)
     stencils = {"three": random_stencil(rng, 8, 3), "four": random_stencil(rng, 5, 4)}
-    numbers = 1000 + rng.permutation(N_LOCAL).astype(np.int64)
-    pattern = BlockPattern(stencils, N_OWNED, N_LOCAL, numbers)
+    pattern = BlockPattern(stencils, N_OWNED, N_LOCAL)
     assert pattern.offsets["four"].dtype == (np.int32 if largest > 20 else np.int64)
     rows = BlockRows(pattern)
     values = rows.zeros()
     expected = np.zeros((N_LOCAL, N_LOCAL, 3, 3))
     for name, stencil in stencils.items():
-        blocks = rng.random((*stencil.shape, stencil.shape[1], 3, 3))
-        expected += dense(stencil, blocks)
-        rows.add(name, lambda lo, hi, out, b=blocks: np.copyto(out, b[lo:hi]), 1.0, values)
-    found = np.zeros_like(expected)
+        blocks = symmetric(rng.random((*stencil.shape, stencil.shape[1], 3, 3)))
+        weight = rng.random(len(stencil))
+        expected += dense(stencil, weight[:, None, None, None, None] * blocks)
+        rows.add(name, lambda lo, hi, out, b=blocks: np.copyto(out, b[lo:hi]), weight, values)
+    found, n_couplings = np.zeros_like(expected), 0
     for row in range(N_OWNED):
         here = slice(pattern.indptr[row], pattern.indptr[row + 1])
         columns = pattern.columns[here]
-        assert (np.diff(numbers[columns]) > 0).all()
-        assert columns[pattern.diagonal[row] - here.start] == row
-        assert set(columns) == {row} | set(np.flatnonzero(expected[row].any(axis=(1, 2))))
+        assert (np.diff(columns) > 0).all()
+        coupled = set(np.flatnonzero(expected[row].any(axis=(1, 2)))) | {row}
+        assert set(columns) == {column for column in coupled if column >= row}
+        n_couplings += len(coupled)
         found[row, columns] = values[here]
+        found[columns, row] = values[here].transpose(0, 2, 1)
     np.testing.assert_allclose(found[:N_OWNED], expected[:N_OWNED])
+    assert pattern.n_couplings == n_couplings
+
+    x = rng.standard_normal((N_LOCAL, 3))
+    product = np.einsum("rcij,cj->ri", expected[:N_OWNED], x)
+    np.testing.assert_allclose(rows.product(values, x), product)
+
+    rows.add_diagonal(diagonal := rng.random(N_OWNED), values)
+    np.testing.assert_allclose(rows.product(values, x), product + diagonal[:, None] * x[:N_OWNED])
+
+
+def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
+    rng = np.random.default_rng(2)
+    rows = BlockRows(BlockPattern({"three": random_stencil(rng, 12, 3)}, N_OWNED, N_LOCAL))
+    values, mask = rng.standard_normal((rows.pattern.n_blocks, 3, 3)), np.zeros((N_LOCAL, 3), dtype=bool)
+    mask[[2, 5, N_OWNED + 1], [0, 1, 2]] = mask[7] = True
+    before, free = values.copy(), ~mask
+    rows.constrain(values, mask, rows.rows_beside(mask))
+    x = rng.standard_normal((N_LOCAL, 3))
+    found = rows.product(values, x)
+    # the free part as it was without the others, each of which is its own
+    alone = rows.product(before, np.where(free, x, 0.0))
+    np.testing.assert_allclose(np.where(free[:N_OWNED], found - alone, 0.0), 0.0, atol=1e-14)
+    assert (found * x[:N_OWNED])[mask[:N_OWNED]].min() > 0.0
+    rows.constrain(everywhere := before, mask, np.arange(N_OWNED))
+    np.testing.assert_array_equal(values, everywhere)
 
 
 def test_rows_times_columns_pass_32_bits() -> None:
     n = 70_000  # n² > 2³²
     stencil = np.array([[n - 1, n - 2], [0, n - 1]], dtype=np.int32)
-    pattern = BlockPattern({"pair": stencil}, n, n, np.arange(n, dtype=np.int64))
-    assert pattern.n_blocks == n + 4
-    assert pattern.columns[pattern.indptr[n - 1] :].tolist() == [0, n - 2, n - 1]
-    assert pattern.columns[pattern.offsets["pair"][1]].tolist() == [[0, n - 1], [0, n - 1]]
+    pattern = BlockPattern({"pair": stencil}, n, n)
+    assert pattern.n_blocks == n + 2
+    assert pattern.n_couplings == n + 4
+    assert pattern.columns[: pattern.indptr[1]].tolist() == [0, n - 1]
+    assert pattern.columns[pattern.indptr[n - 2] :].tolist() == [n - 2, n - 1, n - 1]
+    assert (pattern.offsets["pair"] % 2).tolist() == [[0, 1, 0], [0, 0, 0]]
+    assert pattern.columns[pattern.offsets["pair"] // 2].tolist() == [
+        [n - 1, n - 1, n - 2],
+        [0, n - 1, n - 1],
+    ]
 
 
 def test_no_elements_leave_the_diagonal() -> None:
-    pattern = BlockPattern({"none": np.empty((0, 3), np.int32)}, 2, 3, np.arange(3, dtype=np.int64))
+    pattern = BlockPattern({"none": np.empty((0, 3), np.int32)}, 2, 3)
     assert pattern.columns.tolist() == [0, 1]
-    assert BlockPattern({}, 0, 0, np.empty(0, np.int64)).n_blocks == 0
+    assert BlockPattern({}, 0, 0).n_blocks == 0
+
+
+def test_patterns_of_keys() -> None:
+    keys = room.union(room.diagonal_keys(2, 4), np.array([3, 1, 7]))
+    pattern = BlockPattern.of_keys(keys, 2, 4)
+    assert pattern.indptr.tolist() == [0, 3, 5]
+    assert pattern.columns.tolist() == [0, 1, 3, 1, 3]
+    assert pattern.offsets == {}
 
 
 @pytest.mark.parallel

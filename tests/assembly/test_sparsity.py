@@ -23,8 +23,11 @@ def couplings(mesh: dict[str, Any], comm: MPI.Comm, **more: Any) -> set[tuple[in
         for start, original in comm.allgather((points.start, points.original)):
             mesh_number[start : start + len(original)] = original
         local = mesh_number[points.global_number]
-        rows = np.repeat(local[: points.n_owned], np.diff(pattern.indptr))
-        pairs = list(zip(rows.tolist(), local[pattern.columns].tolist(), strict=True))
+        rows, columns = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
+        pairs = list(zip(local[rows].tolist(), local[columns].tolist(), strict=True))
+        upper = (rows < columns) & (columns < points.n_owned)
+        pairs += zip(local[columns[upper]].tolist(), local[rows[upper]].tolist(), strict=True)
+        assert len(pairs) == pattern.n_couplings
         every = [pair for part in comm.allgather(pairs) for pair in part]
         assert len(every) == len(set(every))
         stored = simulation.stepper.matrix.mat.getInfo()["nz_allocated"]  # over all ranks
