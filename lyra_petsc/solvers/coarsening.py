@@ -53,8 +53,12 @@ class Coarse:
     weights: Array
 
 
-def coarsen(x: Array, triangles: Ints) -> Coarse:
-    """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3)."""
+def coarsen(x: Array, triangles: Ints, edge: NDArray[np.bool_]) -> Coarse:
+    """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3).
+
+    ``edge`` (N,) are the vertices where the sheet ends. Where only the rank's part of it does, nothing is
+    smoothed: that line is ragged, and not a line of the sheet.
+    """
     n = len(x)
     start, neighbours = vertex_graph([triangles], n)
     border = _borders(n, triangles)
@@ -71,8 +75,11 @@ def coarsen(x: Array, triangles: Ints) -> Coarse:
     at, around = _around(len(vertices), coarse)
     parents, weights = np.full((n, 3), -1, dtype=np.int64), np.zeros((n, 3))
     _interpolate(x, start, neighbours, label, owner, vertices, coarse, at, around, parents, weights)
-    smooth = vertex_graph([boundary_edges(triangles).edges], n), (start, neighbours)
-    return Coarse(vertices, coarse, *_smoothed(*smooth[0], *smooth[1], border, parents, weights))
+    along = boundary_edges(triangles).edges
+    along_start, along_ends = vertex_graph([along[edge[along].all(axis=1)]], n)
+    kept = (border > 0) & ((np.diff(along_start) < 2) | (border > 1))
+    rows = _smoothed(along_start, along_ends, start, neighbours, border, kept, parents, weights)
+    return Coarse(vertices, coarse, *rows)
 
 
 def _borders(n: int, triangles: Ints) -> NDArray[np.int8]:
@@ -208,10 +215,10 @@ def _between(x, start, neighbours, label, vertices, v, parents, weights):  # typ
 
 
 @cached()
-def _smoothed(edge_start, edge_ends, start, neighbours, border, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compressed rows of (parents, weights) (N, 3) after each vertex went halfway to its neighbours' mean.
+def _smoothed(along_start, along_ends, start, neighbours, border, kept, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Compressed rows of (parents, weights) (N, 3), each halfway to its neighbours' mean unless it is kept.
 
-    Vertices of the border look at the border only, or the sheet would shrink, and corners at nothing.
+    Vertices of the border look along the border only, or the sheet would shrink.
     """
     n = len(border)
     first = np.zeros(n + 1, np.int64)
@@ -222,8 +229,8 @@ def _smoothed(edge_start, edge_ends, start, neighbours, border, parents, weights
     for v in range(n):
         around, begin = neighbours, start
         if border[v] > 0:
-            around, begin = edge_ends, edge_start
-        degree = 0 if border[v] > 1 else begin[v + 1] - begin[v]
+            around, begin = along_ends, along_start
+        degree = 0 if kept[v] else begin[v + 1] - begin[v]
         most = 3 * (degree + 1)
         if q + most > len(out):
             bigger, more = np.empty(2 * len(out) + most, np.int64), np.empty(2 * len(out) + most)

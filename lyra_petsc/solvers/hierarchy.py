@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.assembly.galerkin import Galerkin
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.meshing.topology import boundary_edges
 from lyra_petsc.partition.points import Points
 from lyra_petsc.solvers.coarsening import Coarse, coarsen
 
@@ -83,8 +84,9 @@ class Hierarchy:
         n = points.n_owned
         x = surface.x[:n]
         triangles = surface.triangles[(surface.triangles < n).all(axis=1)].astype(np.int64)
+        edge = _edge(surface.triangles, points)
         while len(self.levels) < most and (level.points.n_global > COARSEST or len(self.levels) == 1):
-            coarse = coarsen(x, triangles)
+            coarse = coarsen(x, triangles, edge)
             left = points.comm.allreduce(len(coarse.vertices))
             if left > WORTH * level.points.n_global:
                 break
@@ -93,7 +95,7 @@ class Hierarchy:
             level.galerkin = Galerkin(level.points, level.pattern, *interpolation)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
-            x, triangles = x[coarse.vertices], coarse.triangles
+            x, triangles, edge = x[coarse.vertices], coarse.triangles, edge[coarse.vertices]
 
     def set(self, values: Array, held: Mask) -> None:
         """New block rows of the finest level; ``held`` (n_local, 3) are the prescribed coordinates."""
@@ -109,3 +111,11 @@ class Hierarchy:
         for level in self.levels[1:]:
             level.points.destroy()
         self.levels = []
+
+
+def _edge(triangles: NDArray[np.int32], points: Points) -> Mask:
+    """Owned vertices (n_owned,) where the sheet ends; all triangles around them are among the rank's."""
+    ends = boundary_edges(triangles.astype(np.int64)).edges
+    edge = np.zeros(points.n_local, dtype=bool)
+    edge[ends[(ends < points.n_owned).any(axis=1)]] = True
+    return edge[: points.n_owned]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -68,8 +69,11 @@ class Multigrid:
     def after_options(self, ksp: PETSc.KSP) -> None:
         """Give our cycle, which PETSc makes when it reads the options, its levels; collective."""
         if self._cycle is None:
-            self._cycle = ksp.getPC().getPythonContext()
+            pc = ksp.getPC()
+            self._cycle = pc.getPythonContext()
             self._cycle.attach(self.hierarchy)
+            # at the end of a program that destroys nothing PETSc would call Python when that is gone
+            weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
 
     def _follow(self, values: NDArray[np.float64]) -> None:
         self.hierarchy.set(values, self._held())

@@ -18,7 +18,6 @@ from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 Floats = NDArray[np.float32]
 
 
-
 class Smoother:
     """The arrays that a level's sweeps and its interpolation work on.
 

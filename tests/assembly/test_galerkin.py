@@ -16,7 +16,7 @@ from lyra_petsc.solvers.pcmg import Interpolation
 @pytest.mark.parallel
 @pytest.mark.parametrize("held", [False, True], ids=["free", "some held"])
 def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> None:
-    with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 60, 48), "material": CLOTH}, comm) as simulation:
         model = simulation.model
         points, pattern = model.points, model.pattern
         mask = np.zeros((points.n_local, 3), dtype=bool)
