@@ -125,7 +125,9 @@ class BlockRows:
         self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
-        self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
+        weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
+        if not term.add_hessians(x, blend, weights, self.pattern.offsets[term.name], values):
+            self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weights, values)
 
     def add_viscosity(self, term: Viscous, v: Array, values: Array) -> None:
         """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
