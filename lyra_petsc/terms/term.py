@@ -63,7 +63,7 @@ class Elastic(Term):
     def force_scale(self, size: float) -> Array:
         """Force [N] whose relative round-off each element's force carries, (E,).
 
-        ``size`` [m] is the largest coordinate.
+        ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
     def linearise_from(self, y: Array | None) -> None:
