@@ -41,6 +41,19 @@ def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
 
 
 @cached()
+def _scale(indptr, source, factor, diagonal, values):  # type: ignore[no-untyped-def]
+    """values = factor · source, plus the diagonal (n_owned,) times the identity."""
+    for row in range(len(indptr) - 1):
+        first = indptr[row]
+        for k in range(first, indptr[row + 1]):
+            for i in range(3):
+                for j in range(3):
+                    values[k, i, j] = factor * source[k, i, j]
+        for i in range(3):
+            values[first, i, i] += diagonal[row]
+
+
+@cached()
 def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
     """out (n_owned, 3) = whole rows · x (n_local, 3); ``out`` is 0 before."""
     n = len(indptr) - 1
@@ -125,7 +138,9 @@ class BlockRows:
         self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
-        self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, values)
+        weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
+        if not term.add_hessians(x, blend, weights, self.pattern.offsets[term.name], values):
+            self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weights, values)
 
     def add_viscosity(self, term: Viscous, v: Array, values: Array) -> None:
         """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
@@ -135,6 +150,10 @@ class BlockRows:
         """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""
         for axis in range(3):
             values[self.pattern.indptr[:-1], axis, axis] += diagonal
+
+    def scale(self, source: Array, factor: float, diagonal: Array, values: Array) -> None:
+        """Let ``values`` be factor × source + ``diagonal`` (n_owned,) times the identity."""
+        _scale(self.pattern.indptr, source, factor, diagonal, values)
 
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""

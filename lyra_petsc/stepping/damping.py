@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.partition.points import Points
+from lyra_petsc.stepping.remembered import Remembered
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
@@ -31,15 +32,18 @@ class Damping:
     ----------
     acts : bool
         Whether anything is damped, on any rank; without, nothing is stored.
+    product : Remembered
+        D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3).
     """
 
     def __init__(self, points: Points, blocks: BlockRows, elastic: Sequence[Elastic], *, moves: bool) -> None:
-        self._blocks = blocks
+        self._points, self._blocks = points, blocks
         self._terms = [t for t in elastic if moves and t.damped and np.any(t.elements.data["damping"])]
         self.acts = bool(points.comm.allreduce(len(self._terms), MPI.MAX))
         self._values = blocks.zeros() if self.acts else None
         self._at: Array | None = None
-        self._last: tuple[Array, Array] | None = None
+        # residual, objective and works ask at the same velocities
+        self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max() and len(self._terms) == len(elastic)
         self._gamma = float(factors[0]) if uniform else 0.0
@@ -48,28 +52,28 @@ class Damping:
         """Take the geometry of positions x (n_local, 3)."""
         assert self._values is not None
         self._values[:] = 0.0
-        self._at, self._last = x.copy(), None
+        self._at = x.copy()
+        self.product.forget()
         for term in self._terms:
             self._blocks.add_stiffness(term, x, 1.0, term.elements.data["damping"], self._values)
 
-    def product(self, v: Array) -> Array:
-        """D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3)."""
+    def _product(self, v: Array) -> Array:
         assert self._values is not None
-        # residual and objective ask at the same velocities
-        if self._last is None or not np.array_equal(v, self._last[0]):
-            self._last = v.copy(), self._blocks.product(self._values, v)
-        return self._last[1].copy()
+        if not v.any():  # as where a semi-implicit step looks at its forces
+            return np.zeros((self._points.n_owned, 3))
+        return self._blocks.product(self._values, v)
 
     def into(self, values: Array) -> None:
         """Let ``values`` (n_blocks, 3, 3) be D."""
         values[:] = 0.0 if self._values is None else self._values
 
-    def with_stiffness_into(self, x: Array, weight: float, values: Array) -> bool:
-        """Let ``values`` be D + weight · K⁺(x), if that is a multiple of D; else return False.
+    def with_stiffness_into(self, x: Array, weight: float, diagonal: Array, values: Array) -> bool:
+        """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
 
         It is where all elements have one γ, and D was frozen at x: half the assembly of a semi-implicit step.
+        Else False.
         """
         if self._values is None or not self._gamma or self._at is None or not np.array_equal(x, self._at):
             return False
-        np.multiply(self._values, 1.0 + weight / self._gamma, out=values)
+        self._blocks.scale(self._values, 1.0 + weight / self._gamma, diagonal, values)
         return True

@@ -236,8 +236,7 @@ class Newton:
             return None
         if residual <= rtol * self._first_norm:
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        forces = self._system.points.comm.allreduce(np.array(list(self._system.force_norms.values())))
-        scale = float(np.sqrt(forces.max()))
+        scale = self._system.largest_force()
         if (
             residual <= self._tolerances.force_tolerance * scale
             and self.increment <= self._tolerances.step_tolerance * self._spacing

@@ -15,6 +15,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -27,6 +28,7 @@ from lyra_petsc.stepping.clamped import clamped_energy
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.departures import Departures
 from lyra_petsc.stepping.prescribed import Prescribed
+from lyra_petsc.stepping.remembered import Remembered
 from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 
@@ -85,24 +87,25 @@ class ReducedSystem:
     ) -> None:
         self.points, self.mass, self.scheme = points, mass, scheme
         self.elastic, self.viscous, self.loads, self.held = elastic, viscous, loads, held
-        self._blocks = blocks
+        self._blocks, self._events = blocks, events
         self.departures = Departures(points, held, elastic, starts)
         self._prescribed = Prescribed(points, held, blocks)
-        self._events = events
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
+        # moving targets change the forces at one and the same place
+        still = all(type(term).prepare is Elastic.prepare for term in self._shell)
+        shell = partial(self._sum, self._shell)
+        self._internal = Remembered(shell) if still else shell
         self._damping = Damping(points, blocks, elastic, moves=scheme.moves)
         self._values = blocks.zeros()
         n_local, n_owned = points.n_local, points.n_owned
         self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(5))
-        self._xh = self.x
-        self.history = self.v[:n_owned]
+        self._xh, self.history = self.x, self.v[:n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
         self._force = np.zeros((n_local, 3))
-        self.anchored = 0.0
-        self._energy_scales: list[Array] = []
+        self._stiffnesses = [term.force_scale(1.0)[: term.n_owned] for term in elastic]
         self._objectives: list[tuple[Array, tuple[float, float]]] = []
-        self.dt = self.t0 = self.t1 = 0.0
+        self.dt = self.t0 = self.t1 = self.anchored = self._size = 0.0
         self.followers: list[Follower] = [scheme]
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
@@ -145,9 +148,7 @@ class ReducedSystem:
         n = self.points.n_owned
         for term in self.elastic:
             term.prepare(self.t0, self.t1, at)
-        reach = float(np.abs(self.x).max(initial=0.0))
-        self._objectives = []
-        self._energy_scales = [reach * term.force_scale(reach)[: term.n_owned] for term in self.elastic]
+        self._objectives, self._size = [], float(np.abs(self.x).max(initial=0.0))
         if self.scheme.moves or self.given_loads is None:
             self._load(at)
         else:
@@ -199,8 +200,7 @@ class ReducedSystem:
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free coordinates now, norm [N] of its largest part; collective."""
         parts = self._parts(self.x, self.v, np.zeros_like(self.history))
-        squares = self.points.comm.allreduce(np.array([self._norm(p) for p in parts.values()]))
-        return np.where(self._prescribed.free, -sum(parts.values()), 0.0), float(np.sqrt(squares.max()))
+        return np.where(self._prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
 
     @property
     def stage_velocity(self) -> Array:
@@ -252,15 +252,15 @@ class ReducedSystem:
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
         n = self.points.n_owned
-        parts = {"inertia": self.mass[:, None] * vdot}
-        for name, terms in (("internal", self._shell), ("springs", self._springs)):
-            if terms:
-                parts[name] = self._sum(terms, x)
+        parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
+        if self._springs:
+            parts["springs"] = self._sum(self._springs, x)
         parts["loads"] = -self._force[:n]
         if self._damping.acts:
             parts["damping"] = self._damping.product(vs)
         if self.viscous and not self.scheme.explicit:
             parts["wind"] = self._sum(self.viscous, vs)
+        self._last_parts = parts
         return parts
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
@@ -272,16 +272,15 @@ class ReducedSystem:
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
         parts = self._parts(*self._evaluate_at(v), vdot)
-        total = sum(parts.values())
-        out[:] = total
+        out[:] = sum(parts.values())
         if self.held:
             held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed.velocity)
             np.copyto(out, held, where=~self._prescribed.free)
-        self.force_norms = {name: self._norm(part) for name, part in parts.items()}
 
-    def _norm(self, part: Array) -> float:
-        """Square of the norm over this rank's free coordinates."""
-        return float(np.sum(part * part, where=self._prescribed.free))
+    def largest_force(self) -> float:
+        """Norm [N] of the largest part of F last evaluated, over the free coordinates; collective."""
+        squares = np.array([np.sum(p * p, where=self._prescribed.free) for p in self._last_parts.values()])
+        return float(np.sqrt(self.points.comm.allreduce(squares).max()))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
@@ -300,14 +299,15 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         values = self._values
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, self.stage.reach, values):
+        inertia, reach = self.stage.sigma * self.mass, self.stage.reach
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values):
             self._damping.into(values)
             for term in self.elastic:
-                self._blocks.add_stiffness(term, x, blend, self.stage.reach, values)
+                self._blocks.add_stiffness(term, x, blend, reach, values)
+            self._blocks.add_diagonal(inertia, values)
         if not self.scheme.explicit:
             for wind in self.viscous:
                 self._blocks.add_viscosity(wind, vs, values)
-        self._blocks.add_diagonal(self.stage.sigma * self.mass, values)
         if len(self._prescribed.rows):
             self._blocks.constrain(values, self.mask, self._prescribed.rows)
         return values
@@ -335,10 +335,10 @@ class ReducedSystem:
         change = v - self.history
         inertia = 0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))
         energies, square = [], 0.0
-        for term, scale in zip(self.elastic, self._energy_scales, strict=True):
+        for term, stiffness in zip(self.elastic, self._stiffnesses, strict=True):
             each = term.energies(x)
             energies.append(rate * float(each.sum()))
-            square += 2.0 * rate * rate * float(np.vdot(each, scale))
+            square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
         work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
         parts = [inertia, *energies, -rate * work]
         if self._damping.acts:

@@ -45,23 +45,35 @@ def angle(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
     return theta, dot(n1, n1), dot(n2, n2)
 
 
+@kernel(inline="always")
+def _combined(p, u, q, w):  # type: ignore[no-untyped-def]
+    return p * u[0] + q * w[0], p * u[1] + q * w[1], p * u[2] + q * w[2]
+
+
+@kernel(inline="always")
+def angle_slopes(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
+    """Gradients of θ at the four points [1/m]; |n1|² and |n2|² [m⁴]."""
+    e, a, b = minus(x1, x0), minus(x2, x0), minus(x3, x0)
+    n1, n2 = cross(e, a), cross(b, e)
+    square1, square2 = dot(n1, n1), dot(n2, n2)
+    w1, w2 = 1.0 / square1, 1.0 / square2
+    length = math.sqrt(dot(e, e))
+    l1, l2 = -length * w1, -length * w2
+    g1 = _combined(dot(a, e) / length * w1, n1, dot(b, e) / length * w2, n2)
+    g2, g3 = (l1 * n1[0], l1 * n1[1], l1 * n1[2]), (l2 * n2[0], l2 * n2[1], l2 * n2[2])
+    g0 = -g1[0] - g2[0] - g3[0], -g1[1] - g2[1] - g3[1], -g1[2] - g2[2] - g3[2]
+    return (g0, g1, g2, g3), square1, square2
+
+
 @kernel()
 def angle_gradient(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
     """θ [rad], |n1|² and |n2|² [m⁴]; the gradient of θ [1/m] into g (4, 3)."""
-    e, a, b = minus(x1, x0), minus(x2, x0), minus(x3, x0)
-    n1, n2 = cross(e, a), cross(b, e)
-    length = math.sqrt(dot(e, e))
-    theta = math.atan2(dot(cross(n1, n2), e) / length, dot(n1, n2))
-    square1, square2 = dot(n1, n1), dot(n2, n2)
-    w1, w2 = 1.0 / square1, 1.0 / square2
-    ae, be = dot(a, e) / length, dot(b, e) / length
-    l1, l2 = length * w1, length * w2
-    g[2, 0], g[2, 1], g[2, 2] = -l1 * n1[0], -l1 * n1[1], -l1 * n1[2]
-    g[3, 0], g[3, 1], g[3, 2] = -l2 * n2[0], -l2 * n2[1], -l2 * n2[2]
-    a1, a2 = ae * w1, be * w2
-    for i in range(3):
-        g[1, i] = a1 * n1[i] + a2 * n2[i]
-        g[0, i] = -g[1, i] - g[2, i] - g[3, i]
+    slopes, square1, square2 = angle_slopes(x0, x1, x2, x3)
+    for a in range(4):
+        g[a, 0], g[a, 1], g[a, 2] = slopes[a]
+    e = minus(x1, x0)
+    n1, n2 = cross(e, minus(x2, x0)), cross(minus(x3, x0), e)
+    theta = math.atan2(dot(cross(n1, n2), e) / math.sqrt(dot(e, e)), dot(n1, n2))
     return theta, square1, square2
 
 
@@ -73,11 +85,6 @@ def _add_turn(n, d, w, b, scale, out):  # type: ignore[no-untyped-def]
         for j in range(3):
             out[i, j] += p * d[j]
             out[i, j] += q * n[j]
-
-
-@kernel(inline="always")
-def _combined(p, u, q, w):  # type: ignore[no-untyped-def]
-    return p * u[0] + q * w[0], p * u[1] + q * w[1], p * u[2] + q * w[2]
 
 
 @kernel()

@@ -17,7 +17,7 @@ from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.terms.term import Elastic, Offsets
 
 Array = NDArray[np.float64]
 Stencil = NDArray[np.int32]
@@ -105,56 +105,79 @@ def _linearised(f, g, c, e):  # type: ignore[no-untyped-def]
     return e0, e1, e2, c11 * e0 + c12 * e1, c12 * e0 + c22 * e1, c33 * e2
 
 
+@kernel(inline="always")
+def _prepared(x, y, s, e, blend, inverse, w, c):  # type: ignore[no-untyped-def]
+    """What the Hessian of triangle e is made of: deformation gradient; stress and law times w; gradients.
+
+    Gradients (∂/∂u, ∂/∂v) are those of the shape functions of the three corners.
+    """
+    f = _deformation(x, s, e, inverse)
+    e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, e)
+    if blend > 0.0:
+        p0, p1 = _tensile(e0, e1, c[e, 0], c[e, 1], c[e, 2])
+        s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 - blend * s2
+    one, two = (inverse[e, 0, 0], inverse[e, 0, 1]), (inverse[e, 1, 0], inverse[e, 1, 1])
+    gradients = (-one[0] - two[0], -one[1] - two[1]), one, two
+    return f, (w * s0, w * s1, w * s2), (w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]), gradients
+
+
+@kernel(inline="always")
+def _factors(stress, law, ga, gb):  # type: ignore[no-untyped-def]
+    """Of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
+    (au, av), (bu, bv) = ga, gb
+    c11, c12, c22, c33 = law
+    uu, vv = au * bu, av * bv
+    uv, vu = au * bv, av * bu
+    geometric = stress[0] * uu + stress[1] * vv + stress[2] * (uv + vu)
+    return c11 * uu + c33 * vv, c12 * uv + c33 * vu, c12 * vu + c33 * uv, c22 * vv + c33 * uu, geometric
+
+
+@kernel(inline="always")
+def _add_block(f, uu, uv, vu, vv, geometric, o):  # type: ignore[no-untyped-def]
+    ux, uy, uz, vx, vy, vz = f
+    px, py, pz = uu * ux + uv * vx, uu * uy + uv * vy, uu * uz + uv * vz
+    qx, qy, qz = vu * ux + vv * vx, vu * uy + vv * vy, vu * uz + vv * vz
+    o[0, 0] += ux * px + vx * qx + geometric
+    o[0, 1] += ux * py + vx * qy
+    o[0, 2] += ux * pz + vx * qz
+    o[1, 0] += uy * px + vy * qx
+    o[1, 1] += uy * py + vy * qy + geometric
+    o[1, 2] += uy * pz + vy * qz
+    o[2, 0] += uz * px + vz * qx
+    o[2, 1] += uz * py + vz * qy
+    o[2, 2] += uz * pz + vz * qz + geometric
+
+
 @kernel()
 def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j].
 
     Their geometric part has the stress that the linearised strain predicted at x from y; y = x: exact.
     """
-    g = np.empty((3, 2))
+    out[:] = 0.0
     for e in range(lo, hi):
-        f = _deformation(x, s, e, inverse)
-        ux, uy, uz, vx, vy, vz = f
-        e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, e)
-        if blend > 0.0:
-            p0, p1 = _tensile(e0, e1, c[e, 0], c[e, 1], c[e, 2])
-            s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 - blend * s2
-        w = area[e]
-        s0, s1, s2 = w * s0, w * s1, w * s2
-        c11, c12, c22, c33 = w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]
-        g[1, 0], g[1, 1] = inverse[e, 0, 0], inverse[e, 0, 1]
-        g[2, 0], g[2, 1] = inverse[e, 1, 0], inverse[e, 1, 1]
-        g[0, 0], g[0, 1] = -g[1, 0] - g[2, 0], -g[1, 1] - g[2, 1]
+        f, stress, law, g = _prepared(x, y, s, e, blend, inverse, area[e], c)
         for a in range(3):
-            au, av = g[a, 0], g[a, 1]
-            # rows of ∂E/∂x_a
-            a0x, a0y, a0z = au * ux, au * uy, au * uz
-            a1x, a1y, a1z = av * vx, av * vy, av * vz
-            a2x, a2y, a2z = au * vx + av * ux, au * vy + av * uy, au * vz + av * uz
+            for b in range(3):
+                uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
+                _add_block(f, uu, uv, vu, vv, geometric, out[e - lo, a, b])
+
+
+@kernel()
+def add_hessians(x, y, s, blend, inverse, area, c, weight, offsets, values):  # type: ignore[no-untyped-def]
+    """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
+    for e in range(s.shape[0]):
+        f, stress, law, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c)
+        pair = 0
+        for a in range(3):
             for b in range(a, 3):
-                bu, bv = g[b, 0], g[b, 1]
-                b0x, b0y, b0z = bu * ux, bu * uy, bu * uz
-                b1x, b1y, b1z = bv * vx, bv * vy, bv * vz
-                b2x, b2y, b2z = bu * vx + bv * ux, bu * vy + bv * uy, bu * vz + bv * uz
-                q0x, q1x, q2x = c11 * b0x + c12 * b1x, c12 * b0x + c22 * b1x, c33 * b2x
-                q0y, q1y, q2y = c11 * b0y + c12 * b1y, c12 * b0y + c22 * b1y, c33 * b2y
-                q0z, q1z, q2z = c11 * b0z + c12 * b1z, c12 * b0z + c22 * b1z, c33 * b2z
-                geometric = s0 * au * bu + s1 * av * bv + s2 * (au * bv + av * bu)
-                o = out[e - lo, a, b]
-                o[0, 0] = a0x * q0x + a1x * q1x + a2x * q2x + geometric
-                o[0, 1] = a0x * q0y + a1x * q1y + a2x * q2y
-                o[0, 2] = a0x * q0z + a1x * q1z + a2x * q2z
-                o[1, 0] = a0y * q0x + a1y * q1x + a2y * q2x
-                o[1, 1] = a0y * q0y + a1y * q1y + a2y * q2y + geometric
-                o[1, 2] = a0y * q0z + a1y * q1z + a2y * q2z
-                o[2, 0] = a0z * q0x + a1z * q1x + a2z * q2x
-                o[2, 1] = a0z * q0y + a1z * q1y + a2z * q2y
-                o[2, 2] = a0z * q0z + a1z * q1z + a2z * q2z + geometric
-                if b > a:
-                    p = out[e - lo, b, a]
-                    for i in range(3):
-                        for j in range(3):
-                            p[j, i] = o[i, j]
+                at = offsets[e, pair]
+                pair += 1
+                if at >= 0:
+                    uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
+                    if at & 1:
+                        uv, vu = vu, uv
+                    _add_block(f, uu, uv, vu, vv, geometric, values[at >> 1])
 
 
 @kernel()
@@ -198,6 +221,12 @@ class Membrane(Elastic):
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
         y = x if self._before is None else self._before
         hessians(x, y, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
+
+    def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+        y = x if self._before is None else self._before
+        constants = self._inverse, self._area, self._c
+        add_hessians(x, y, self.stencil, blend, *constants, weight, offsets, values)
+        return True
 
     def force_scale(self, size: float) -> Array:
         stiffest: Array = np.abs(self._c).max(axis=1)

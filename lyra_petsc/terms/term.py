@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.partition.elements import Elements
 
 Array = NDArray[np.float64]
+Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 
 class Term(ABC):
@@ -51,11 +52,18 @@ class Elastic(Term):
         ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one.
         """
 
+    def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+        """Add weight (E,) × Hessian blocks [N/m] to block rows (n_blocks, 3, 3) at once; whether it did.
+
+        ``offsets`` (E, n (n + 1) / 2) are the pattern's. What a term cannot add so goes by ``hessians``.
+        """
+        return False
+
     @abstractmethod
     def force_scale(self, size: float) -> Array:
         """Force [N] whose relative round-off each element's force carries, (E,).
 
-        ``size`` [m] is the largest coordinate.
+        ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
     def linearise_from(self, y: Array | None) -> None:

@@ -1,0 +1,32 @@
+"""A function of an array that is often asked twice at the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Remembered:
+    """``function`` of an array, computed where it was not computed last.
+
+    Its results cannot be written to: they are given out again.
+    """
+
+    def __init__(self, function: Callable[[Array], Array]) -> None:
+        self._function = function
+        self._last: tuple[Array, Array] | None = None
+
+    def forget(self) -> None:
+        """Let the function be another from here on."""
+        self._last = None
+
+    def __call__(self, at: Array) -> Array:
+        if self._last is None or not np.array_equal(at, self._last[0]):
+            result = self._function(at)
+            result.flags.writeable = False
+            self._last = at.copy(), result
+        return self._last[1]
