@@ -7,6 +7,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys, index_type, union
+from lyra_petsc.assembly.shared_blocks import SharedBlocks
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.partition.points import Points
@@ -19,48 +20,62 @@ Index = np.uintp
 CHUNK_ROWS = 1 << 13
 """Fine rows whose products are looked at together while the coarse pattern is made."""
 
+CHUNK_PRODUCTS = 1 << 20
+
 
 @cached()
 def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type: ignore[no-untyped-def]
     """Of fine rows lo..hi: where a row's product with the interpolation is summed, and what it adds to.
 
     A row of blocks times the interpolation has a block for each coarse point met, in the order in which
-    they are met; ``slots`` are their numbers. Of ``keys`` there is one for each parent of the row and each
-    of these: row · width + column of the coarse block, ~ of it if the product is to be transposed.
+    they are met, first over owned and then over ghost columns; ``slots`` are their numbers. Of ``keys``
+    there is one for each parent of the row and each of these. Blocks of owned columns stand for their
+    transpose too: smaller · width + larger coarse point, ~ of it if the product is to be transposed. Those
+    of ghosts do not: width² + row · width + column.
     """
+    n_owned = len(indptr) - 1
     seen, at = np.full(width, -1, np.int64), np.zeros(width, np.int64)
-    met = np.empty(width, np.int64)
+    met = np.empty(2 * width, np.int64)
     s = q = 0
     for row in range(lo, hi):
-        m = 0
+        m = own = 0
+        mark = 2 * row
         for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] >= n_owned and mark == 2 * row:
+                mark, own = mark + 1, m
             for p in range(start[columns[k]], start[columns[k] + 1]):
                 c = parents[p]
-                if seen[c] != row:
-                    seen[c], at[c], met[m] = row, m, c
+                if seen[c] != mark:
+                    seen[c], at[c], met[m] = mark, m, c
                     m += 1
                 slots[s] = at[c]
                 s += 1
+        if mark == 2 * row:
+            own = m
         for p in range(start[row], start[row + 1]):
             a = parents[p]
             for t in range(m):
                 c = met[t]
-                keys[q] = a * width + c if c >= a else ~(c * width + a)
+                if t >= own:
+                    keys[q] = (width + a) * width + c
+                else:
+                    keys[q] = a * width + c if c >= a else ~(c * width + a)
                 q += 1
-    return q
 
 
 @cached()
 def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignore[no-untyped-def]
     """Of each fine row, how many slots and keys it has."""
+    n_owned = len(indptr) - 1
     seen = np.full(width, -1, np.int64)
-    for row in range(len(indptr) - 1):
+    for row in range(n_owned):
         m = n = 0
         for k in range(indptr[row], indptr[row + 1]):
+            mark = 2 * row + (columns[k] >= n_owned)
             for p in range(start[columns[k]], start[columns[k] + 1]):
                 n += 1
-                if seen[parents[p]] != row:
-                    seen[parents[p]] = row
+                if seen[parents[p]] != mark:
+                    seen[parents[p]] = mark
                     m += 1
         slots[row] = n
         keys[row] = m * (start[row + 1] - start[row])
@@ -106,12 +121,12 @@ def _project(indptr, columns, start, weights, slots, most, target, values, free,
                     sums[t, 8] += w * b8
         for p in range(start[row], start[row + 1]):
             w = weights[p]
-            for t in range(Index(m)):
+            for u in range(Index(m)):
                 k = target[q]
                 q += 1
-                b0, b1, b2 = w * sums[t, 0], w * sums[t, 1], w * sums[t, 2]
-                b3, b4, b5 = w * sums[t, 3], w * sums[t, 4], w * sums[t, 5]
-                b6, b7, b8 = w * sums[t, 6], w * sums[t, 7], w * sums[t, 8]
+                b0, b1, b2 = w * sums[u, 0], w * sums[u, 1], w * sums[u, 2]
+                b3, b4, b5 = w * sums[u, 3], w * sums[u, 4], w * sums[u, 5]
+                b6, b7, b8 = w * sums[u, 6], w * sums[u, 7], w * sums[u, 8]
                 if k < 0:
                     k = ~k
                     b1, b2, b3, b5, b6, b7 = b3, b6, b1, b7, b2, b5
@@ -128,21 +143,28 @@ def _project(indptr, columns, start, weights, slots, most, target, values, free,
 
 
 @cached()
-def _finish_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
-    """Add the transposed half; where nothing is interpolated from a coordinate, a one, and it is not free."""
+def _finish_diagonal(indptr, values):  # type: ignore[no-untyped-def]
+    """Add the transposed half to the diagonal blocks of values (n_blocks, 9)."""
     for row in range(len(indptr) - 1):
-        v = values[indptr[row]]
+        k = indptr[row]
         for i in range(3):
-            for j in range(i, 3):
-                v[i, j] = v[j, i] = v[i, j] + v[j, i]
+            values[k, 4 * i] *= 2.0
+        for i, j in ((1, 3), (2, 6), (5, 7)):
+            values[k, i] = values[k, j] = values[k, i] + values[k, j]
+
+
+@cached()
+def _fill_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
+    """A one, and 0 in free (n, 3), where nothing is interpolated from a coordinate."""
+    for row in range(len(indptr) - 1):
         for i in range(3):
             free[row, i] = 1.0
-            if v[i, i] == 0.0:
-                v[i, i], free[row, i] = 1.0, 0.0
+            if values[indptr[row], 4 * i] == 0.0:
+                values[indptr[row], 4 * i], free[row, i] = 1.0, 0.0
 
 
 class Galerkin:
-    """The coarse rows of a rank, whose points are interpolated from coarse ones of the same rank.
+    """The coarse rows of a rank.
 
     Parameters
     ----------
@@ -153,14 +175,15 @@ class Galerkin:
     start : (n_owned + 1,)
         Where each fine point's parents begin.
     parents, weights : (P,)
-        Owned coarse points that it is interpolated from.
-    n_coarse : int
-        Coarse points of this rank.
+        Coarse points, in global numbers, that it is interpolated from.
+    bounds : (ranks + 1,)
+        First coarse point of each rank.
 
     Attributes
     ----------
     points : Points
-        The coarse ones, with those of other ranks that the rows couple to as ghosts.
+        The coarse ones, with those of other ranks that the rows couple to, or are interpolated from, as
+        ghosts.
     pattern : BlockPattern
         Of the coarse rows.
     values : (n_blocks, 3, 3)
@@ -170,60 +193,86 @@ class Galerkin:
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, start: Ints, parents: Ints, weights: Array, n_coarse: int
+        self, points: Points, pattern: BlockPattern, start: Ints, parents: Ints, weights: Array, bounds: Ints
     ) -> None:
         comm = points.comm
-        bounds = np.concatenate([[0], np.cumsum(comm.allgather(n_coarse))]).astype(np.int64)
-        first = int(bounds[comm.rank])
-        everyone, self._weights, self._start = _with_ghosts(points, start, parents + first, weights)
-        ghosts = np.unique(everyone[(everyone < first) | (everyone >= first + n_coarse)])
-        self.points = Points(comm, bounds, ghosts, np.arange(n_coarse))
-        numbers = local_numbers(everyone, ghosts, first, first + n_coarse)
+        first, end = int(bounds[comm.rank]), int(bounds[comm.rank + 1])
+        everyone, self._weights, self._start = _with_ghosts(points, start, parents, weights)
+        near = np.unique(everyone[(everyone < first) | (everyone >= end)])
+        n, width = end - first, end - first + len(near)
         self._fine = pattern
-        self._make_pattern(n_coarse, self.points.n_local, numbers)
-        self.values = np.zeros((self.pattern.n_blocks, 3, 3))
-        self.free = np.ones((n_coarse, 3))
+        keys, target = self._products(local_numbers(everyone, near, first, end), n, width)
+        one, other = np.divmod(keys, max(width, 1))
+        inside = other < n
+        inside &= one < n
+        mixed = ~inside
+        symmetric = one < width
+        number = np.concatenate([np.arange(first, end), near])
+        pairs = np.column_stack([number[one - np.where(symmetric, 0, width)], number[other]])[mixed]
+        self._shared = shared = SharedBlocks(comm, bounds, pairs, symmetric[mixed])
+        needed = np.concatenate([shared.columns, everyone[: len(parents)]])
+        ghosts = np.unique(needed[(needed < first) | (needed >= end)])
+        self.points = Points(comm, bounds, ghosts, np.arange(n))
+        n_local = self.points.n_local
+        own = one[inside] * n_local + other[inside]
+        came = (shared.rows - first) * n_local + local_numbers(shared.columns, ghosts, first, end)
+        final = union(diagonal_keys(n, n_local), own, came)
+        self.pattern = BlockPattern.of_keys(final, n, n_local)
+        shared.into(np.searchsorted(final, came))
+        place = np.empty(len(keys), dtype=np.int64)
+        place[inside] = np.searchsorted(final, own)
+        place[mixed] = len(final) + np.arange(len(pairs))
+        for lo in range(0, len(target), CHUNK_PRODUCTS):
+            part = target[lo : lo + CHUNK_PRODUCTS]
+            found = place[np.where(part < 0, ~part, part)]
+            part[:] = np.where(part < 0, ~found, found)
+        self._target = target
+        self._sums = np.zeros((len(final) + len(pairs), 9))
+        self.values = self._sums[: len(final)].reshape(-1, 3, 3)
+        self.free = np.ones((n, 3))
 
-    def _make_pattern(self, n_coarse: int, width: int, parents: Ints) -> None:
+    def _products(self, parents: Ints, n_coarse: int, width: int) -> tuple[Ints, Ints]:
+        """All keys, ascending, and which of them each product adds to; ~ of it if transposed."""
         fine, n = self._fine, len(self._fine.indptr) - 1
         rows = fine.indptr, fine.columns, self._start, parents
         n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         _counts(*rows, width, n_slots, n_keys)
         self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
         self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
+        firsts = np.concatenate([[0], np.cumsum(n_slots)])
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
 
         def made(lo: int, hi: int) -> Ints:
             keys = np.empty(int(n_keys[lo:hi].sum()), dtype=np.int64)
-            at = int(n_slots[:lo].sum())
-            _slots(lo, hi, *rows, self._slots[at:], keys, width)
+            _slots(lo, hi, *rows, self._slots[firsts[lo] :], keys, width)
             return keys
 
-        keys = diagonal_keys(n_coarse, width)
+        keys = np.empty(0, dtype=np.int64)
         for lo, hi in chunks:
             new = made(lo, hi)
             keys = union(keys, np.where(new < 0, ~new, new))
-        self.pattern = BlockPattern.of_keys(keys, n_coarse, width)
-        self._target = np.empty(int(n_keys.sum()), dtype=index_type(len(keys)))
+        target = np.empty(int(n_keys.sum()), dtype=index_type(2 * len(keys)))
         q = 0
         for lo, hi in chunks:
             new = made(lo, hi)
             found = np.searchsorted(keys, np.where(new < 0, ~new, new))
-            self._target[q : q + len(new)] = np.where(new < 0, ~found, found)
+            target[q : q + len(new)] = np.where(new < 0, ~found, found)
             q += len(new)
+        return keys, target
 
     def project(self, values: Array, free: Array) -> None:
-        """Make the coarse block rows of fine ones (n_blocks, 3, 3).
+        """Make the coarse block rows of fine ones (n_blocks, 3, 3); collective.
 
         ``free`` (n_owned, 3) is 0 for coordinates that nothing is interpolated to, 1 for others; those are
         decoupled in ``values``.
         """
-        fine = self._fine
-        self.values[:] = 0.0
+        fine, n = self._fine, self.pattern.n_blocks
+        self._sums[:] = 0.0
         rows = fine.indptr, fine.columns, self._start, self._weights
-        blocks, sums = values.reshape(-1, 9), self.values.reshape(-1, 9)
-        _project(*rows, self._slots, self._most, self._target, blocks, free, sums)
-        _finish_diagonal(self.pattern.indptr, self.values, self.free)
+        _project(*rows, self._slots, self._most, self._target, values.reshape(-1, 9), free, self._sums)
+        _finish_diagonal(self.pattern.indptr, self._sums)
+        self._shared.add(self._sums[n:], self._sums[:n])
+        _fill_diagonal(self.pattern.indptr, self._sums, self.free)
 
 
 def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:

@@ -87,6 +87,17 @@ class Points:
         self._forest.bcastBegin(triple, owned, ghosts, MPI.REPLACE)
         self._forest.bcastEnd(triple, owned, ghosts, MPI.REPLACE)
 
+    def add_to_owners(self, values: NDArray[np.float64] | NDArray[np.float32]) -> None:
+        """Add the ghost rows of ``values`` (n_local, 3) to the owners' rows; collective."""
+        if self.comm.size == 1:
+            return
+        wide = values.astype(np.float64)  # PETSc has no sums of single precision
+        owned, ghosts = wide[: self.n_owned], wide[self.n_owned :]
+        triple = self._triples[wide.dtype]
+        self._forest.reduceBegin(triple, ghosts, owned, MPI.SUM)
+        self._forest.reduceEnd(triple, ghosts, owned, MPI.SUM)
+        values[: self.n_owned] = owned
+
     def destroy(self) -> None:
         """Free the communication objects; collective."""
         self._forest.destroy()

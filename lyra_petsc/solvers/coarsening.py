@@ -7,7 +7,7 @@ coarse triangle that contains it. Each vertex is then moved halfway to the mean 
 subdivision scheme: of linear interpolation alone every coarse edge makes a fold, whose bending is twice too
 stiff on each coarser mesh.
 
-Functions of arrays; a rank looks at its own vertices only, so that interpolation never communicates.
+Functions of arrays, of a whole mesh.
 """
 
 from __future__ import annotations
@@ -53,12 +53,8 @@ class Coarse:
     weights: Array
 
 
-def coarsen(x: Array, triangles: Ints, edge: NDArray[np.bool_]) -> Coarse:
-    """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3).
-
-    ``edge`` (N,) are the vertices where the sheet ends. Where only the rank's part of it does, nothing is
-    smoothed: that line is ragged, and not a line of the sheet.
-    """
+def coarsen(x: Array, triangles: Ints) -> Coarse:
+    """Coarse mesh of vertices x (N, 3) [m] and triangles (F, 3)."""
     n = len(x)
     start, neighbours = vertex_graph([triangles], n)
     border = _borders(n, triangles)
@@ -75,11 +71,8 @@ def coarsen(x: Array, triangles: Ints, edge: NDArray[np.bool_]) -> Coarse:
     at, around = _around(len(vertices), coarse)
     parents, weights = np.full((n, 3), -1, dtype=np.int64), np.zeros((n, 3))
     _interpolate(x, start, neighbours, label, owner, vertices, coarse, at, around, parents, weights)
-    along = boundary_edges(triangles).edges
-    along_start, along_ends = vertex_graph([along[edge[along].all(axis=1)]], n)
-    kept = (border > 0) & ((np.diff(along_start) < 2) | (border > 1))
-    rows = _smoothed(along_start, along_ends, start, neighbours, border, kept, parents, weights)
-    return Coarse(vertices, coarse, *rows)
+    along = vertex_graph([boundary_edges(triangles).edges], n)
+    return Coarse(vertices, coarse, *_smoothed(*along, start, neighbours, border, parents, weights))
 
 
 def _borders(n: int, triangles: Ints) -> NDArray[np.int8]:
@@ -215,10 +208,10 @@ def _between(x, start, neighbours, label, vertices, v, parents, weights):  # typ
 
 
 @cached()
-def _smoothed(along_start, along_ends, start, neighbours, border, kept, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Compressed rows of (parents, weights) (N, 3), each halfway to its neighbours' mean unless it is kept.
+def _smoothed(along_start, along_ends, start, neighbours, border, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Compressed rows of (parents, weights) (N, 3), each halfway to its neighbours' mean.
 
-    Vertices of the border look along the border only, or the sheet would shrink.
+    Vertices of the border look along the border only, or the sheet would shrink, and corners stay.
     """
     n = len(border)
     first = np.zeros(n + 1, np.int64)
@@ -230,7 +223,7 @@ def _smoothed(along_start, along_ends, start, neighbours, border, kept, parents,
         around, begin = neighbours, start
         if border[v] > 0:
             around, begin = along_ends, along_start
-        degree = 0 if kept[v] else begin[v + 1] - begin[v]
+        degree = 0 if border[v] > 1 else begin[v + 1] - begin[v]
         most = 3 * (degree + 1)
         if q + most > len(out):
             bigger, more = np.empty(2 * len(out) + most, np.int64), np.empty(2 * len(out) + most)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.galerkin import Galerkin
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.meshing.topology import boundary_edges
 from lyra_petsc.partition.points import Points
-from lyra_petsc.solvers.coarsening import Coarse, coarsen
+from lyra_petsc.solvers.coarsening import coarsen
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 COARSEST = 300
@@ -39,6 +40,27 @@ class Surface:
     triangles: NDArray[np.int32]
 
 
+@dataclass(frozen=True)
+class Interpolation:
+    """A rank's rows of the interpolation from a coarser level.
+
+    Attributes
+    ----------
+    bounds : (ranks + 1,)
+        First coarse vertex of each rank.
+    start : (n_owned + 1,)
+        Where each vertex' parents begin.
+    parents : (P,)
+        Coarse vertices that it is interpolated from, in global numbers.
+    weights : (P,)
+    """
+
+    bounds: Ints
+    start: Ints
+    parents: Ints
+    weights: Array
+
+
 class Level:
     """Block rows of one level, and, but for the coarsest, the interpolation to it from the next coarser one.
 
@@ -49,7 +71,7 @@ class Level:
     values : (n_blocks, 3, 3)
     free : (n_owned, 3)
         0 for coordinates that take no part in interpolation, 1 for others.
-    coarse : Coarse or None
+    interpolation : Interpolation or None
     galerkin : Galerkin or None
         Makes the next coarser level's block rows.
     """
@@ -58,12 +80,14 @@ class Level:
         self.points, self.pattern = points, pattern
         self.values: Array = np.zeros((0, 3, 3))
         self.free: Array = np.ones((points.n_owned, 3))
-        self.coarse: Coarse | None = None
+        self.interpolation: Interpolation | None = None
         self.galerkin: Galerkin | None = None
 
 
 class Hierarchy:
-    """All levels of a mesh, finest first.
+    """All levels of a mesh, finest first; collective.
+
+    Rank 0 makes all coarse meshes, so that they do not depend on the ranks.
 
     Parameters
     ----------
@@ -81,27 +105,18 @@ class Hierarchy:
     def __init__(self, points: Points, pattern: BlockPattern, surface: Surface, most: int) -> None:
         level = Level(points, pattern)
         self.levels = [level]
-        n = points.n_owned
-        x = surface.x[:n]
-        triangles = surface.triangles[(surface.triangles < n).all(axis=1)].astype(np.int64)
-        edge = _edge(surface.triangles, points)
-        while len(self.levels) < most and (level.points.n_global > COARSEST or len(self.levels) == 1):
-            coarse = coarsen(x, triangles, edge)
-            left = points.comm.allreduce(len(coarse.vertices))
-            if left > WORTH * level.points.n_global:
-                break
-            level.coarse = coarse
-            interpolation = coarse.start, coarse.parents, coarse.weights, len(coarse.vertices)
-            level.galerkin = Galerkin(level.points, level.pattern, *interpolation)
+        for interpolation in _interpolations(points, surface, most):
+            level.interpolation = interpolation
+            rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
+            level.galerkin = Galerkin(level.points, level.pattern, *rows)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
-            x, triangles, edge = x[coarse.vertices], coarse.triangles, edge[coarse.vertices]
 
     def set(self, values: Array, held: Mask) -> None:
         """New block rows of the finest level; ``held`` (n_local, 3) are the prescribed coordinates."""
         finest = self.levels[0]
         finest.values, finest.free = values, np.where(held[: finest.points.n_owned], 0.0, 1.0)
-        for level, coarser in zip(self.levels, self.levels[1:], strict=False):
+        for level, coarser in pairwise(self.levels):
             assert level.galerkin is not None
             level.galerkin.project(level.values, level.free)
             coarser.values, coarser.free = level.galerkin.values, level.galerkin.free
@@ -113,9 +128,34 @@ class Hierarchy:
         self.levels = []
 
 
-def _edge(triangles: NDArray[np.int32], points: Points) -> Mask:
-    """Owned vertices (n_owned,) where the sheet ends; all triangles around them are among the rank's."""
-    ends = boundary_edges(triangles.astype(np.int64)).edges
-    edge = np.zeros(points.n_local, dtype=bool)
-    edge[ends[(ends < points.n_owned).any(axis=1)]] = True
-    return edge[: points.n_owned]
+def _interpolations(points: Points, surface: Surface, most: int) -> list[Interpolation]:
+    """This rank's rows of all of them, finest first."""
+    comm, n = points.comm, points.n_owned
+    first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
+    mine = surface.x[:n], points.global_number[surface.triangles[first_owned]]
+    parts = comm.gather(mine)
+    shares: list[list[Interpolation]] = []
+    if parts is not None:
+        x, triangles = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+        del parts
+        shares = _shares(x, triangles, points.bounds, most)
+    share: list[Interpolation] = comm.scatter(shares)
+    return share
+
+
+def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[Interpolation]]:
+    """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers."""
+    shares: list[list[Interpolation]] = [[] for _ in bounds[1:]]
+    levels = 1
+    while levels < most and (len(x) > COARSEST or levels == 1):
+        coarse = coarsen(x, triangles)
+        if len(coarse.vertices) > WORTH * len(x):
+            break
+        below = np.searchsorted(coarse.vertices, bounds)
+        for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
+            start = coarse.start[lo : hi + 1]
+            rows = slice(start[0], start[-1])
+            share.append(Interpolation(below, start - start[0], coarse.parents[rows], coarse.weights[rows]))
+        x, triangles, bounds = x[coarse.vertices], coarse.triangles, below
+        levels += 1
+    return shares

@@ -1,4 +1,4 @@
-"""Geometric multigrid where the options ask for it: our V cycle, or PETSc's, on levels that follow a matrix."""
+"""Geometric multigrid where options ask for it: our V cycle or PETSc's, on levels that follow a matrix."""
 
 from __future__ import annotations
 
@@ -70,8 +70,9 @@ class Multigrid:
         """Give our cycle, which PETSc makes when it reads the options, its levels; collective."""
         if self._cycle is None:
             pc = ksp.getPC()
-            self._cycle = pc.getPythonContext()
-            self._cycle.attach(self.hierarchy)
+            context: VCycle = pc.getPythonContext()
+            context.attach(self.hierarchy)
+            self._cycle = context
             # at the end of a program that destroys nothing PETSc would call Python when that is gone
             weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
 

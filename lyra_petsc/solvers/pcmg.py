@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -17,23 +19,21 @@ class Interpolation:
     """The matrix (3 n fine, 3 n coarse) that interpolates to a level from the next coarser one."""
 
     def __init__(self, level: Level, coarser: Level) -> None:
-        coarse, fine, points = level.coarse, level.points, coarser.points
-        assert coarse is not None
-        self._level, self._weights = level, np.repeat(coarse.weights, 3)
-        counts = np.diff(coarse.start)
+        rows, fine, points = level.interpolation, level.points, coarser.points
+        assert rows is not None
+        self._level, self._weights = level, rows.weights
+        counts = np.diff(rows.start)
         row = np.repeat(np.arange(fine.n_owned), counts)
         order = np.argsort(np.concatenate([3 * row, 3 * row + 1, 3 * row + 2]), kind="stable")
         self._order, self._row = order, row
-        parents = 3 * (coarse.parents + points.start)
+        parents = 3 * rows.parents
         self._columns = np.concatenate([parents, parents + 1, parents + 2])[order].astype(PETSc.IntType)
         self._indptr = np.concatenate([[0], np.cumsum(np.repeat(counts, 3))]).astype(PETSc.IntType)
-        self._weights = coarse.weights
         sizes = (3 * fine.n_owned, 3 * fine.n_global), (3 * points.n_owned, 3 * points.n_global)
-        widths = np.repeat(counts, 3).astype(PETSc.IntType)
-        none = np.zeros_like(widths)
-        self.mat = PETSc.Mat().createAIJ(
-            sizes, nnz=(widths, none) if fine.comm.size > 1 else widths, comm=fine.comm
-        )
+        own = (rows.parents >= points.start) & (rows.parents < points.start + points.n_owned)
+        inside = np.bincount(row[own], minlength=fine.n_owned)
+        nnz = [np.repeat(part, 3).astype(PETSc.IntType) for part in (inside, counts - inside)]
+        self.mat = PETSc.Mat().createAIJ(sizes, nnz=nnz if fine.comm.size > 1 else nnz[0], comm=fine.comm)
         self._free: Array | None = None
 
     def set(self) -> None:
@@ -54,7 +54,7 @@ class PetscCycle:
     def __init__(self, pc: PETSc.PC, hierarchy: Hierarchy) -> None:
         levels = hierarchy.levels
         self._levels = levels
-        self._interpolations = [Interpolation(*pair) for pair in zip(levels, levels[1:], strict=False)]
+        self._interpolations = [Interpolation(*pair) for pair in pairwise(levels)]
         kinds = ["baij"] * (len(levels) - 2) + ["aij"]
         self._matrices = [
             SystemMatrix(level.points, level.pattern, kind, given=False)

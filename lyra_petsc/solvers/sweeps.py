@@ -57,7 +57,7 @@ def backward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignor
         for k in range(lo, hi):
             c = Index(columns[k])
             if c >= Index(n_owned):
-                hi = k
+                hi = Index(k)
                 break
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
             s0 -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
@@ -118,8 +118,7 @@ def forward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore
 @cached(fastmath=True)
 def restrict(start, parents, weights, free, r, out):  # type: ignore[no-untyped-def]
     """out (C, 3) = interpolationᵀ · r (n, 3), without coordinates that are not free."""
-    for c in range(len(out)):
-        out[c, 0] = out[c, 1] = out[c, 2] = 0.0
+    out[:] = 0.0
     for row in range(Index(len(start) - 1)):
         r0, r1, r2 = free[row, 0] * r[row, 0], free[row, 1] * r[row, 1], free[row, 2] * r[row, 2]
         for p in range(Index(start[row]), Index(start[row + Index(1)])):

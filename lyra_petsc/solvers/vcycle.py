@@ -1,4 +1,4 @@
-"""Geometric multigrid as a preconditioner of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
+"""Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
 
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
 is symmetric. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own cycle
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.solvers import sweeps
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 
@@ -23,10 +24,10 @@ class Smoother:
 
     Attributes
     ----------
-    b, r : (n_owned, 3)
-        Right-hand side; residual, without held coordinates.
-    x : (n_local, 3)
-        Solution.
+    b, x : (n_local, 3)
+        Right-hand side and solution.
+    r : (n_owned, 3)
+        Residual.
     """
 
     def __init__(self, level: Level) -> None:
@@ -37,10 +38,15 @@ class Smoother:
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
-        self.b, self.r = (np.zeros((n, 3), dtype=np.float32) for _ in range(2))
-        coarse = level.coarse
-        assert coarse is not None
-        self._parents = coarse.start, coarse.parents.astype(np.int32), coarse.weights.astype(np.float32)
+        self.b = np.zeros_like(self.x)
+        self.r = np.zeros((n, 3), dtype=np.float32)
+        rows = level.interpolation
+        assert rows is not None
+        assert level.galerkin is not None
+        self._coarse = coarse = level.galerkin.points
+        lo, hi = coarse.start, coarse.start + coarse.n_owned
+        parents = local_numbers(rows.parents, coarse.ghosts, lo, hi).astype(np.int32)
+        self._parents = rows.start, parents, rows.weights.astype(np.float32)
         self._free = np.ones((n, 3), dtype=np.float32)
 
     def set(self) -> None:
@@ -52,15 +58,17 @@ class Smoother:
         self._free[:] = level.free
 
     def before(self, coarse: Floats) -> None:
-        """Sweep from zero; ``coarse`` gets the restricted residual; collective."""
+        """Sweep from zero; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective."""
         sweeps.backward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
         if self._points.comm.size > 1:
             self._points.update_ghosts(self.x)
             sweeps.subtract_ghosts(*self._rows, self._blocks, self.x, self.r)
         sweeps.restrict(*self._parents, self._free, self.r, coarse)
+        self._coarse.add_to_owners(coarse)
 
     def after(self, coarse: Floats) -> None:
         """Add what the coarser level found, and sweep; collective."""
+        self._coarse.update_ghosts(coarse)
         sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
         self._points.update_ghosts(self.x)
         sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
@@ -72,8 +80,7 @@ class Coarsest:
     def __init__(self, level: Level) -> None:
         self._level = level
         self.matrix = SystemMatrix(level.points, level.pattern, "aij", given=False)
-        n = level.points.n_owned
-        self.x, self.b = np.zeros((n, 3), dtype=np.float32), np.zeros((n, 3), dtype=np.float32)
+        self.x, self.b = (np.zeros((level.points.n_local, 3), dtype=np.float32) for _ in range(2))
         self._solution, self._rhs = self.matrix.mat.createVecs()
         self._ksp = PETSc.KSP().create(level.points.comm)
         self._ksp.setOptionsPrefix("mg_coarse_")
@@ -87,9 +94,10 @@ class Coarsest:
 
     def solve(self) -> None:
         """x of b; collective."""
-        self._rhs.getArray()[:] = self.b.ravel()
+        n = self._level.points.n_owned
+        self._rhs.getArray()[:] = self.b[:n].ravel()
         self._ksp.solve(self._rhs, self._solution)
-        self.x[:] = self._solution.getArray().reshape(-1, 3)
+        self.x[:n] = self._solution.getArray().reshape(-1, 3)
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""
@@ -119,17 +127,15 @@ class VCycle:
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one V cycle on b; collective."""
         assert self._coarsest is not None
-        levels = [*self._smoothers, self._coarsest]
-        with b as given:
-            levels[0].b[:] = given.reshape(-1, 3)
+        levels: list[Smoother | Coarsest] = [*self._smoothers, self._coarsest]
+        n = b.getLocalSize() // 3
+        levels[0].b[:n] = b.getArray(readonly=True).reshape(-1, 3)
         for smoother, coarser in zip(self._smoothers, levels[1:], strict=True):
             smoother.before(coarser.b)
         self._coarsest.solve()
-        for smoother, coarser in reversed(list(zip(self._smoothers, levels[1:], strict=True))):
+        for smoother, coarser in zip(self._smoothers[::-1], levels[:0:-1], strict=True):
             smoother.after(coarser.x)
-        n = len(levels[0].b)
-        with x as found:
-            found.reshape(-1, 3)[:] = levels[0].x[:n]
+        x.setArray(levels[0].x[:n].ravel())
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""

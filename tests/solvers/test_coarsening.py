@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lyra_petsc.meshing.topology import boundary_edges
-from lyra_petsc.solvers import coarsening
-from lyra_petsc.solvers.coarsening import Coarse
-
-
-def coarsen(x: np.ndarray, triangles: np.ndarray) -> Coarse:
-    """The coarse mesh of a whole sheet."""
-    edge = np.zeros(len(x), dtype=bool)
-    edge[boundary_edges(triangles).edges] = True
-    return coarsening.coarsen(x, triangles, edge)
+from lyra_petsc.solvers.coarsening import Coarse, coarsen
 
 
 def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

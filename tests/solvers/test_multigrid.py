@@ -1,4 +1,4 @@
-"""Multigrid on our coarse meshes, our cycle and PETSc's: iterations against mesh, ranks, stiffness; options."""
+"""Multigrid on our coarse meshes, our cycle and PETSc's: iterations against mesh, ranks, stiffness."""
 
 from __future__ import annotations
 
