@@ -58,19 +58,21 @@ def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
     """out (n_owned, 3) = whole rows · x (n_local, 3); ``out`` is 0 before."""
     n = len(indptr) - 1
     for row in range(n):
-        y0, y1, y2 = x[row, 0], x[row, 1], x[row, 2]
-        s0 = s1 = s2 = 0.0
-        for k in range(indptr[row], indptr[row + 1]):
-            c = columns[k]
+        first = indptr[row]
+        d, y0, y1, y2 = values[first], x[row, 0], x[row, 1], x[row, 2]
+        s0 = d[0, 0] * y0 + d[0, 1] * y1 + d[0, 2] * y2
+        s1 = d[1, 0] * y0 + d[1, 1] * y1 + d[1, 2] * y2
+        s2 = d[2, 0] * y0 + d[2, 1] * y1 + d[2, 2] * y2
+        for k in range(first + 1, indptr[row + 1]):
+            c, v = columns[k], values[k]
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            v = values[k]
             v00, v01, v02 = v[0, 0], v[0, 1], v[0, 2]
             v10, v11, v12 = v[1, 0], v[1, 1], v[1, 2]
             v20, v21, v22 = v[2, 0], v[2, 1], v[2, 2]
             s0 += v00 * x0 + v01 * x1 + v02 * x2
             s1 += v10 * x0 + v11 * x1 + v12 * x2
             s2 += v20 * x0 + v21 * x1 + v22 * x2
-            if row < c < n:
+            if c < n:
                 out[c, 0] += v00 * y0 + v10 * y1 + v20 * y2
                 out[c, 1] += v01 * y0 + v11 * y1 + v21 * y2
                 out[c, 2] += v02 * y0 + v12 * y1 + v22 * y2

@@ -162,3 +162,25 @@ def test_product_of_rows_needs_no_petsc(comm: MPI.Comm) -> None:
         by_rows = simulation.system._blocks.product(values, local)
         expected = product(simulation.stepper.matrix, direction)
         assert largest(comm, by_rows - expected) <= 1e-13 * largest(comm, expected)
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.5, 1.0])
+def test_hessians_added_at_once_are_those_of_the_elements(comm: MPI.Comm, blend: float) -> None:
+    with Simulation(EVERYTHING, comm) as simulation:
+        bent_state(simulation)
+        blocks, x = simulation.system._blocks, simulation.system.x
+        before = x + 0.01 * np.cos(9.0 * x[:, ::-1])
+        done = set()
+        for term in simulation.system.elastic:
+            term.linearise_from(before)
+            weight = 1.0 + np.arange(term.n_elements)
+            found, expected = blocks.zeros(), blocks.zeros()
+            if not term.add_hessians(x, blend, weight, blocks.pattern.offsets[term.name], found):
+                assert not found.any()
+                continue
+            done.add(term.name)
+            blocks.add(
+                term.name, lambda lo, hi, out, t=term: t.hessians(x, lo, hi, blend, out), weight, expected
+            )
+            np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13 * np.abs(expected).max())
+        assert done == ({"membrane", "bending"} if blend == 1.0 else {"membrane"})
