@@ -9,7 +9,7 @@
 set -euo pipefail
 
 # What takes about half of the time; whatever else there is in tests/ is the other half.
-first_half=(tests/cli tests/view)
+first_half=(tests/cli tests/surviving)
 
 source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
 
