@@ -71,7 +71,7 @@ keep() { if ((code == 0)); then code=$1; fi; }
 
 # run_halves: both at once; the second one's words are shown when both are done
 run_halves() {
-    local one=0 two=0 other
+    local one=0 two=0
     say "tests on 1 rank, first half: ${first_half[*]}; the others beside it, shown after it"
     # a group of its own: in one that the shell starts in the background, and in all that it starts,
     # an interrupt would be ignored

@@ -53,14 +53,19 @@ def make(folder: Path) -> None:
     launcher.chmod(0o755)
 
 
-def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a script of ours without what the variables of this environment would tell it; offline."""
+def surroundings(folder: Path) -> dict[str, str]:
+    """Variables without those that tell a script of ours about this environment; nothing is fetched."""
     names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
     clean = {name: value for name, value in os.environ.items() if name not in names}
+    return {**clean, "LYRA_VENV": str(folder / "laid over"), "PIP_NO_INDEX": "1"}
+
+
+def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a script of ours."""
     return subprocess.run(
         ["bash", str(ROOT / "scripts" / script), *arguments],
         cwd=cwd,
-        env={**clean, "LYRA_VENV": str(cwd / "laid over"), "PIP_NO_INDEX": "1", **variables},
+        env=surroundings(cwd) | variables,
         capture_output=True,
         text=True,
         timeout=60,

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from environments import NEEDED, ROOT, activated, call, make, put, site_packages
+from environments import NEEDED, ROOT, activated, call, make, put, site_packages, surroundings
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")
 
 PYTEST = """\
-import os, signal, sys
+import os, signal, sys, time
+from pathlib import Path
 words = sys.argv[1:]
 ignored = [word for word in words if word.startswith("--ignore=")]
 half = "SECOND" if ignored else "FIRST" if "tests/cli" in words else "WHOLE"
@@ -22,12 +25,21 @@ print(half, words, "asks to be interrupted:", signal.getsignal(signal.SIGINT) !=
 line, code = os.environ[half].split(";")
 print(line)
 sys.stdout.flush()
+if line == "works":
+    Path(os.environ["LYRA_VENV"]).with_name(half).write_text(str(os.getpid()))
+    time.sleep(60)
 if int(code) < 0:
     os.kill(os.getpid(), -int(code))
 sys.exit(int(code))
 """
 
 CORES = '#!/bin/sh\necho "${CORES:-2}"\n'
+
+SAID = {
+    "FIRST": "=== 3 passed, 1 warning in 2.50s ===;0",
+    "SECOND": "=== 4 passed in 1.25s ===;0",
+    "WHOLE": "=== 7 passed in 3.75s ===;0",
+}
 
 Tests = Callable[..., "subprocess.CompletedProcess[str]"]
 
@@ -52,13 +64,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def tests(made: Path, tmp_path: Path) -> Tests:
-    said = {
-        "FIRST": "=== 3 passed, 1 warning in 2.50s ===;0",
-        "SECOND": "=== 4 passed in 1.25s ===;0",
-        "WHOLE": "=== 7 passed in 3.75s ===;0",
-    }
     return lambda *words, **variables: call(
-        "test.sh", *words, cwd=tmp_path, **{**activated(made), **said, **variables}
+        "test.sh", *words, cwd=tmp_path, **{**activated(made), **SAID, **variables}
     )
 
 
@@ -109,6 +116,34 @@ def test_a_half_that_fails_is_a_failure(
     done = tests(**said)
     assert done.returncode == code, done.stderr
     assert done.stdout.splitlines()[-1] == f"=== {line} ==="
+
+
+def at_work(pid: int) -> bool:
+    """Whether a process has not ended."""
+    words = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
+    return words.strip()[:1] not in ("", "Z")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_both_halves(made: Path, tmp_path: Path, number: int) -> None:
+    process = subprocess.Popen(
+        ["bash", str(ROOT / "scripts/test.sh")],
+        env=surroundings(tmp_path) | activated(made) | SAID | {"FIRST": "works;0", "SECOND": "works;0"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    halves = [tmp_path / "FIRST", tmp_path / "SECOND"]
+    deadline = time.monotonic() + 30.0
+    while not all(half.exists() and half.read_text() for half in halves):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, number)  # as a terminal does, of whose group the second half is not
+    assert process.wait(timeout=20.0) != 0
+    while any(at_work(int(half.read_text())) for half in halves):
+        assert time.monotonic() < deadline + 20.0
+        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(
