@@ -80,7 +80,7 @@ run_halves() {
         >"$logs/part-1b" 2>&1 </dev/null &
     other=$!
     set +m
-    trap 'kill -TERM -- "-$other" 2>/dev/null && wait "$other"; rm -rf -- "$logs"' EXIT
+    trap 'kill -TERM -- "-$other" 2>/dev/null && wait "$other" || true; rm -rf -- "$logs"' EXIT
     pytest_on 1 "${arguments[@]}" "${first_half[@]}" 2>&1 | tee "$logs/part-1a" || one=${PIPESTATUS[0]}
     wait "$other" || two=$?
     trap 'rm -rf -- "$logs"' EXIT

@@ -126,9 +126,13 @@ def at_work(pid: int) -> bool:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupt_ends_both_halves(made: Path, tmp_path: Path, number: int) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
     process = subprocess.Popen(
         ["bash", str(ROOT / "scripts/test.sh")],
-        env=surroundings(tmp_path) | activated(made) | SAID | {"FIRST": "works;0", "SECOND": "works;0"},
+        env=surroundings(tmp_path)
+        | activated(made)
+        | {"FIRST": "works;0", "SECOND": "works;0", "TMPDIR": str(logs)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -144,6 +148,7 @@ def test_an_interrupt_ends_both_halves(made: Path, tmp_path: Path, number: int) 
     while any(at_work(int(half.read_text())) for half in halves):
         assert time.monotonic() < deadline + 20.0
         time.sleep(0.02)
+    assert list(logs.iterdir()) == []
 
 
 @pytest.mark.parametrize(
