@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -130,6 +129,7 @@ class Forks:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._heard = b""
 
     def run(self, arguments: Sequence[object], folder: Path, patience: float) -> Left:
         """A run to its end."""
@@ -145,40 +145,38 @@ class Forks:
             )
             atexit.register(self._process.kill)
         assert self._process.stdin is not None
-        with tempfile.TemporaryDirectory() as words:
-            out, err = Path(words, "out"), Path(words, "err")
-            out.touch()
-            err.touch()
-            asked = {
-                "arguments": [str(argument) for argument in arguments],
-                "folder": str(folder),
-                "environment": environment(),
-                "out": str(out),
-                "err": str(err),
-            }
-            self._process.stdin.write(json.dumps(asked).encode() + b"\n")
-            pid = self._answer(PATIENCE)
-            assert pid is not None, "no process is forked"
-            code = self._answer(patience)
-            if code is None:
-                os.killpg(pid, signal.SIGKILL)
-                self._answer(PATIENCE)
-                pytest.fail(f"hangs: {asked['arguments']}\n{out.read_text()}\n{err.read_text()}")
-            return Left(code, out.read_text(encoding="utf-8"), err.read_text(encoding="utf-8"))
+        asked = {
+            "arguments": [str(argument) for argument in arguments],
+            "folder": str(folder),
+            "environment": environment(),
+        }
+        self._process.stdin.write(json.dumps(asked).encode() + b"\n")
+        pid = self._answer(PATIENCE)
+        answer = self._answer(patience)
+        hangs = answer is None
+        if hangs:
+            os.killpg(pid, signal.SIGKILL)
+            answer = self._answer(PATIENCE)
+        code, *words = answer
+        out, err = (text.replace("\r\n", "\n").replace("\r", "\n") for text in words)
+        if hangs:
+            pytest.fail(f"hangs: {asked['arguments']}\n{out}\n{err}")
+        return Left(code, out, err)
 
-    def _answer(self, patience: float) -> int | None:
-        """The number on the next line; None if none comes in time."""
+    def _answer(self, patience: float) -> Any:
+        """What the next line says; None if none comes in time."""
         assert self._process is not None
         assert self._process.stdout is not None
-        line, deadline = b"", time.monotonic() + patience
-        while not line.endswith(b"\n"):
+        deadline = time.monotonic() + patience
+        while b"\n" not in self._heard:
             left = max(0.0, deadline - time.monotonic())
             if not select.select([self._process.stdout], [], [], left)[0]:
                 return None
-            read = self._process.stdout.read(1)
-            assert read, "the process that forks has ended"
-            line += read
-        return int(line)
+            piece = self._process.stdout.read(2**16)
+            assert piece, "the process that forks has ended"
+            self._heard += piece
+        line, _, self._heard = self._heard.partition(b"\n")
+        return json.loads(line)
 
 
 FORKS = Forks()
