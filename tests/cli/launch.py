@@ -1,12 +1,20 @@
-"""Starts the program as a user does: another process, or several under mpirun."""
+"""Starts the program as a user does: another process, or several under mpirun.
+
+A run on one rank that nobody looks at before its end is forked from a process that has done half of the
+imports (see ``forks``), which take longer than most of these runs.
+"""
 
 from __future__ import annotations
 
+import atexit
+import json
 import os
+import select
 import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +109,7 @@ def start(
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        # under nohup the tests would ignore it, and the program with them
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+        preexec_fn=heed_signals,
     )
 
 
@@ -117,6 +124,70 @@ def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
     return Left(process.returncode, out, err)
 
 
+class Forks:
+    """Starts ``forks`` and asks it for runs."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._heard = b""
+
+    def run(self, arguments: Sequence[object], folder: Path, patience: float) -> Left:
+        """A run to its end."""
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, str(Path(__file__).with_name("forks.py"))],
+                env=environment(),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,
+                preexec_fn=heed_signals,
+            )
+            atexit.register(self._process.kill)
+        assert self._process.stdin is not None
+        asked = {
+            "arguments": [str(argument) for argument in arguments],
+            "folder": str(folder),
+            "environment": environment(),
+        }
+        self._process.stdin.write(json.dumps(asked).encode() + b"\n")
+        pid = self._answer(PATIENCE)
+        answer = self._answer(patience)
+        hangs = answer is None
+        if hangs:
+            os.killpg(pid, signal.SIGKILL)
+            answer = self._answer(PATIENCE)
+        code, *words = answer
+        out, err = (text.replace("\r\n", "\n").replace("\r", "\n") for text in words)
+        if hangs:
+            pytest.fail(f"hangs: {asked['arguments']}\n{out}\n{err}")
+        return Left(code, out, err)
+
+    def _answer(self, patience: float) -> Any:
+        """What the next line says; None if none comes in time."""
+        assert self._process is not None
+        assert self._process.stdout is not None
+        deadline = time.monotonic() + patience
+        while b"\n" not in self._heard:
+            left = max(0.0, deadline - time.monotonic())
+            if not select.select([self._process.stdout], [], [], left)[0]:
+                return None
+            piece = self._process.stdout.read(2**16)
+            assert piece, "the process that forks has ended"
+            self._heard += piece
+        line, _, self._heard = self._heard.partition(b"\n")
+        return json.loads(line)
+
+
+FORKS = Forks()
+
+
+def heed_signals() -> None:
+    """Under nohup, or in the background, the tests ignore these, and the program would with them."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def lyra(
     arguments: Sequence[object],
     folder: Path,
@@ -126,6 +197,8 @@ def lyra(
     **keywords: Any,
 ) -> Left:
     """Run the program in ``folder`` to its end."""
+    if ranks == 1 and not extra and not keywords:
+        return FORKS.run(arguments, folder, patience)
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 

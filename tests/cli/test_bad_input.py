@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import pytest
-from launch import SCENE, lyra, write_scene
+from launch import SCENE, Left, done, lyra, write_scene
 
 GRID = "{grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}"
 EMPTY = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
@@ -45,52 +47,123 @@ CASES: dict[str, tuple[tuple[str, str] | None, list[str], str]] = {
 }
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "empty.obj").write_text(EMPTY)
-    (tmp_path / "noise.msh").write_bytes(bytes(range(256)) * 8)
-    (tmp_path / "used").mkdir()
-    return tmp_path
+WORDS: list[tuple[list[str], str]] = [
+    (["runn", "scene.yaml"], "runn: unknown verb, did you mean 'run'"),
+    (["scene.yaml"], "give a verb first, as in: run scene.yaml"),
+    (["export", "nowhere", "--to", "obj"], "nowhere: no such folder"),
+    (["run", "none.yaml"], "none.yaml"),
+    (["run", "used"], "used"),
+    (["check", "noise.msh"], "noise.msh"),
+    (["check", "scene.yaml", "--out", "x"], "--out: no such option"),
+    (["run", "--resume", "--out", "used"], "used"),
+]
+
+# name: (scene, arguments, words in the line)
+MISTAKES = {
+    name: (SCENE.replace(*change) if change else SCENE, ["run", "scene.yaml", *arguments], words)
+    for name, (change, arguments, words) in CASES.items()
+} | {" ".join(arguments): (SCENE, arguments, words) for arguments, words in WORDS}
+
+OF_PETSC = [
+    name for name, (_, words, _) in MISTAKES.items() if any(re.match("-[a-z]", word) for word in words)
+]
+"""Mistakes in what PETSc reads as it starts, which it does once in a process."""
+
+ONE_BY_ONE = """
+import json
+import re
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+import os, sys
+from mpi4py import MPI
+from lyra_petsc.cli.app import run_command_line
+
+left = []
+for folder, words in json.loads(Path("mistakes.json").read_text()):
+    os.chdir(folder)
+    with redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err:
+        code = run_command_line(["lyra-petsc", *words])
+    left.append([code, out.getvalue(), err.getvalue()])
+Path(sys.argv[1], f"left-{MPI.COMM_WORLD.rank}.json").write_text(json.dumps(left))
+"""
 
 
-def refused(arguments: list[str], folder: Path, ranks: int, words: str) -> None:
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    left = lyra(arguments, folder, ranks, patience=30)
+Listing = dict[Path, int]
+
+
+def listing(folder: Path) -> Listing:
+    """When what is in a folder was last changed."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+def set_out(folder: Path, name: str) -> tuple[list[str], str]:
+    """Write what a mistake is made with; its command and the words of its line."""
+    scene, arguments, words = MISTAKES[name]
+    write_scene(folder, scene)
+    (folder / "empty.obj").write_text(EMPTY)
+    (folder / "noise.msh").write_bytes(bytes(range(256)) * 8)
+    (folder / "used").mkdir()
+    return arguments, words
+
+
+def refused(left: Left, words: str) -> None:
+    """Exit code 2 and one line of ours with these words."""
     assert left.code == 2, left.err
     assert len(left.ours) == 1, left.err
     assert words in left.ours[0]
     assert "Traceback" not in left.err
     assert left.out == ""
-    if ranks == 1:
-        assert left.err.splitlines() == left.ours
-    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("name", CASES)
-def test_a_mistake_is_one_line(folder: Path, name: str, ranks: int) -> None:
-    change, arguments, words = CASES[name]
-    if change is not None:
-        assert change[0] in SCENE
-    write_scene(folder, SCENE.replace(*change) if change else SCENE)
-    refused(["run", "scene.yaml", *arguments], folder, ranks, words)
+def test_every_case_makes_a_mistake() -> None:
+    assert all(change is None or change[0] in SCENE for change, _, _ in CASES.values())
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["runn", "scene.yaml"], "runn: unknown verb, did you mean 'run'"),
-        (["scene.yaml"], "give a verb first, as in: run scene.yaml"),
-        (["export", "nowhere", "--to", "obj"], "nowhere: no such folder"),
-        (["run", "none.yaml"], "none.yaml"),
-        (["run", "used"], "used"),
-        (["check", "noise.msh"], "noise.msh"),
-        (["check", "scene.yaml", "--out", "x"], "--out: no such option"),
-        (["run", "--resume", "--out", "used"], "used"),
-    ],
-    ids=" ".join,
-)
-def test_a_wrong_word_is_one_line(folder: Path, arguments: list[str], words: str, ranks: int) -> None:
-    write_scene(folder)
-    refused(arguments, folder, ranks, words)
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
+    arguments, words = set_out(tmp_path, name)
+    before = listing(tmp_path)
+    left = lyra(arguments, tmp_path, patience=30)
+    refused(left, words)
+    assert left.err.splitlines() == left.ours
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["unknown key", "nothing to resume", "runn scene.yaml", *OF_PETSC])
+def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> None:
+    arguments, words = set_out(tmp_path, name)
+    before = listing(tmp_path)
+    refused(lyra(arguments, tmp_path, 2, patience=30), words)
+    assert listing(tmp_path) == before
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Listing, list[Left]]]:
+    """What every mistake but PETSc's left on each of two ranks, made one after the other in one job."""
+    work = tmp_path_factory.mktemp("together")
+    made = {}
+    for number, name in enumerate(name for name in MISTAKES if name not in OF_PETSC):
+        folder = work / str(number)
+        folder.mkdir()
+        made[name] = folder, set_out(folder, name)[0], listing(folder)
+    (work / "one_by_one.py").write_text(ONE_BY_ONE)
+    (work / "mistakes.json").write_text(json.dumps([(str(f), words) for f, words, _ in made.values()]))
+    left = done([work], work, 2, program=("one_by_one.py",))
+    assert (left.out, left.err) == ("", "")
+    ranks = [json.loads((work / f"left-{rank}.json").read_text()) for rank in range(2)]
+    return {
+        name: (folder, before, [Left(*each[number]) for each in ranks])
+        for number, (name, (folder, _, before)) in enumerate(made.items())
+    }
+
+
+@pytest.mark.parametrize("name", [name for name in MISTAKES if name not in OF_PETSC])
+def test_two_ranks_agree_on_a_mistake(
+    together: dict[str, tuple[Path, Listing, list[Left]]], name: str
+) -> None:
+    folder, before, (first, second) = together[name]
+    refused(first, MISTAKES[name][2])
+    assert first.err.splitlines() == first.ours
+    assert second == Left(2, "", "")
+    assert listing(folder) == before

@@ -8,71 +8,18 @@ import venv
 from pathlib import Path
 
 import pytest
+from environments import ROOT, activated, call, make, site_packages
 
-ROOT = Path(__file__).parents[2]
 HELPER = ROOT / "scripts" / "environment.py"
-NEEDED = {
-    "numpy": "1.26.0",
-    "numba": "0.60.0",
-    "pydantic": "2.9",
-    "ruamel.yaml": "0.18.6",
-    "click": "8.1.7",
-    "rich": "13.9",
-    "h5py": "3.11",
-    "gmsh": "4.12",
-    "mpi4py": "4.0.0",
-    "petsc4py": "3.20.1",
-    "matplotlib": "3.9",
-    "jinja2": "3.1.4",
-    "scipy": "1.14",
-}
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")
 
 
-def site_packages(environment: Path) -> Path:
-    return environment / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
-
-
-def put(environment: Path, name: str, version: str) -> None:
-    """A package that only exists: a module and its metadata."""
-    site = site_packages(environment)
-    module = site.joinpath(*name.split("."))
-    module.mkdir(parents=True)
-    (module / "__init__.py").write_text(f"__version__ = {version!r}\n")
-    metadata = site / f"{name}-{version}.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-
-
 @pytest.fixture
 def environment(tmp_path):
-    """An environment with all that is needed, none of it real, and a launcher that only speaks."""
     folder = tmp_path / "own environment"
-    venv.create(folder, symlinks=True)
-    for name, version in NEEDED.items():
-        put(folder, name, version)
-    launcher = folder / "bin" / "mpirun"
-    launcher.write_text('#!/bin/sh\necho "launched in $PWD: $*"\nexit "${LAUNCHER_EXIT:-0}"\n')
-    launcher.chmod(0o755)
+    make(folder)
     return folder
-
-
-def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
-    clean = {name: value for name, value in os.environ.items() if name not in names}
-    return subprocess.run(
-        ["bash", str(ROOT / "scripts" / script), *arguments],
-        cwd=cwd,
-        env={**clean, "LYRA_VENV": str(cwd / "laid over"), **variables},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-
-
-def activated(environment: Path) -> dict[str, str]:
-    return {"PATH": f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}"}
 
 
 def listing(folder: Path) -> list[tuple[str, float]]:

@@ -1,0 +1,77 @@
+"""The program with half of its imports done: forks for each command line that it reads, tells how it left.
+
+A line of the standard input asks for a run: arguments, folder, environment. The answers are its process
+number and, when it has ended and nothing that it started can speak for it, its exit code and its words.
+Neither MPI nor PETSc have been loaded here: each of the forked processes starts them as any other does,
+and ends in no other way.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import select
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+
+EARLY = ("cli.app", "kernel_cache", "scene.load", "scene.dump")
+"""Modules that take long to load, and know nothing of MPI."""
+
+
+def become(asked: dict[str, Any], out: int, err: int) -> None:
+    """Make this process what the asked one is before its first import."""
+    os.setsid()
+    os.chdir(asked["folder"])
+    os.environ.clear()
+    os.environ.update(asked["environment"])
+    for number, file in enumerate((os.open(os.devnull, os.O_RDONLY), out, err)):
+        os.dup2(file, number)
+        os.close(file)
+    sys.argv = [str(ROOT / "lyra_petsc" / "__main__.py"), *asked["arguments"]]
+
+
+def heard(*files: int) -> list[str]:
+    """All that comes out of pipes until their other ends are closed."""
+    words = {file: bytearray() for file in files}
+    still = list(files)
+    while still:
+        for file in select.select(still, [], [])[0]:
+            piece = os.read(file, 2**16)
+            words[file] += piece
+            if not piece:
+                still.remove(file)
+                os.close(file)
+    return [text.decode() for text in words.values()]
+
+
+def serve() -> None:
+    """Fork for each line; returns in the forked processes alone."""
+    for line in sys.stdin:
+        asked = json.loads(line)
+        (out, to_out), (err, to_err) = os.pipe(), os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            become(asked, to_out, to_err)
+            os.close(out)
+            os.close(err)
+            return
+        os.close(to_out)
+        os.close(to_err)
+        print(pid, flush=True)
+        words = heard(out, err)
+        print(json.dumps([os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), *words]), flush=True)
+    os._exit(0)
+
+
+for room in EARLY:
+    importlib.import_module(f"lyra_petsc.{room}")
+assert not {"mpi4py.MPI", "petsc4py.PETSc"} & set(sys.modules)
+serve()
+
+from lyra_petsc.__main__ import main  # noqa: E402
+
+main()

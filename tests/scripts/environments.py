@@ -1,0 +1,76 @@
+"""Environments in which no package is real, for the scripts that look for one."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+NEEDED = {
+    "numpy": "1.26.0",
+    "numba": "0.60.0",
+    "pydantic": "2.9",
+    "ruamel.yaml": "0.18.6",
+    "click": "8.1.7",
+    "rich": "13.9",
+    "h5py": "3.11",
+    "gmsh": "4.12",
+    "mpi4py": "4.0.0",
+    "petsc4py": "3.20.1",
+    "matplotlib": "3.9",
+    "jinja2": "3.1.4",
+    "scipy": "1.14",
+}
+"""What the program and its studies need."""
+MODULES = {"pillow": "PIL", "usd-core": "pxr"}
+
+
+def site_packages(environment: Path) -> Path:
+    return environment / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+
+
+def put(environment: Path, name: str, version: str) -> None:
+    """A package that only exists: a module and its metadata."""
+    site = site_packages(environment)
+    module = site.joinpath(*MODULES.get(name, name.replace("-", "_")).split("."))
+    module.mkdir(parents=True)
+    (module / "__init__.py").write_text(f"__version__ = {version!r}\n")
+    metadata = site / f"{name.replace('-', '_')}-{version}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+
+
+def make(folder: Path) -> None:
+    """An environment with all that is needed and a launcher that only speaks."""
+    venv.create(folder, symlinks=True)
+    for name, version in NEEDED.items():
+        put(folder, name, version)
+    launcher = folder / "bin" / "mpirun"
+    launcher.write_text('#!/bin/sh\necho "launched in $PWD: $*"\nexit "${LAUNCHER_EXIT:-0}"\n')
+    launcher.chmod(0o755)
+
+
+def surroundings(folder: Path) -> dict[str, str]:
+    """Variables without those that tell a script of ours about this environment; nothing is fetched."""
+    names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
+    clean = {name: value for name, value in os.environ.items() if name not in names}
+    return {**clean, "LYRA_VENV": str(folder / "laid over"), "PIP_NO_INDEX": "1"}
+
+
+def call(script: str, *arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a script of ours."""
+    return subprocess.run(
+        ["bash", str(ROOT / "scripts" / script), *arguments],
+        cwd=cwd,
+        env=surroundings(cwd) | variables,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def activated(environment: Path) -> dict[str, str]:
+    return {"PATH": f"{environment / 'bin'}{os.pathsep}{os.environ['PATH']}"}
