@@ -36,7 +36,7 @@ PRESETS: dict[str, dict[str, Value]] = {
         "pc_type": "cholesky",
         "pc_factor_mat_ordering_type": "qmd",
     },
-    # a fifteenth of the iterations of block Jacobi for a few times the price; on fine meshes under load the
+    # a tenth of the iterations of block Jacobi for a few times the price; on fine meshes under load the
     # factors stop existing
     "ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "ilu", "pc_factor_levels": 1},
     "block-ilu": {
@@ -91,11 +91,8 @@ PRESETS: dict[str, dict[str, Value]] = {
 
 FACTORISATIONS = ("direct", "cholesky")
 
-ILU_FROM, ILU_UNTIL = 2000, 30_000
-"""Vertices between which incomplete factors are tried first; from 0 on where a step is one linear solve."""
-
-MULTIGRID_FROM = 5000
-"""Vertices from which multigrid is tried first where a step is one linear solve."""
+MULTIGRID_FROM = {True: 2000, False: 3000}
+"""Vertices from which multigrid is tried first; with Newton iterations, and with one linear solve a step."""
 
 BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 """What is used with block storage; every other ``-pc_type`` gets ``aij``."""
@@ -107,12 +104,8 @@ DIRECT_UNTIL = 30_000
 FACTOR_COST = 50.0, 6.5
 """Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
 
-MULTIGRID_AFTER_ILU = 8000
-"""Vertices from which multigrid takes over from incomplete factors before a factorisation does."""
-
-WORTH_OF_ILU, PRICE_OF_ILU = 4.0, 3.0
-"""How many iterations of block Jacobi one with incomplete factors is worth, at the least, and costs."""
-
+WORTH, PRICE = 4.0, 3.0
+"""How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least, and costs."""
 
 LAST = ("multigrid", "gamg", "block-jacobi")
 """What is left where nothing else is known to be better."""
@@ -131,19 +124,15 @@ def candidates(
     factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
     if static:
         return [*factors, *LAST]
-    if n_vertices > ILU_UNTIL:
+    if n_vertices > DIRECT_UNTIL:
         return list(LAST)
     incomplete = "ilu" if ranks == 1 else "block-ilu"
-    small = n_vertices < ILU_FROM
-    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH_OF_ILU):
-        return [*factors, incomplete, *LAST]
-    if small and newton:
-        return ["block-jacobi", *factors, "multigrid", "gamg"]
-    if not newton and n_vertices >= MULTIGRID_FROM:
-        return ["multigrid", incomplete, *factors, "block-jacobi"]
-    if n_vertices < MULTIGRID_AFTER_ILU:
-        return [incomplete, *factors, *LAST]
-    return [incomplete, "multigrid", *factors, "gamg", "block-jacobi"]
+    small = n_vertices < MULTIGRID_FROM[newton]
+    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH):
+        return [*factors, *LAST]
+    if not small:
+        return ["multigrid", *factors, incomplete, "gamg", "block-jacobi"]
+    return ["block-jacobi", *factors, *LAST[:-1]] if newton else [incomplete, *factors, *LAST]
 
 
 def _factorisations(ranks: int) -> list[str]:
@@ -156,7 +145,7 @@ def _factorisations(ranks: int) -> list[str]:
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE_OF_ILU)
+        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE)
     return math.inf
 
 
