@@ -64,6 +64,8 @@ def _reaches_out(name: str, value: Any) -> bool:
         return False
     if _SHOWS.fullmatch(name):
         return not _SCREEN.fullmatch(value)
+    if name == "pc_type" and value == "python":
+        return False  # the program's own multigrid, as nothing else can be named
     return not _PLAIN.fullmatch(value) or (name.endswith("type") and value in ("python", "shell"))
 
 
@@ -84,7 +86,8 @@ PETSC_BLOCK: dict[str, Any] = {
     "patternProperties": {
         _SHOWING: _or_no_text(rf"^{_SCREEN.pattern}$"),
         rf"^(?!{_SHOWING[1:]})": _or_no_text(rf"^{_PLAIN.pattern}$"),
-        "[tT][yY][pP][eE]$": {"not": {"enum": ["python", "shell"]}},
+        "[tT][yY][pP][eE]$": {"not": {"const": "shell"}},
+        "^(?![pP][cC]_[tT][yY][pP][eE]$).*[tT][yY][pP][eE]$": {"not": {"const": "python"}},
     },
 }
 """The same in words of JSON Schema."""

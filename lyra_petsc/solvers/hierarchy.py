@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-COARSEST = 300
+COARSEST = 100
 """Vertices, over all ranks, at which a factorisation takes over."""
 
 WORTH = 0.7
