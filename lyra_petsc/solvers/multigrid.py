@@ -74,7 +74,7 @@ class Multigrid:
             context.attach(self.hierarchy)
             self._cycle = context
             # at the end of a program that destroys nothing PETSc would call Python when that is gone
-            weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
+            self._detach = weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
 
     def _follow(self, values: NDArray[np.float64]) -> None:
         self.hierarchy.set(values, self._held())
@@ -83,6 +83,8 @@ class Multigrid:
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""
-        if self._cycle is not None:
+        if isinstance(self._cycle, PetscCycle):
             self._cycle.destroy()
+        elif self._cycle is not None:
+            self._detach()
         self.hierarchy.destroy()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.errors import InputError
 from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.solvers import sweeps
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
@@ -32,7 +33,7 @@ class Smoother:
 
     def __init__(self, level: Level) -> None:
         pattern, points = level.pattern, level.points
-        self._level, self._points = level, points
+        self._level, self.points = level, points
         n = points.n_owned
         self._rows = pattern.indptr, pattern.columns, n
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
@@ -60,8 +61,8 @@ class Smoother:
     def before(self, coarse: Floats) -> None:
         """Sweep from zero; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective."""
         sweeps.backward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
-        if self._points.comm.size > 1:
-            self._points.update_ghosts(self.x)
+        if self.points.comm.size > 1:
+            self.points.update_ghosts(self.x)
             sweeps.subtract_ghosts(*self._rows, self._blocks, self.x, self.r)
         sweeps.restrict(*self._parents, self._free, self.r, coarse)
         self._coarse.add_to_owners(coarse)
@@ -70,7 +71,7 @@ class Smoother:
         """Add what the coarser level found, and sweep; collective."""
         self._coarse.update_ghosts(coarse)
         sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
-        self._points.update_ghosts(self.x)
+        self.points.update_ghosts(self.x)
         sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
 
 
@@ -78,7 +79,7 @@ class Coarsest:
     """The last level, solved by a KSP of its own (``-mg_coarse_``)."""
 
     def __init__(self, level: Level) -> None:
-        self._level = level
+        self._level, self.points = level, level.points
         self.matrix = SystemMatrix(level.points, level.pattern, "aij", given=False)
         self.x, self.b = (np.zeros((level.points.n_local, 3), dtype=np.float32) for _ in range(2))
         self._solution, self._rhs = self.matrix.mat.createVecs()
@@ -106,7 +107,7 @@ class Coarsest:
 
 
 class VCycle:
-    """What PETSc's PC of type python calls; ``levels`` are given to it afterwards."""
+    """What PETSc's PC of type python makes and calls; its levels are given to it by ``attach``."""
 
     def __init__(self) -> None:
         self._smoothers: list[Smoother] = []
@@ -124,6 +125,12 @@ class VCycle:
             smoother.set()
         self._coarsest.set()
 
+    def setUp(self, pc: PETSc.PC) -> None:
+        """Refuse to be a part of another preconditioner, which has no levels to give."""
+        if self._coarsest is None:
+            prefix = pc.getOptionsPrefix() or ""
+            raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
+
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one V cycle on b; collective."""
         assert self._coarsest is not None
@@ -139,10 +146,10 @@ class VCycle:
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
-        sizes = [level._points.n_global for level in self._smoothers]
-        viewer.printfASCII(f"  V cycle on {len(sizes) + 1} levels, vertices: {sizes}\n")
+        sizes = [level.points.n_global for level in (*self._smoothers, self._coarsest) if level is not None]
+        viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices\n")
 
-    def destroy(self, pc: PETSc.PC | None = None) -> None:
+    def destroy(self, pc: PETSc.PC) -> None:
         """Free the PETSc objects; collective."""
         if self._coarsest is not None:
             self._coarsest.destroy()

@@ -50,7 +50,7 @@ OPTIONS = {
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
     "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
-    "pc_mg_levels": "Most levels of multigrid (`-pc_type python` or `mg`), on coarse meshes of the program's.",
+    "pc_mg_levels": "Most levels of multigrid (`-pc_type python`, `mg`), on coarse meshes of the program's.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
     "mat_type": "Storage of the matrix: `aij`, `baij`, `sbaij`; by default as the preconditioner needs.",
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "

@@ -106,6 +106,22 @@ def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Co
     np.testing.assert_array_equal(values, points.global_number[:, None] + [0.0, 0.25, 0.5])
 
 
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_owners_get_the_sum_of_what_ranks_have(comm: MPI.Comm, part: Part, kind: type) -> None:
+    points = part.points
+    values = np.ones((points.n_local, 3), dtype=kind)
+    values[:, 1] = comm.rank
+    points.add_to_owners(values)
+    everywhere = comm.allgather((points.global_number, comm.rank))
+    seen, ranks = np.zeros(points.n_global), np.zeros(points.n_global)
+    for numbers, rank in everywhere:
+        seen[numbers] += 1
+        ranks[numbers] += rank
+    own = points.global_number[: points.n_owned]
+    np.testing.assert_array_equal(values[: points.n_owned, 0], seen[own])
+    np.testing.assert_array_equal(values[: points.n_owned, 1], ranks[own])
+
+
 def test_a_large_mesh_is_cut_evenly_with_few_ghosts(comm: MPI.Comm) -> None:
     mesh = square(40, 40)
     part = distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)

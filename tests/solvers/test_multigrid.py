@@ -10,8 +10,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import gathered
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.simulation import Simulation
+from lyra_petsc.solvers.presets import PYTHON_TYPE
 
 pytestmark = pytest.mark.parallel
 
@@ -137,6 +139,21 @@ def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
     direct, _ = stepped(comm, hanging(8), 2, "cholesky")
     assert max(counts) > 20
     assert np.abs(x - direct).max() < 1e-6
+
+
+def test_as_a_part_of_another_preconditioner_it_is_refused(comm: MPI.Comm) -> None:
+    with pytest.raises(InputError, match="main preconditioner only") as caught:
+        stepped(comm, hanging(8), 1, "bjacobi", sub_pc_type="python", sub_pc_python_type=PYTHON_TYPE)
+    assert caught.value.key == "-sub_pc_python_type"
+
+
+def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
+    _, counts = stepped(comm, hanging(50), 3, "python")
+    alone = comm.Split(comm.rank, 0)
+    _, serial = stepped(alone, hanging(50), 3, "python")
+    alone.Free()
+    # but for sweeps, which see the values of other ranks later
+    assert max(counts) <= max(serial) + 2
 
 
 class Scaling:
