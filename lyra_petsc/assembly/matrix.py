@@ -33,6 +33,8 @@ class SystemMatrix:
     mat : PETSc.Mat
     followers : list of callables
         Are given the block rows (n_blocks, 3, 3) of the pattern whenever they change.
+    read : bool
+        Whether PETSc reads the entries; if not, only the followers get new ones.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, kind: str, *, given: bool = True) -> None:
@@ -52,6 +54,7 @@ class SystemMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
         self.followers: list[Callable[[NDArray[np.float64]], None]] = []
+        self.read = True
         self._storage: Storage | None = None
         if self.kind in KINDS and PETSc.ScalarType == np.float64:
             with suppress(AttributeError, OSError):
@@ -67,6 +70,8 @@ class SystemMatrix:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
         for follower in self.followers:
             follower(values)
+        if self.mat.assembled and not self.read:
+            return
         if self._storage is not None and self.mat.assembled:
             self._storage.write(values)
         else:

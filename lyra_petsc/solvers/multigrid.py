@@ -56,7 +56,7 @@ class Multigrid:
         surface: Surface,
         held: Callable[[], Mask],
     ) -> None:
-        self._held = held
+        self._held, self._matrix = held, matrix
         ours = kind_asked_for() == PETSc.PC.Type.PYTHON
         least = 1 if ours else 2
         most = max(least, PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS))
@@ -66,9 +66,13 @@ class Multigrid:
             self._cycle = PetscCycle(ksp.getPC(), self.hierarchy)
         matrix.followers.append(self._follow)
 
-    def after_options(self, ksp: PETSc.KSP) -> None:
-        """Give our cycle, which PETSc makes when it reads the options, its levels; collective."""
+    def after_options(self, ksp: PETSc.KSP, *, alone: bool) -> None:
+        """Give our cycle, which PETSc makes when it reads the options, its levels; collective.
+
+        ``alone`` says that the matrix is the preconditioner's only, not the operator too.
+        """
         if self._cycle is None:
+            self._matrix.read = not alone
             pc = ksp.getPC()
             context: VCycle = pc.getPythonContext()
             context.attach(self.hierarchy)

@@ -183,7 +183,7 @@ class Stepper:
         except PETSc.Error as error:
             raise refused(error) from None
         if self._multigrid is not None:
-            self._multigrid.after_options(ksp)
+            self._multigrid.after_options(ksp, alone=self.preconditioner is not self.matrix)
         if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
