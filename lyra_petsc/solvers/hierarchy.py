@@ -41,7 +41,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class Interpolation:
+class InterpolationRows:
     """A rank's rows of the interpolation from a coarser level.
 
     Attributes
@@ -71,7 +71,7 @@ class Level:
     values : (n_blocks, 3, 3)
     free : (n_owned, 3)
         0 for coordinates that take no part in interpolation, 1 for others.
-    interpolation : Interpolation or None
+    interpolation : InterpolationRows or None
     galerkin : Galerkin or None
         Makes the next coarser level's block rows.
     """
@@ -80,7 +80,7 @@ class Level:
         self.points, self.pattern = points, pattern
         self.values: Array = np.zeros((0, 3, 3))
         self.free: Array = np.ones((points.n_owned, 3))
-        self.interpolation: Interpolation | None = None
+        self.interpolation: InterpolationRows | None = None
         self.galerkin: Galerkin | None = None
 
 
@@ -128,24 +128,24 @@ class Hierarchy:
         self.levels = []
 
 
-def _interpolations(points: Points, surface: Surface, most: int) -> list[Interpolation]:
+def _interpolations(points: Points, surface: Surface, most: int) -> list[InterpolationRows]:
     """This rank's rows of all of them, finest first."""
     comm, n = points.comm, points.n_owned
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     mine = surface.x[:n], points.global_number[surface.triangles[first_owned]]
     parts = comm.gather(mine)
-    shares: list[list[Interpolation]] = []
+    shares: list[list[InterpolationRows]] = []
     if parts is not None:
         x, triangles = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
         del parts
         shares = _shares(x, triangles, points.bounds, most)
-    share: list[Interpolation] = comm.scatter(shares)
+    share: list[InterpolationRows] = comm.scatter(shares)
     return share
 
 
-def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[Interpolation]]:
+def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[InterpolationRows]]:
     """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers."""
-    shares: list[list[Interpolation]] = [[] for _ in bounds[1:]]
+    shares: list[list[InterpolationRows]] = [[] for _ in bounds[1:]]
     levels = 1
     while levels < most and (len(x) > COARSEST or levels == 1):
         coarse = coarsen(x, triangles)
@@ -155,7 +155,9 @@ def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[Int
         for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
             start = coarse.start[lo : hi + 1]
             rows = slice(start[0], start[-1])
-            share.append(Interpolation(below, start - start[0], coarse.parents[rows], coarse.weights[rows]))
+            share.append(
+                InterpolationRows(below, start - start[0], coarse.parents[rows], coarse.weights[rows])
+            )
         x, triangles, bounds = x[coarse.vertices], coarse.triangles, below
         levels += 1
     return shares
