@@ -71,6 +71,7 @@ class SystemMatrix:
         for follower in self.followers:
             follower(values)
         if self.mat.assembled and not self.read:
+            self.mat.stateIncrease()
             return
         if self._storage is not None and self.mat.assembled:
             self._storage.write(values)

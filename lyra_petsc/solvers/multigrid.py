@@ -61,6 +61,7 @@ class Multigrid:
         least = 1 if ours else 2
         most = max(least, PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS))
         self.hierarchy = Hierarchy(points, pattern, surface, most)
+        self._values: NDArray[np.float64] | None = None
         self._cycle: VCycle | PetscCycle | None = None
         if not ours:
             self._cycle = PetscCycle(ksp.getPC(), self.hierarchy)
@@ -75,15 +76,21 @@ class Multigrid:
             self._matrix.read = not alone
             pc = ksp.getPC()
             context: VCycle = pc.getPythonContext()
-            context.attach(self.hierarchy)
+            context.attach(self.hierarchy, self._renew)
             self._cycle = context
             # at the end of a program that destroys nothing PETSc would call Python when that is gone
             self._detach = weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
 
     def _follow(self, values: NDArray[np.float64]) -> None:
-        self.hierarchy.set(values, self._held())
-        assert self._cycle is not None
-        self._cycle.update()
+        self._values = values
+        if isinstance(self._cycle, PetscCycle):  # ours asks for them when PETSc sets it up
+            self._renew()
+            self._cycle.update()
+
+    def _renew(self) -> None:
+        """Make the coarse block rows of the matrix as it is now; collective."""
+        assert self._values is not None
+        self.hierarchy.set(self._values, self._held())
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""

@@ -7,6 +7,8 @@ on the same levels, with a choice of smoothers, is ``pcmg``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -112,24 +114,29 @@ class VCycle:
     def __init__(self) -> None:
         self._smoothers: list[Smoother] = []
         self._coarsest: Coarsest | None = None
+        self._renew: Callable[[], None] | None = None
 
-    def attach(self, hierarchy: Hierarchy) -> None:
-        """Work on these levels; collective."""
+    def attach(self, hierarchy: Hierarchy, renew: Callable[[], None]) -> None:
+        """Work on these levels, which ``renew`` brings up to date; collective."""
         self._smoothers = [Smoother(level) for level in hierarchy.levels[:-1]]
         self._coarsest = Coarsest(hierarchy.levels[-1])
+        self._renew = renew
 
-    def update(self) -> None:
-        """Take the levels' new block rows; collective."""
-        assert self._coarsest is not None
+    def setUp(self, pc: PETSc.PC) -> None:
+        """Take the levels' new block rows, when the matrix has changed; collective.
+
+        Raises
+        ------
+        InputError
+            As a part of another preconditioner, which has no levels to give.
+        """
+        if self._coarsest is None or self._renew is None:
+            prefix = pc.getOptionsPrefix() or ""
+            raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
+        self._renew()
         for smoother in self._smoothers:
             smoother.set()
         self._coarsest.set()
-
-    def setUp(self, pc: PETSc.PC) -> None:
-        """Refuse to be a part of another preconditioner, which has no levels to give."""
-        if self._coarsest is None:
-            prefix = pc.getOptionsPrefix() or ""
-            raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one V cycle on b; collective."""
@@ -153,4 +160,4 @@ class VCycle:
         """Free the PETSc objects; collective."""
         if self._coarsest is not None:
             self._coarsest.destroy()
-        self._smoothers, self._coarsest = [], None
+        self._smoothers, self._coarsest, self._renew = [], None, None
