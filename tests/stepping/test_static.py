@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -152,7 +153,8 @@ NOWHERE: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "blown around a corner": (
         {"handles": [{"nodes": [0]}], "loads": [{"pressure": 10.0}]},
-        "proximal steps came no nearer",
+        # rounding decides which of its limits is reached first
+        "proximal steps came no nearer|did not converge within its iterations",
     ),
 }
 
@@ -167,6 +169,6 @@ def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> N
             simulation.step()
         assert simulation.failure is not None
         tried = simulation.failure.tried
-        assert words in tried[-1].words
+        assert re.search(words, tried[-1].words)
         assert sum(each.newton_iterations for each in tried) < 2500  # it took 36,780
         assert np.array_equal(shape(simulation), start)
