@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys, index_type, union
+from lyra_petsc.assembly.pattern import BlockPattern, begins, diagonal_keys, index_type, union
 from lyra_petsc.assembly.shared_blocks import SharedBlocks
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.distribute import local_numbers
@@ -203,8 +203,7 @@ class Galerkin:
         self._fine = pattern
         keys, target = self._products(local_numbers(everyone, near, first, end), n, width)
         one, other = np.divmod(keys, max(width, 1))
-        inside = other < n
-        inside &= one < n
+        inside = (one < n) & (other < n)
         mixed = ~inside
         symmetric = one < width
         number = np.concatenate([np.arange(first, end), near])
@@ -233,13 +232,13 @@ class Galerkin:
 
     def _products(self, parents: Ints, n_coarse: int, width: int) -> tuple[Ints, Ints]:
         """All keys, ascending, and which of them each product adds to; ~ of it if transposed."""
-        fine, n = self._fine, len(self._fine.indptr) - 1
+        fine, n = self._fine, self._fine.n_owned
         rows = fine.indptr, fine.columns, self._start, parents
         n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         _counts(*rows, width, n_slots, n_keys)
         self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
         self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
-        firsts = np.concatenate([[0], np.cumsum(n_slots)])
+        firsts = begins(n_slots)
         chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
 
         def made(lo: int, hi: int) -> Ints:
@@ -281,7 +280,7 @@ def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> 
     counts[: points.n_owned, 0] = np.diff(start)
     points.update_ghosts(counts)
     number = counts[:, 0].astype(np.int64)
-    everywhere = np.concatenate([[0], np.cumsum(number)])
+    everywhere = begins(number)
     all_parents, all_weights = np.empty(everywhere[-1], dtype=np.int64), np.empty(everywhere[-1])
     all_parents[: len(parents)], all_weights[: len(weights)] = parents, weights
     row = np.zeros((points.n_local, 3))

@@ -62,8 +62,7 @@ class BlockPattern:
         self.n_owned = n_owned
         rows, columns = np.divmod(keys, max(n_local, 1))
         self.columns: NDArray[np.int32] = columns.astype(np.int32)
-        self.indptr: Ints = np.zeros(n_owned + 1, dtype=np.int64)
-        np.cumsum(np.bincount(rows, minlength=n_owned), out=self.indptr[1:])
+        self.indptr: Ints = begins(np.bincount(rows, minlength=n_owned))
 
     @property
     def n_blocks(self) -> int:
@@ -73,6 +72,11 @@ class BlockPattern:
     def n_couplings(self) -> int:
         """Blocks of the whole rows, both of those that are each other's transpose."""
         return self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_owned
+
+
+def begins(counts: NDArray[Any]) -> Ints:
+    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
 def diagonal_keys(n_owned: int, n_local: int) -> Ints:

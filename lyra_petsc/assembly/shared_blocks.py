@@ -22,9 +22,9 @@ def _pack(blocks, source, how, out):  # type: ignore[no-untyped-def]
         for i in range(3):
             for j in range(3):
                 straight, turned = blocks[source[k], 3 * i + j], blocks[source[k], 3 * j + i]
-                if how[k] == 0:
+                if how[k] == STRAIGHT:
                     out[k, 3 * i + j] = straight
-                elif how[k] == 1:
+                elif how[k] == TURNED:
                     out[k, 3 * i + j] = turned
                 else:
                     out[k, 3 * i + j] = straight + turned

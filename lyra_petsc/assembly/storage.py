@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.assembly.pattern import BlockPattern, index_type
+from lyra_petsc.assembly.pattern import BlockPattern, begins, index_type
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.points import Points
 
@@ -150,11 +149,6 @@ def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
     """How many blocks (n_blocks,) of each row are flagged."""
     counts: Ints = np.diff(begins(flags)[indptr])
     return counts
-
-
-def begins(counts: NDArray[Any]) -> Ints:
-    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
-    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
 
 
 class Storage:

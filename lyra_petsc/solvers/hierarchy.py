@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,17 +108,18 @@ class Hierarchy:
             level.interpolation = interpolation
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
             level.galerkin = Galerkin(level.points, level.pattern, *rows)
-            level = Level(level.galerkin.points, level.galerkin.pattern)
+            made = level.galerkin
+            level = Level(made.points, made.pattern)
+            level.values, level.free = made.values, made.free
             self.levels.append(level)
 
     def set(self, values: Array, held: Mask) -> None:
         """New block rows of the finest level; ``held`` (n_local, 3) are the prescribed coordinates."""
         finest = self.levels[0]
         finest.values, finest.free = values, np.where(held[: finest.points.n_owned], 0.0, 1.0)
-        for level, coarser in pairwise(self.levels):
-            assert level.galerkin is not None
-            level.galerkin.project(level.values, level.free)
-            coarser.values, coarser.free = level.galerkin.values, level.galerkin.free
+        for level in self.levels:
+            if level.galerkin is not None:
+                level.galerkin.project(level.values, level.free)
 
     def destroy(self) -> None:
         """Free the communication objects of the coarse levels; collective."""

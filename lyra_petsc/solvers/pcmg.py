@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.assembly.pattern import begins
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 from lyra_petsc.solvers.options import is_set
 
@@ -28,7 +29,7 @@ class Interpolation:
         self._order, self._row = order, row
         parents = 3 * rows.parents
         self._columns = np.concatenate([parents, parents + 1, parents + 2])[order].astype(PETSc.IntType)
-        self._indptr = np.concatenate([[0], np.cumsum(np.repeat(counts, 3))]).astype(PETSc.IntType)
+        self._indptr = begins(np.repeat(counts, 3)).astype(PETSc.IntType)
         sizes = (3 * fine.n_owned, 3 * fine.n_global), (3 * points.n_owned, 3 * points.n_global)
         own = (rows.parents >= points.start) & (rows.parents < points.start + points.n_owned)
         inside = np.bincount(row[own], minlength=fine.n_owned)
