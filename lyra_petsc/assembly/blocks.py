@@ -60,22 +60,22 @@ def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
     for row in range(n):
         first = indptr[row]
         d, y0, y1, y2 = values[first], x[row, 0], x[row, 1], x[row, 2]
-        s0 = d[0, 0] * y0 + d[0, 1] * y1 + d[0, 2] * y2
-        s1 = d[1, 0] * y0 + d[1, 1] * y1 + d[1, 2] * y2
-        s2 = d[2, 0] * y0 + d[2, 1] * y1 + d[2, 2] * y2
+        s0 = d[0, 0] * y0 + d[1, 0] * y1 + d[2, 0] * y2
+        s1 = d[0, 1] * y0 + d[1, 1] * y1 + d[2, 1] * y2
+        s2 = d[0, 2] * y0 + d[1, 2] * y1 + d[2, 2] * y2
         for k in range(first + 1, indptr[row + 1]):
             c, v = columns[k], values[k]
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
             v00, v01, v02 = v[0, 0], v[0, 1], v[0, 2]
             v10, v11, v12 = v[1, 0], v[1, 1], v[1, 2]
             v20, v21, v22 = v[2, 0], v[2, 1], v[2, 2]
-            s0 += v00 * x0 + v01 * x1 + v02 * x2
-            s1 += v10 * x0 + v11 * x1 + v12 * x2
-            s2 += v20 * x0 + v21 * x1 + v22 * x2
+            s0 += v00 * x0 + v10 * x1 + v20 * x2
+            s1 += v01 * x0 + v11 * x1 + v21 * x2
+            s2 += v02 * x0 + v12 * x1 + v22 * x2
             if c < n:
-                out[c, 0] += v00 * y0 + v10 * y1 + v20 * y2
-                out[c, 1] += v01 * y0 + v11 * y1 + v21 * y2
-                out[c, 2] += v02 * y0 + v12 * y1 + v22 * y2
+                out[c, 0] += v00 * y0 + v01 * y1 + v02 * y2
+                out[c, 1] += v10 * y0 + v11 * y1 + v12 * y2
+                out[c, 2] += v20 * y0 + v21 * y1 + v22 * y2
         out[row, 0] += s0
         out[row, 1] += s1
         out[row, 2] += s2
@@ -92,7 +92,7 @@ def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyp
             size = max(abs(values[k, 0, 0]), abs(values[k, 1, 1]), abs(values[k, 2, 2]))
             for i in range(3):
                 for j in range(3):
-                    if mask[row, i] or mask[c, j]:
+                    if mask[c, i] or mask[row, j]:
                         values[k, i, j] = size if row == c and i == j else 0.0
 
 
@@ -102,7 +102,7 @@ class BlockRows:
     Attributes
     ----------
     values : (n_blocks, 3, 3) float64
-        In the order of ``pattern``. Every method that takes ``values`` works on such an array.
+        In the order of ``pattern``, column by column. Every method that takes ``values`` works on such an array.
     """
 
     def __init__(self, pattern: BlockPattern) -> None:
@@ -163,12 +163,15 @@ class BlockRows:
         _product(self.pattern.indptr, self.pattern.columns, values, x, out)
         return out
 
-    def rows_beside(self, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Rows with a stored block whose row or column has a prescribed coordinate; mask (n_local, 3)."""
+    def beside(self, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Blocks whose row or column has a prescribed coordinate, and before them their rows.
+
+        Numbers, ascending; mask (n_local, 3).
+        """
         held = mask.any(axis=1)
         rows = np.repeat(np.arange(self.pattern.n_owned), np.diff(self.pattern.indptr))
-        beside: NDArray[np.int64] = np.unique(rows[held[self.pattern.columns] | held[rows]])
-        return beside
+        blocks = np.flatnonzero(held[self.pattern.columns] | held[rows])
+        return np.unique(rows[blocks]), blocks
 
     def constrain(self, values: Array, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> None:
         """Decouple prescribed coordinates, with a positive diagonal of the size of their neighbours.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -27,6 +28,8 @@ class SystemMatrix:
         PETSc matrix type where ``-mat_type`` says nothing (``baij``, ``aij``, ``sbaij``).
     given : bool
         Whether ``-mat_type`` and other options count.
+    beside : SystemMatrix
+        May share its ``rows`` with this one.
 
     Attributes
     ----------
@@ -35,9 +38,20 @@ class SystemMatrix:
         Are given the block rows (n_blocks, 3, 3) of the pattern whenever they change.
     read : bool
         Whether PETSc reads the entries; if not, only the followers get new ones.
+    rows : (n_blocks, 3, 3) float64
+        Where to put new block rows together for ``set``: PETSc's own array if that has the same layout. As
+        long as the matrix lives.
     """
 
-    def __init__(self, points: Points, pattern: BlockPattern, kind: str, *, given: bool = True) -> None:
+    def __init__(
+        self,
+        points: Points,
+        pattern: BlockPattern,
+        kind: str,
+        *,
+        given: bool = True,
+        beside: SystemMatrix | None = None,
+    ) -> None:
         comm, rows = points.comm, 3 * points.n_owned
         self.mat = PETSc.Mat().create(comm)
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
@@ -49,34 +63,45 @@ class SystemMatrix:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
-        self._rows = StoredRows(points, pattern, self.kind)
+        self._stored = StoredRows(points, pattern, self.kind)
         self._preallocate(comm)
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        # all rows are owned ones, and a block's values stand column by column
+        for option, value in (("SYMMETRIC", True), ("NO_OFF_PROC_ENTRIES", True), ("ROW_ORIENTED", False)):
+            self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
         self.mat.setUp()
         self.followers: list[Callable[[NDArray[np.float64]], None]] = []
         self.read = True
         self._storage: Storage | None = None
+        # zeros that nobody touches take no memory
+        self._stored.insert(np.zeros((pattern.n_blocks, 3, 3)), self.mat)
         if self.kind in KINDS and PETSc.ScalarType == np.float64:
             with suppress(AttributeError, OSError):
-                self._storage = Storage(self.mat, self.kind, pattern, self._rows)
+                self._storage = Storage(self.mat, self.kind, pattern, self._stored)
+        self._shape, self._beside = (pattern.n_blocks, 3, 3), beside
 
     def _preallocate(self, comm: MPI.Comm) -> None:
-        inside, outside = self._rows.inside, self._rows.outside
+        inside, outside = self._stored.inside, self._stored.outside
         if self.kind == "aij":
             inside, outside = np.repeat(3 * inside, 3), np.repeat(3 * outside, 3)
         self.mat.setPreallocationNNZ((inside, outside) if comm.size > 1 else inside)
+
+    @cached_property
+    def rows(self) -> NDArray[np.float64]:
+        shared = self._storage.shared if self._storage is not None else None
+        if shared is not None:
+            return shared
+        return np.zeros(self._shape) if self._beside is None else self._beside.rows
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
         for follower in self.followers:
             follower(values)
-        if self.mat.assembled and not self.read:
+        if not self.read:
             self.mat.stateIncrease()
-            return
-        if self._storage is not None and self.mat.assembled:
+        elif self._storage is not None:
             self._storage.write(values)
         else:
-            self._rows.insert(values, self.mat)
+            self._stored.insert(values, self.mat)
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

@@ -20,7 +20,8 @@ LARGEST_INT32 = 2**31 - 1
 class BlockPattern:
     """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
 
-    A row holds the columns from its own on: the upper triangle among owned points, and all ghosts.
+    A row holds the columns from its own on: the upper triangle among owned points, and all ghosts. Values of
+    a block stand column by column, as PETSc keeps them.
 
     Parameters
     ----------
@@ -37,7 +38,8 @@ class BlockPattern:
         Local column of each block, ascending within a row.
     offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
         Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
-        index of the block, plus 1 where that is of coupling (b, a); −1 where other ranks have both rows.
+        index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
+        both rows.
     """
 
     def __init__(self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int) -> None:
@@ -113,6 +115,6 @@ def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int)
     out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
     for pair, (a, b) in enumerate(pairs):
         one, other = stencil[:, a], stencil[:, b]
-        found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one > other)
+        found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one < other)
         out[:, pair] = np.where(np.minimum(one, other) < n_owned, found, -1)
     return out

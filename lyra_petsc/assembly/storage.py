@@ -28,7 +28,7 @@ PORTIONS = 16
 
 @cached(inline="always")
 def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
-    """Rows of a block ``across`` apart, columns ``along``."""
+    """Rows of a block as it is stored ``across`` apart, columns ``along``."""
     for i in range(3):
         for j in range(3):
             out[at + across * i + along * j] = block[i, j]
@@ -40,14 +40,14 @@ def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: i
     n, p, q = len(indptr) - 1, 0, 0
     for row in range(n):
         for t in range(begin[row], begin[row + 1]):
-            _put(values[below[t]], inside, p, 3, 1)
+            _put(values[below[t]], inside, p, 1, 3)
             p += 9
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                _put(values[k], inside, p, 1, 3)
+                _put(values[k], inside, p, 3, 1)
                 p += 9
             else:
-                _put(values[k], outside, q, 1, 3)
+                _put(values[k], outside, q, 3, 1)
                 q += 9
 
 
@@ -64,19 +64,31 @@ def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ig
                 beyond += 3
         at = p
         for t in range(begin[row], begin[row + 1]):
-            _put(values[below[t]], inside, at, 1, width)
+            _put(values[below[t]], inside, at, width, 1)
             at += 3
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                _put(values[k], inside, at, width, 1)
+                _put(values[k], inside, at, 1, width)
                 at += 3
         at = q
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] >= n:
-                _put(values[k], outside, at, beyond, 1)
+                _put(values[k], outside, at, 1, beyond)
                 at += 3
         p += 3 * width
         q += 3 * beyond
+
+
+@cached()
+def _to_sbaij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+    """Blocks of owned columns as they are; those of ghosts are another's business."""
+    n, p = len(indptr) - 1, 0
+    for row in range(n):
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] >= n:
+                break
+            _put(values[k], inside, p, 3, 1)
+            p += 9
 
 
 @cached()
@@ -134,10 +146,19 @@ class StoredRows:
         edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
         for lo, hi in itertools.pairwise(edges):
             part = self.below[lo:hi]
-            rows = np.searchsorted(indptr, part, side="right") - 1
+            rows = np.searchsorted(self._pattern.indptr, part, side="right") - 1
             # all rows, most of them empty: petsc4py takes no others
             _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
         mat.assemble()
+
+    def insert_outside(self, values: Array, mat: PETSc.Mat) -> None:
+        """Set the entries in columns of ghosts by ``MatSetValues``; not assembled after it."""
+        rows = np.flatnonzero(self.outside)
+        columns = np.flatnonzero(self._kept & (self._pattern.columns >= self._points.n_owned))
+        numbers = self._points.global_number[self._pattern.columns[columns]].astype(PETSc.IntType)
+        indptr = begins(self.outside[rows]).astype(PETSc.IntType)
+        owned = (self._points.start + rows).astype(PETSc.IntType)
+        mat.setValuesBlockedIJV(indptr, numbers, values[columns], PETSc.InsertMode.INSERT, rowmap=owned)
 
 
 def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
@@ -157,11 +178,16 @@ class Storage:
     Parameters
     ----------
     mat : PETSc.Mat
-        With the entries of the pattern and no others; assembled when it is written to.
+        With the entries of the pattern and no others; assembled.
     kind : str
-        A key of ``KINDS``; on several ranks not ``sbaij``, which hides its second array.
+        A key of ``KINDS``.
     pattern : BlockPattern
     stored : StoredRows
+
+    Attributes
+    ----------
+    shared : (n_blocks, 3, 3) or None
+        PETSc's array, where that is block rows as the pattern has them; as long as the matrix lives.
 
     Raises
     ------
@@ -173,27 +199,46 @@ class Storage:
         library, name = ctypes.CDLL(PETSc.__file__), KINDS[kind]
         self._get = getattr(library, f"MatSeq{name}GetArray")
         self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
-        self._several = mat.getComm().size > 1
-        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if self._several else None
-        self._fill = _to_aij if kind == "aij" else _to_baij
-        self._mat, self._rows = mat, (pattern.indptr, pattern.columns, stored.begin, stored.below)
+        self._mat, self._stored = mat, stored
+        self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
         self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
+        self._half, several = kind == "sbaij", mat.getComm().size > 1
+        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if several and not self._half else None
+        self._fill = {"aij": _to_aij, "baij": _to_baij, "sbaij": _to_sbaij}[kind]
+        self.shared: Array | None = None
+        if self._half and not several:
+            part = ctypes.c_void_p(mat.handle)
+            self.shared = self._array(part, self._sizes[0]).reshape(-1, 3, 3)
+            self._give_back(part, ctypes.byref(ctypes.c_void_p()))
+
+    def _array(self, part: ctypes.c_void_p, size: int) -> Array:
+        pointer = ctypes.POINTER(ctypes.c_double)()
+        self._get(part, ctypes.byref(pointer))
+        return np.ctypeslib.as_array(pointer, (size,)) if size else np.empty(0)
 
     def write(self, values: Array) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+        if self.shared is None:
+            self._copy(values)
+        elif values is not self.shared:
+            self.shared[:] = values
+        self._mat.assemble()
+
+    def _copy(self, values: Array) -> None:
         whole = ctypes.c_void_p(self._mat.handle)
         parts = [whole]
+        diagonal = None
         if self._split is not None:
             inside, outside, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
             self._split(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
             parts = [inside, outside]
-        pointers = [ctypes.POINTER(ctypes.c_double)() for _ in parts]
-        arrays = [np.empty(0), np.empty(0)]  # on one rank there is no outside
-        for number, (part, pointer) in enumerate(zip(parts, pointers, strict=True)):
-            self._get(part, ctypes.byref(pointer))
-            if self._sizes[number]:
-                arrays[number] = np.ctypeslib.as_array(pointer, (self._sizes[number],))
-        self._fill(*self._rows, values, *arrays)
-        for part, pointer in zip(parts, pointers, strict=True):
-            self._give_back(part, ctypes.byref(pointer))
-        self._mat.assemble()
+        elif self._half:  # PETSc does not tell where the other part is
+            diagonal = self._mat.getDiagonalBlock()
+            parts = [ctypes.c_void_p(diagonal.handle)]
+        arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]
+        self._fill(*self._rows, values, *arrays, *[np.empty(0)] * (2 - len(arrays)))
+        for part in parts:
+            self._give_back(part, ctypes.byref(ctypes.c_void_p()))
+        if diagonal is not None:
+            self._stored.insert_outside(values, self._mat)
+            diagonal.destroy()

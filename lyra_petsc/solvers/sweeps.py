@@ -60,18 +60,18 @@ def backward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignor
                 hi = Index(k)
                 break
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            s0 -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
-            s1 -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
-            s2 -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+            s0 -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
+            s1 -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
+            s2 -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
         y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
         y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
         y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         for k in range(lo, hi):
             c = Index(columns[k])
-            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 3] * y1 + blocks[k, 6] * y2
-            r[c, 1] -= blocks[k, 1] * y0 + blocks[k, 4] * y1 + blocks[k, 7] * y2
-            r[c, 2] -= blocks[k, 2] * y0 + blocks[k, 5] * y1 + blocks[k, 8] * y2
+            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 1] * y1 + blocks[k, 2] * y2
+            r[c, 1] -= blocks[k, 3] * y0 + blocks[k, 4] * y1 + blocks[k, 5] * y2
+            r[c, 2] -= blocks[k, 6] * y0 + blocks[k, 7] * y1 + blocks[k, 8] * y2
 
 
 @cached(fastmath=True)
@@ -83,9 +83,9 @@ def subtract_ghosts(indptr, columns, n_owned, blocks, x, r):  # type: ignore[no-
             if c < Index(n_owned):
                 break
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            r[row, 0] -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
-            r[row, 1] -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
-            r[row, 2] -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+            r[row, 0] -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
+            r[row, 1] -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
+            r[row, 2] -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
 
 
 @cached(fastmath=True)
@@ -99,9 +99,9 @@ def forward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore
         for k in range(lo, hi):
             c = Index(columns[k])
             x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            s0 -= blocks[k, 0] * x0 + blocks[k, 1] * x1 + blocks[k, 2] * x2
-            s1 -= blocks[k, 3] * x0 + blocks[k, 4] * x1 + blocks[k, 5] * x2
-            s2 -= blocks[k, 6] * x0 + blocks[k, 7] * x1 + blocks[k, 8] * x2
+            s0 -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
+            s1 -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
+            s2 -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
         y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
         y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
         y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
@@ -110,9 +110,9 @@ def forward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore
             c = Index(columns[k])
             if c >= Index(n_owned):
                 break
-            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 3] * y1 + blocks[k, 6] * y2
-            r[c, 1] -= blocks[k, 1] * y0 + blocks[k, 4] * y1 + blocks[k, 7] * y2
-            r[c, 2] -= blocks[k, 2] * y0 + blocks[k, 5] * y1 + blocks[k, 8] * y2
+            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 1] * y1 + blocks[k, 2] * y2
+            r[c, 1] -= blocks[k, 3] * y0 + blocks[k, 4] * y1 + blocks[k, 5] * y2
+            r[c, 2] -= blocks[k, 6] * y0 + blocks[k, 7] * y1 + blocks[k, 8] * y2
 
 
 @cached(fastmath=True)

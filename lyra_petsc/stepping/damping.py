@@ -16,6 +16,33 @@ from lyra_petsc.terms.term import Elastic
 Array = NDArray[np.float64]
 
 
+class Multiple:
+    """Block rows that are factor · D + diagonal · I, but for some rows, which are kept as they would be.
+
+    Parameters
+    ----------
+    values : (n_blocks, 3, 3)
+    factor : float
+    diagonal : (n_owned,)
+    changing : (n,) int
+        Blocks that will be others afterwards.
+    """
+
+    def __init__(self, values: Array, factor: float, diagonal: Array, changing: NDArray[np.int64]) -> None:
+        self._values, self._factor, self._diagonal = values, factor, diagonal
+        self._changing, self._kept = changing, values[changing]
+
+    def product(self, blocks: BlockRows, v: Array) -> Array:
+        """D v (n_owned, 3) of v (n_local, 3)."""
+        now = self._values[self._changing]
+        self._values[self._changing] = self._kept
+        out = blocks.product(self._values, v)
+        self._values[self._changing] = now
+        out -= self._diagonal[:, None] * v[: len(out)]
+        out /= self._factor
+        return out
+
+
 class Damping:
     """D of the owned rows, from the regularised Hessians K⁺ of the damped terms.
 
@@ -27,6 +54,8 @@ class Damping:
         All of the scene; those without damping are passed over.
     moves : bool
         Nothing is damped where time does not pass.
+    once : bool
+        A step's matrix is put together once, and stays until the step's end.
 
     Attributes
     ----------
@@ -36,11 +65,15 @@ class Damping:
         D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3).
     """
 
-    def __init__(self, points: Points, blocks: BlockRows, elastic: Sequence[Elastic], *, moves: bool) -> None:
-        self._points, self._blocks = points, blocks
+    def __init__(
+        self, points: Points, blocks: BlockRows, elastic: Sequence[Elastic], *, moves: bool, once: bool
+    ) -> None:
+        self._points, self._blocks, self._once = points, blocks, once
         self._terms = [t for t in elastic if moves and t.damped and np.any(t.elements.data["damping"])]
         self.acts = bool(points.comm.allreduce(len(self._terms), MPI.MAX))
-        self._values = blocks.zeros() if self.acts else None
+        self._values: Array | None = None
+        self._stored = False
+        self._multiple: Multiple | None = None
         self._at: Array | None = None
         # residual, objective and works ask at the same velocities
         self.product = Remembered(self._product)
@@ -50,30 +83,54 @@ class Damping:
 
     def freeze(self, x: Array) -> None:
         """Take the geometry of positions x (n_local, 3)."""
-        assert self._values is not None
-        self._values[:] = 0.0
-        self._at = x.copy()
+        self.let_go()
+        self._at, self._stored = x.copy(), False
         self.product.forget()
-        for term in self._terms:
-            self._blocks.add_stiffness(term, x, 1.0, term.elements.data["damping"], self._values)
+
+    def let_go(self) -> None:
+        """Work no longer with the rows that ``with_stiffness_into`` was given."""
+        self._multiple = None
+
+    def _own(self) -> Array:
+        """D, stored from here on until the geometry is another."""
+        if self._values is None:
+            self._values = self._blocks.zeros()
+        if not self._stored and self._at is not None:
+            self._values[:] = 0.0
+            for term in self._terms:
+                self._blocks.add_stiffness(term, self._at, 1.0, term.elements.data["damping"], self._values)
+            self._stored = True
+        return self._values
 
     def _product(self, v: Array) -> Array:
-        assert self._values is not None
         if not v.any():  # as where a semi-implicit step looks at its forces
             return np.zeros((self._points.n_owned, 3))
-        return self._blocks.product(self._values, v)
+        if self._multiple is not None:
+            return self._multiple.product(self._blocks, v)
+        return self._blocks.product(self._own(), v)
 
     def into(self, values: Array) -> None:
         """Let ``values`` (n_blocks, 3, 3) be D."""
-        values[:] = 0.0 if self._values is None else self._values
+        values[:] = self._own() if self.acts else 0.0
 
-    def with_stiffness_into(self, x: Array, weight: float, diagonal: Array, values: Array) -> bool:
+    def with_stiffness_into(
+        self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
+    ) -> bool:
         """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
 
-        It is where all elements have one γ, and D was frozen at x: half the assembly of a semi-implicit step.
-        Else False.
+        It is where all elements have one γ, and D was frozen at x: half the assembly of a semi-implicit step,
+        and D need not be stored beside it. Else False. The caller may change the blocks ``changing`` (n,)
+        afterwards.
         """
-        if self._values is None or not self._gamma or self._at is None or not np.array_equal(x, self._at):
+        if not self._gamma or self._at is None or not np.array_equal(x, self._at):
             return False
-        self._blocks.scale(self._values, 1.0 + weight / self._gamma, diagonal, values)
+        factor = 1.0 + weight / self._gamma
+        if self._once and not self._stored:
+            values[:] = 0.0
+            for term in self._terms:
+                self._blocks.add_stiffness(term, x, 1.0, self._gamma + weight, values)
+            self._blocks.add_diagonal(diagonal, values)
+            self._multiple = Multiple(values, factor, diagonal, changing)
+        else:
+            self._blocks.scale(self._own(), factor, diagonal, values)
         return True

@@ -116,8 +116,7 @@ class Newton:
         if self._iterates:
             self._system.new_iterate(v)
             self.forcing.before_solve(self.norm)
-        values = self._system.jacobian(v, self._blend.after(self._taken(u)))
-        self._matrix.set(values)
+        self._set(self._matrix, v, self._blend.after(self._taken(u)))
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         separate = self._preconditioner is not self._matrix
         self._kept = separate and self._fell
@@ -126,9 +125,13 @@ class Newton:
         )
         if self._same:
             # as long as it is positive definite there is no better preconditioner
-            self._preconditioner.set(values)
+            self._preconditioner.set(self._matrix.rows)
         elif separate and not self._kept:
-            self._preconditioner.set(self._system.jacobian(v, 1.0))
+            self._set(self._preconditioner, v, 1.0)
+
+    def _set(self, matrix: SystemMatrix, v: Array, blend: float) -> None:
+        self._system.jacobian(v, blend, matrix.rows)
+        matrix.set(matrix.rows)
 
     def remember(self, u: PETSc.Vec) -> None:
         """Note energy and residual of the present iterate, against which trial points are judged."""
@@ -180,10 +183,10 @@ class Newton:
     def _assemble_again(self, u: PETSc.Vec) -> None:
         v = u.getArray(readonly=True).reshape(self._shape)
         if self._kept or self._same:
-            self._preconditioner.set(self._system.jacobian(v, 1.0))
+            self._set(self._preconditioner, v, 1.0)
             self._kept = self._same = False
         else:
-            self._matrix.set(self._system.jacobian(v, self._blend.value))
+            self._set(self._matrix, v, self._blend.value)
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

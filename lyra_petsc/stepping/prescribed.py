@@ -24,6 +24,8 @@ class Prescribed:
         The others.
     rows : (n,) int
         Block rows that couple to prescribed coordinates.
+    blocks : (n,) int
+        The blocks in them.
     goal : (n_owned, 3)
         Positions [m] at the end of the step; those of free coordinates at its start. Empty without handles.
     velocity : (n_owned, 3)
@@ -36,7 +38,7 @@ class Prescribed:
         self._span = (0.0, 0.0)
         self.mask: Mask = np.zeros((points.n_local, 3), dtype=bool)
         self.free: Mask = ~self.mask[: points.n_owned]
-        self.rows = np.empty(0, dtype=np.int64)
+        self.rows = self.blocks = np.empty(0, dtype=np.int64)
         self.goal, self.velocity = (np.zeros((points.n_owned, 3)) if held else np.empty((0, 3)) for _ in "ab")
 
     def begin_step(self, t0: float, t1: float, x: Array) -> bool:
@@ -55,7 +57,7 @@ class Prescribed:
             self._points.update_ghosts(flags)
             self.mask = flags > 0.5
             self.free = ~self.mask[:n]
-            self.rows = self._blocks.rows_beside(self.mask)
+            self.rows, self.blocks = self._blocks.beside(self.mask)
         self.goal[:] = x[:n]
         self.held.targets(t0, t1, t1, self.goal)
         return changed

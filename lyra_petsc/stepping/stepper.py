@@ -124,7 +124,7 @@ class Stepper:
         self.matrix = SystemMatrix(points, self._pattern, "baij")
         self.preconditioner = self.matrix
         if self._separate():
-            self.preconditioner = SystemMatrix(points, self._pattern, "baij")
+            self.preconditioner = SystemMatrix(points, self._pattern, "baij", beside=self.matrix)
         self.velocity = PETSc.Vec().createMPI(
             (3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm
         )
@@ -219,6 +219,7 @@ class Stepper:
         database = PETSc.Options()
         for name in self._filled:
             database.delValue(name)
+        self._system.forget_rows()
         self.ts.destroy()
         self.matrix.destroy()
         if self.preconditioner is not self.matrix:

@@ -96,8 +96,7 @@ class ReducedSystem:
         still = all(type(term).prepare is Elastic.prepare for term in self._shell)
         shell = partial(self._sum, self._shell)
         self._internal = Remembered(shell) if still else shell
-        self._damping = Damping(points, blocks, elastic, moves=scheme.moves)
-        self._values = blocks.zeros()
+        self._damping = Damping(points, blocks, elastic, moves=scheme.moves, once=scheme.explicit)
         n_local, n_owned = points.n_local, points.n_owned
         self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(5))
         self._xh, self.history = self.x, self.v[:n_owned]
@@ -292,15 +291,19 @@ class ReducedSystem:
         for term in self.elastic:
             term.linearise_from(before)
 
-    def jacobian(self, v: Array, blend: float) -> Array:
-        """Block rows (n_blocks, 3, 3) of σ M + c K + D + ∇∇P, prescribed coordinates decoupled.
+    def forget_rows(self) -> None:
+        """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
+        self._damping.let_go()
+
+    def jacobian(self, v: Array, blend: float, values: Array) -> None:
+        """Let block rows (n_blocks, 3, 3) be σ M + c K + D + ∇∇P, prescribed coordinates decoupled.
 
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
         x, vs = self._evaluate_at(v)
-        values = self._values
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values):
+        beside = self._prescribed.blocks
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, beside):
             self._damping.into(values)
             for term in self.elastic:
                 self._blocks.add_stiffness(term, x, blend, reach, values)
@@ -310,7 +313,6 @@ class ReducedSystem:
                 self._blocks.add_viscosity(wind, vs, values)
         if len(self._prescribed.rows):
             self._blocks.constrain(values, self.mask, self._prescribed.rows)
-        return values
 
     def objective(self, v: Array) -> tuple[float, float]:
         """The function whose gradient F is, and what its round-off is relative to [W].

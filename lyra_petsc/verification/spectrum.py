@@ -56,7 +56,7 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     held[:n] = system.held.mask(trial.simulation.time, trial.simulation.time, n)
     points.update_ghosts(held)
     mask = held > 0.5
-    rows.constrain(values, mask, rows.rows_beside(mask))
+    rows.constrain(values, mask, rows.beside(mask)[0])
     matrix = SystemMatrix(points, model.pattern, "aij")
     matrix.set(values)
     solver = direct_solver(points.comm, matrix.mat, "verify_modes_")

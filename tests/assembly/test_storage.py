@@ -46,3 +46,25 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
         np.testing.assert_allclose(y.getArray().reshape(-1, 3), expected, rtol=0.0, atol=1e-12)
         for matrix in (once, twice):
             matrix.destroy()
+
+
+def test_rows_are_put_together_where_petsc_keeps_them() -> None:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, MPI.COMM_SELF) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        half, whole = (SystemMatrix(points, pattern, kind, given=False) for kind in ("sbaij", "baij"))
+        beside = SystemMatrix(points, pattern, "aij", given=False, beside=whole)
+        assert beside.rows is whole.rows
+        for matrix in (half, whole, beside):
+            matrix.rows[:] = symmetric(points, pattern, 0.5)
+            matrix.set(matrix.rows)
+        x, y, z = (half.mat.createVecs()[0] for _ in range(3))
+        x.setArray(np.random.default_rng(1).standard_normal(3 * points.n_owned))
+        half.mat.mult(x, y)
+        for matrix in (whole, beside):
+            matrix.mat.mult(x, z)
+            np.testing.assert_allclose(z.getArray(), y.getArray(), rtol=0.0, atol=1e-12)
+        half.rows[0] += np.eye(3)
+        half.mat.mult(x, z)
+        np.testing.assert_allclose((z - y).getArray()[:3], x.getArray()[:3], rtol=0.0, atol=1e-12)
+        for matrix in (half, whole, beside):
+            matrix.destroy()

@@ -21,7 +21,7 @@ def system() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
             if column == row:
                 block = block @ block.T + 20.0 * np.eye(3)
             columns.append(column)
-            blocks.append(block)
+            blocks.append(block.T)  # column by column
             dense[3 * row : 3 * row + 3, 3 * column : 3 * column + 3] = block
             if column < N:
                 dense[3 * column : 3 * column + 3, 3 * row : 3 * row + 3] = block.T

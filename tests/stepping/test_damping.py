@@ -27,11 +27,12 @@ def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: 
         for term in system.elastic:
             blocks.add_stiffness(term, x, 1.0, 0.3, expected)
         blocks.add_diagonal(diagonal := 1.0 + np.arange(len(system.mass)), expected)
-        if damping.with_stiffness_into(x, 0.3, diagonal, found):
+        none = np.empty(0, dtype=np.int64)
+        if damping.with_stiffness_into(x, 0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
         else:
             assert comm.size > 1  # a rank without an element of a term takes the long way
-        assert not damping.with_stiffness_into(x + 1e-9, 0.3, diagonal, found)
+        assert not damping.with_stiffness_into(x + 1e-9, 0.3, diagonal, found, none)
 
 
 def test_two_factors_are_no_multiple() -> None:
@@ -44,7 +45,8 @@ def test_two_factors_are_no_multiple() -> None:
         system = simulation.model.system
         system._damping.freeze(system.x)
         values = system._blocks.zeros()
-        assert not system._damping.with_stiffness_into(system.x, 0.3, system.mass, values)
+        none = np.empty(0, dtype=np.int64)
+        assert not system._damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
 
 
 def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> None:
@@ -58,3 +60,29 @@ def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> 
         np.testing.assert_allclose(system._damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
         system._damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]))
         assert np.abs(system._damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
+
+
+@pytest.mark.parallel
+def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None:
+    scene = {
+        "mesh": grid(0.5, 0.4, 5, 4),
+        "material": MATERIAL,
+        "gravity": [0.0, 0.0, -9.81],
+        "handles": [{"nodes": [0, 5]}, {"nodes": [20], "axes": ["z"]}],
+        "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
+    }
+    with Simulation(scene, comm) as simulation:
+        system = simulation.model.system
+        for _ in range(3):
+            simulation.step(0.01)
+        matrix = simulation.stepper.matrix.rows.copy()
+        damping, v = system._damping, np.cos(3.0 * system.x)
+        found = damping.product(v)
+        assert (damping._values is None) == (damping._multiple is not None)
+        assert damping._multiple is not None or comm.size > 1
+        assert np.array_equal(matrix, simulation.stepper.matrix.rows)  # as a lagged Jacobian needs it
+        system.forget_rows()
+        damping.product.forget()
+        expected = damping.product(v)
+        scale = comm.allreduce(float(np.abs(expected).max(initial=0.0)), MPI.MAX)
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * scale)
