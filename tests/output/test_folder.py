@@ -143,6 +143,7 @@ def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
     here("mine/notes.txt")
     with Claim(comm, choose(comm, "flag", "mine/deep/out")) as claim:
         assert claim.path.is_dir()
+        comm.Barrier()  # one rank takes it away again
     comm.Barrier()
     assert os.listdir("mine") == ["notes.txt"]
     comm.Barrier()
