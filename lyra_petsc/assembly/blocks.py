@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.product import product
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.terms.term import Elastic, Viscous
 
@@ -51,34 +52,6 @@ def _scale(indptr, source, factor, diagonal, values):  # type: ignore[no-untyped
                     values[k, i, j] = factor * source[k, i, j]
         for i in range(3):
             values[first, i, i] += diagonal[row]
-
-
-@cached()
-def _product(indptr, columns, values, x, out):  # type: ignore[no-untyped-def]
-    """out (n_owned, 3) = whole rows · x (n_local, 3); ``out`` is 0 before."""
-    n = len(indptr) - 1
-    for row in range(n):
-        first = indptr[row]
-        d, y0, y1, y2 = values[first], x[row, 0], x[row, 1], x[row, 2]
-        s0 = d[0, 0] * y0 + d[1, 0] * y1 + d[2, 0] * y2
-        s1 = d[0, 1] * y0 + d[1, 1] * y1 + d[2, 1] * y2
-        s2 = d[0, 2] * y0 + d[1, 2] * y1 + d[2, 2] * y2
-        for k in range(first + 1, indptr[row + 1]):
-            c, v = columns[k], values[k]
-            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            v00, v01, v02 = v[0, 0], v[0, 1], v[0, 2]
-            v10, v11, v12 = v[1, 0], v[1, 1], v[1, 2]
-            v20, v21, v22 = v[2, 0], v[2, 1], v[2, 2]
-            s0 += v00 * x0 + v10 * x1 + v20 * x2
-            s1 += v01 * x0 + v11 * x1 + v21 * x2
-            s2 += v02 * x0 + v12 * x1 + v22 * x2
-            if c < n:
-                out[c, 0] += v00 * y0 + v01 * y1 + v02 * y2
-                out[c, 1] += v10 * y0 + v11 * y1 + v12 * y2
-                out[c, 2] += v20 * y0 + v21 * y1 + v22 * y2
-        out[row, 0] += s0
-        out[row, 1] += s1
-        out[row, 2] += s2
 
 
 @cached()
@@ -160,7 +133,7 @@ class BlockRows:
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
         out = np.zeros((self.pattern.n_owned, 3))
-        _product(self.pattern.indptr, self.pattern.columns, values, x, out)
+        product(self.pattern.indptr, self.pattern.columns, values, x, out)
         return out
 
     def beside(self, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.product import MatMult
 from lyra_petsc.assembly.storage import KINDS, Storage, StoredRows
 from lyra_petsc.errors import InputError
 from lyra_petsc.partition.points import Points
@@ -78,6 +79,10 @@ class SystemMatrix:
             with suppress(AttributeError, OSError):
                 self._storage = Storage(self.mat, self.kind, pattern, self._stored)
         self._shape, self._beside = (pattern.n_blocks, 3, 3), beside
+        self._half = self.kind == "sbaij" and self._storage is not None
+        if self._half:
+            with suppress(AttributeError, OSError):
+                self._multiply = MatMult(self.mat, points, pattern, self.rows)
 
     def _preallocate(self, comm: MPI.Comm) -> None:
         inside, outside = self._stored.inside, self._stored.outside
@@ -90,7 +95,9 @@ class SystemMatrix:
         shared = self._storage.shared if self._storage is not None else None
         if shared is not None:
             return shared
-        return np.zeros(self._shape) if self._beside is None else self._beside.rows
+        if self._beside is None or self._half:
+            return np.zeros(self._shape)
+        return self._beside.rows
 
     def set(self, values: NDArray[np.float64]) -> None:
         """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
@@ -99,6 +106,8 @@ class SystemMatrix:
         if not self.read:
             self.mat.stateIncrease()
         elif self._storage is not None:
+            if self._half and values is not self.rows:
+                self.rows[:] = values
             self._storage.write(values)
         else:
             self._stored.insert(values, self.mat)

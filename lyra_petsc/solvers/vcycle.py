@@ -56,7 +56,7 @@ class Smoother:
         """Take the level's block rows."""
         level = self._level
         values = level.values.reshape(-1, 9)
-        self._blocks[:] = values
+        sweeps.store(level.pattern.indptr, values, self._blocks)
         sweeps.invert_diagonal(level.pattern.indptr, values, self._inverse)
         self._free[:] = level.free
 
