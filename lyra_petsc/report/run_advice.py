@@ -36,6 +36,7 @@ OPTIONS = {
     "ilu": "-pc_type ilu -pc_factor_levels 1",
     "block-ilu": "-pc_type bjacobi -sub_pc_type ilu -sub_pc_factor_levels 1",
     "multigrid": "-pc_type python",
+    "multigrid-w": "-pc_type python -pc_mg_w_from 2",
     "pcmg": "-pc_type mg",
     "gamg": "-pc_type gamg",
     "direct": "-pc_type cholesky",
@@ -105,7 +106,7 @@ def _linear(facts: Facts) -> Iterator[str]:
         return
     used = str(facts.summary.get("linear_solver", ""))
     incomplete = "ilu" if facts.summary.get("ranks", 1) == 1 else "block-ilu"
-    tries = "; ".join(OPTIONS[name] for name in (incomplete, "multigrid", "direct") if name != used)
+    tries = "; ".join(OPTIONS[name] for name in (incomplete, "multigrid", "direct") if not used.startswith(name))
     yield (
         f"A Newton iteration takes {short(mean)} linear iterations on average with '{used}'. Try, comparing "
         f"wall times: {tries}; or a looser -ksp_rtol."

@@ -59,6 +59,9 @@ PRESETS: dict[str, dict[str, Value]] = {
         "mg_coarse_pc_type": "redundant",
         "mg_coarse_redundant_pc_type": "cholesky",
     },
+    # with levels from the second coarser one on visited twice: a sixth more for a cycle, and iterations that do
+    # not grow where there are many, in size or by stiffness
+    "multigrid-w": {"pc_mg_w_from": 2},
     # the same levels with PETSc's cycle: a forward sweep before and a backward one after the coarser level
     "pcmg": {
         "mat_type": "baij",
@@ -89,6 +92,8 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
+PRESETS["multigrid-w"] = PRESETS["multigrid"] | PRESETS["multigrid-w"]
+
 FACTORISATIONS = ("direct", "cholesky")
 
 MULTIGRID_FROM = {True: 2000, False: 3000}
@@ -107,8 +112,8 @@ FACTOR_COST = 50.0, 6.5
 WORTH, PRICE = 4.0, 3.0
 """How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least, and costs."""
 
-LAST = ("multigrid", "gamg", "block-jacobi")
-"""What is left where nothing else is known to be better."""
+TWICE_FROM = 30.0
+"""Iterations of block Jacobi from which coarser levels are visited twice."""
 
 
 def candidates(
@@ -122,17 +127,19 @@ def candidates(
     if is_set("pc_type"):
         return ["user"]
     factors = _factorisations(ranks) if n_vertices <= DIRECT_UNTIL else []
+    cycle = "multigrid-w" if static or iterations > TWICE_FROM else "multigrid"
+    last = [cycle, "gamg", "block-jacobi"]  # where nothing else is known to be better
     if static:
-        return [*factors, *LAST]
+        return [*factors, *last]
     if n_vertices > DIRECT_UNTIL:
-        return list(LAST)
+        return last
     incomplete = "ilu" if ranks == 1 else "block-ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
     if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH):
-        return [*factors, *LAST]
+        return [*factors, *last]
     if not small:
-        return ["multigrid", *factors, incomplete, "gamg", "block-jacobi"]
-    return ["block-jacobi", *factors, *LAST[:-1]] if newton else [incomplete, *factors, *LAST]
+        return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
+    return ["block-jacobi", *factors, *last[:-1]] if newton else [incomplete, *factors, *last]
 
 
 def _factorisations(ranks: int) -> list[str]:

@@ -1,7 +1,8 @@
 """Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
 
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
-is symmetric. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own cycle
+is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) levels are visited twice,
+as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own cycle
 on the same levels, with a choice of smoothers, is ``pcmg``.
 """
 
@@ -60,14 +61,30 @@ class Smoother:
         sweeps.invert_diagonal(level.pattern.indptr, values, self._inverse)
         self._free[:] = level.free
 
-    def before(self, coarse: Floats) -> None:
-        """Sweep from zero; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective."""
-        sweeps.backward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
-        if self.points.comm.size > 1:
-            self.points.update_ghosts(self.x)
-            sweeps.subtract_ghosts(*self._rows, self._blocks, self.x, self.r)
+    def before(self, coarse: Floats, *, again: bool) -> None:
+        """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
+
+        From zero, or again from where ``after`` ended.
+        """
+        if again:
+            self._subtract_ghosts(np.zeros_like(self.x[self.points.n_owned :]))
+        else:
+            self.x[:] = 0.0
+            self.r[:] = self.b[: len(self.r)]
+        seen = self.x[self.points.n_owned :].copy()
+        sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
+        self._subtract_ghosts(seen)
         sweeps.restrict(*self._parents, self._free, self.r, coarse)
         self._coarse.add_to_owners(coarse)
+
+    def _subtract_ghosts(self, seen: Floats) -> None:
+        """Let the residual follow the ghosts, of which it has seen these values; collective."""
+        if self.points.comm.size > 1:
+            self.points.update_ghosts(self.x)
+            ghosts = self.x[self.points.n_owned :]
+            ghosts -= seen
+            sweeps.subtract_ghosts(*self._rows, self._blocks, self.x, self.r)
+            ghosts += seen
 
     def after(self, coarse: Floats) -> None:
         """Add what the coarser level found, and sweep; collective."""
@@ -114,6 +131,11 @@ class VCycle:
     def __init__(self) -> None:
         self._smoothers: list[Smoother] = []
         self._coarsest: Coarsest | None = None
+        self._twice_from = 0
+
+    def setFromOptions(self, pc: PETSc.PC) -> None:
+        """Read ``-pc_mg_w_from``."""
+        self._twice_from = PETSc.Options(pc.getOptionsPrefix()).getInt("pc_mg_w_from", 0)
         self._renew: Callable[[], None] | None = None
 
     def attach(self, hierarchy: Hierarchy, renew: Callable[[], None]) -> None:
@@ -139,22 +161,35 @@ class VCycle:
         self._coarsest.set()
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
-        """x = one V cycle on b; collective."""
-        assert self._coarsest is not None
-        levels: list[Smoother | Coarsest] = [*self._smoothers, self._coarsest]
-        n = b.getLocalSize() // 3
-        levels[0].b[:n] = b.getArray(readonly=True).reshape(-1, 3)
-        for smoother, coarser in zip(self._smoothers, levels[1:], strict=True):
-            smoother.before(coarser.b)
-        self._coarsest.solve()
-        for smoother, coarser in zip(self._smoothers[::-1], levels[:0:-1], strict=True):
-            smoother.after(coarser.x)
-        x.setArray(levels[0].x[:n].ravel())
+        """x = one cycle on b; collective."""
+        finest, n = self._level(0), b.getLocalSize() // 3
+        finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
+        self._visit(0)
+        x.getArray()[:] = finest.x[:n].ravel()
+
+    def _level(self, number: int) -> Smoother | Coarsest:
+        level = self._smoothers[number] if number < len(self._smoothers) else self._coarsest
+        assert level is not None
+        return level
+
+    def _visit(self, number: int, *, again: bool = False) -> None:
+        """Let x of a level be what it finds for its b, from zero or going on; collective."""
+        level, coarser = self._level(number), number + 1
+        if isinstance(level, Coarsest):
+            level.solve()
+            return
+        below = self._level(coarser)
+        level.before(below.b, again=again)
+        self._visit(coarser)
+        if 0 < self._twice_from <= coarser < len(self._smoothers):
+            self._visit(coarser, again=True)
+        level.after(below.x)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
         sizes = [level.points.n_global for level in (*self._smoothers, self._coarsest) if level is not None]
-        viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices\n")
+        again = f", twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
+        viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices{again}\n")
 
     def destroy(self, pc: PETSc.PC) -> None:
         """Free the PETSc objects; collective."""

@@ -117,7 +117,14 @@ def test_options_reach_it(options: dict[str, Any], comm: MPI.Comm) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"pc_mg_levels": 1}, {"pc_mg_levels": 2}, {"mat_type": "aij"}, {"mg_coarse_pc_type": "svd"}],
+    [
+        {"pc_mg_levels": 1},
+        {"pc_mg_levels": 2},
+        {"pc_mg_w_from": 1},
+        {"pc_mg_w_from": 9},
+        {"mat_type": "aij"},
+        {"mg_coarse_pc_type": "svd"},
+    ],
     ids=lambda options: " ".join(options),
 )
 def test_options_reach_our_cycle(options: dict[str, Any], comm: MPI.Comm) -> None:
@@ -125,6 +132,15 @@ def test_options_reach_our_cycle(options: dict[str, Any], comm: MPI.Comm) -> Non
         options = {"mg_coarse_redundant_pc_type": "svd"}
     _, counts = stepped(comm, hanging(25), 2, "python", **options)
     assert 0 < max(counts) < 20
+
+
+def test_levels_visited_twice(comm: MPI.Comm) -> None:
+    content = hanging(45)
+    content["material"] |= {"stretching_scale": 1000.0, "bending_scale": 1000.0}
+    once, counts = stepped(comm, content, 3, "python")
+    twice, fewer = stepped(comm, content, 3, "python", pc_mg_w_from=1)
+    assert max(fewer) < max(counts)
+    assert np.abs(once - twice).max() < 1e-6
 
 
 def test_our_cycle_stands_in_the_solvers_view(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:

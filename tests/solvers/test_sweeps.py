@@ -50,9 +50,10 @@ def test_a_sweep_before_and_one_after() -> None:
 
     rng = np.random.default_rng(5)
     b = rng.standard_normal((N, 3)).astype(np.float32)
-    x = np.full((N + GHOSTS, 3), 7.0, dtype=np.float32)
-    r = np.full((N, 3), 7.0, dtype=np.float32)
-    sweeps.backward(indptr, columns, N, single, inverse, b, x, r)
+    x = np.zeros((N + GHOSTS, 3), dtype=np.float32)
+    x[N:] = 7.0
+    r = b.copy()
+    sweeps.backward(indptr, columns, N, single, inverse, x, r)
     first = np.linalg.solve(triangle(dense, upper=True), b.ravel())
     np.testing.assert_allclose(x[:N].ravel(), first, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(r.ravel(), b.ravel() - owned @ first, rtol=1e-4, atol=1e-5)
@@ -70,6 +71,15 @@ def test_a_sweep_before_and_one_after() -> None:
     step = np.linalg.solve(triangle(dense, upper=False), residual)
     np.testing.assert_allclose(x[:N].ravel(), before[:N].ravel() + step, rtol=1e-4, atol=1e-5)
     assert np.array_equal(x[N:], before[N:].astype(np.float32))
+
+    # and again from there
+    before = x.astype(float)
+    residual = b.ravel() - dense @ before.ravel()
+    sweeps.subtract_ghosts(indptr, columns, N, single, x, r)
+    sweeps.backward(indptr, columns, N, single, inverse, x, r)
+    step = np.linalg.solve(triangle(dense, upper=True), residual)
+    np.testing.assert_allclose(x[:N].ravel(), before[:N].ravel() + step, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(r.ravel(), residual - owned @ step, rtol=1e-4, atol=1e-5)
 
 
 def test_singular_diagonal_blocks_are_inverted_where_they_can_be() -> None:
