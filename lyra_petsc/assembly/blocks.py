@@ -55,6 +55,15 @@ def _scale(indptr, source, factor, diagonal, values):  # type: ignore[no-untyped
 
 
 @cached()
+def _set_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
+    """values = the diagonal (n_owned,) times the identity."""
+    values[:] = 0.0
+    for row in range(len(indptr) - 1):
+        for i in range(3):
+            values[indptr[row], i, i] = diagonal[row]
+
+
+@cached()
 def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyped-def]
     """Zero the rows and columns of prescribed coordinates; their diagonal gets its block's largest size."""
     for t in range(len(touched)):
@@ -75,7 +84,7 @@ class BlockRows:
     Attributes
     ----------
     values : (n_blocks, 3, 3) float64
-        In the order of ``pattern``, column by column. Every method that takes ``values`` works on such an array.
+        In the order of ``pattern``, column by column. All methods that take ``values`` work on such an array.
     """
 
     def __init__(self, pattern: BlockPattern) -> None:
@@ -121,10 +130,9 @@ class BlockRows:
         """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
         self.add(term.name, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
 
-    def add_diagonal(self, diagonal: Array, values: Array) -> None:
-        """Add ``diagonal`` (n_owned,) times the identity to the diagonal blocks."""
-        for axis in range(3):
-            values[self.pattern.indptr[:-1], axis, axis] += diagonal
+    def set_diagonal(self, diagonal: Array, values: Array) -> None:
+        """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""
+        _set_diagonal(self.pattern.indptr, diagonal, values)
 
     def scale(self, source: Array, factor: float, diagonal: Array, values: Array) -> None:
         """Let ``values`` be factor × source + ``diagonal`` (n_owned,) times the identity."""

@@ -101,7 +101,7 @@ class MatMult:
     def _array(self, pointer: ctypes.c_void_p) -> Array:
         if pointer.value is None:  # of no rows
             return np.empty((0, 3))
-        return np.frombuffer(self._size.from_address(pointer.value)).reshape(-1, 3)
+        return np.ctypeslib.as_array(self._size.from_address(pointer.value)).reshape(-1, 3)
 
     def _product(self, x: Array, y: Array) -> None:
         if self._local is not None:

@@ -106,7 +106,9 @@ def _linear(facts: Facts) -> Iterator[str]:
         return
     used = str(facts.summary.get("linear_solver", ""))
     incomplete = "ilu" if facts.summary.get("ranks", 1) == 1 else "block-ilu"
-    tries = "; ".join(OPTIONS[name] for name in (incomplete, "multigrid", "direct") if not used.startswith(name))
+    tries = "; ".join(
+        OPTIONS[name] for name in (incomplete, "multigrid", "direct") if not used.startswith(name)
+    )
     yield (
         f"A Newton iteration takes {short(mean)} linear iterations on average with '{used}'. Try, comparing "
         f"wall times: {tries}; or a looser -ksp_rtol."

@@ -59,8 +59,8 @@ PRESETS: dict[str, dict[str, Value]] = {
         "mg_coarse_pc_type": "redundant",
         "mg_coarse_redundant_pc_type": "cholesky",
     },
-    # with levels from the second coarser one on visited twice: a sixth more for a cycle, and iterations that do
-    # not grow where there are many, in size or by stiffness
+    # with levels from the second coarser one on visited twice: a sixth more for a cycle, and iterations that
+    # do not grow where there are many, by size or stiffness
     "multigrid-w": {"pc_mg_w_from": 2},
     # the same levels with PETSc's cycle: a forward sweep before and a backward one after the coarser level
     "pcmg": {

@@ -35,17 +35,17 @@ def _flushed(value):  # type: ignore[no-untyped-def]
 @cached()
 def store(indptr, values, blocks):  # type: ignore[no-untyped-def]
     """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision, without negligible ones."""
-    least = np.inf
+    least = np.float64(np.inf)
     for row in range(Index(len(indptr) - 1)):
         k = Index(indptr[row])
         for i in (0, 4, 8):
             if 0.0 < values[k, i] < least:
                 least = values[k, i]
     least *= NEGLIGIBLE
-    for k in range(Index(len(blocks))):
+    for block in range(Index(len(blocks))):
         for i in range(Index(9)):
-            value = values[k, i]
-            blocks[k, i] = value if abs(value) > least else 0.0
+            value = values[block, i]
+            blocks[block, i] = value if abs(value) > least else 0.0
 
 
 @cached()

@@ -1,9 +1,9 @@
 """Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
 
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
-is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) levels are visited twice,
-as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own cycle
-on the same levels, with a choice of smoothers, is ``pcmg``.
+is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) each is visited twice,
+as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own
+cycle on the same levels, with a choice of smoothers, is ``pcmg``.
 """
 
 from __future__ import annotations

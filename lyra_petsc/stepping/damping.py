@@ -109,9 +109,12 @@ class Damping:
             return self._multiple.product(self._blocks, v)
         return self._blocks.product(self._own(), v)
 
-    def into(self, values: Array) -> None:
-        """Let ``values`` (n_blocks, 3, 3) be D."""
-        values[:] = self._own() if self.acts else 0.0
+    def into(self, values: Array, diagonal: Array) -> None:
+        """Let ``values`` (n_blocks, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
+        if self.acts:
+            self._blocks.scale(self._own(), 1.0, diagonal, values)
+        else:
+            self._blocks.set_diagonal(diagonal, values)
 
     def with_stiffness_into(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
@@ -126,10 +129,9 @@ class Damping:
             return False
         factor = 1.0 + weight / self._gamma
         if self._once and not self._stored:
-            values[:] = 0.0
+            self._blocks.set_diagonal(diagonal, values)
             for term in self._terms:
                 self._blocks.add_stiffness(term, x, 1.0, self._gamma + weight, values)
-            self._blocks.add_diagonal(diagonal, values)
             self._multiple = Multiple(values, factor, diagonal, changing)
         else:
             self._blocks.scale(self._own(), factor, diagonal, values)

@@ -92,9 +92,8 @@ class ReducedSystem:
         self._prescribed = Prescribed(points, held, blocks)
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
-        # moving targets change the forces at one and the same place
         still = all(type(term).prepare is Elastic.prepare for term in self._shell)
-        shell = partial(self._sum, self._shell)
+        shell = partial(self._sum, self._shell)  # moving targets change the forces at one and the same place
         self._internal = Remembered(shell) if still else shell
         self._damping = Damping(points, blocks, elastic, moves=scheme.moves, once=scheme.explicit)
         n_local, n_owned = points.n_local, points.n_owned
@@ -302,12 +301,11 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        beside = self._prescribed.blocks
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, beside):
-            self._damping.into(values)
+        given = values, self._prescribed.blocks
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, *given):
+            self._damping.into(values, inertia)
             for term in self.elastic:
                 self._blocks.add_stiffness(term, x, blend, reach, values)
-            self._blocks.add_diagonal(inertia, values)
         if not self.scheme.explicit:
             for wind in self.viscous:
                 self._blocks.add_viscosity(wind, vs, values)

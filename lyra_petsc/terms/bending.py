@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.hinge import angle, angle_slopes, point
+from lyra_petsc.terms.hinge import angle, point
 from lyra_petsc.terms.hinge_energy import (
     fading_limit,
     hinge_energy,
     hinge_gradient,
     hinge_hessian,
-    hinge_stiffness,
     hinge_weight,
 )
+from lyra_petsc.terms.hinge_rows import add_exact, add_regularised
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
@@ -78,37 +78,6 @@ def hessians(x, s, lo, hi, blend, k, rest, limit, out):  # type: ignore[no-untyp
         hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], blend, g, out[e - lo])
 
 
-@kernel(inline="always")
-def _add_outer(w, p, q, block):  # type: ignore[no-untyped-def]
-    """block += w p qᵀ."""
-    for i in range(3):
-        wp = w * p[i]
-        block[i, 0] += wp * q[0]
-        block[i, 1] += wp * q[1]
-        block[i, 2] += wp * q[2]
-
-
-@kernel()
-def add_regularised(x, s, k, limit, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight (E,) times the regularised blocks to the block rows, where ``offsets`` say."""
-    for e in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        g, square1, square2 = angle_slopes(x0, x1, x2, x3)
-        w = weight[e] * hinge_stiffness(square1, square2, k[e], limit[e, 0], limit[e, 1])
-        if w == 0.0:  # where θ itself may be no number
-            continue
-        pair = 0
-        for a in range(4):
-            for b in range(a, 4):
-                at = offsets[e, pair]
-                pair += 1
-                if at >= 0:
-                    p, q = g[a], g[b]
-                    if at & 1:
-                        p, q = q, p
-                    _add_outer(w, p, q, values[at >> 1])
-
-
 class Bending(Elastic):
     """The bending energy of all hinges.
 
@@ -155,10 +124,11 @@ class Bending(Elastic):
         hessians(x, self.stencil, lo, hi, blend, *self._constants, out)
 
     def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+        k, rest, limit = self._constants
         if blend < 1.0:
-            return False
-        k, _, limit = self._constants
-        add_regularised(x, self.stencil, k, limit, weight, offsets, values)
+            add_exact(x, self.stencil, blend, k, rest, limit, weight, offsets, values)
+        else:
+            add_regularised(x, self.stencil, k, limit, weight, offsets, values)
         return True
 
     def force_scale(self, size: float) -> Array:

@@ -87,53 +87,55 @@ def _add_turn(n, d, w, b, scale, out):  # type: ignore[no-untyped-def]
             out[i, j] += q * n[j]
 
 
+@kernel(forceinline=True)
+def triangle_turn(e, length, u, p, side):  # type: ignore[no-untyped-def]
+    """Of one triangle of a hinge: its unit normal n, and ω_c, ∇b_c and ∂ω_c/∂x_d of its three corners.
+
+    With barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the normal turns by −Σ ∇b_d (n · δx_d), so that
+    ∂²θ/∂x_c∂x_d = n (∂ω_c/∂x_d)ᵀ − ω_c ∇b_d nᵀ, with all but n in the triangle's plane. The edge e = x1 − x0
+    has the direction u, p goes from x0 to the opposite corner, on the first or second side (0, 1).
+    """
+    m = cross(e, p) if side == 0 else cross(p, e)
+    double = math.sqrt(dot(m, m))
+    n = m[0] / double, m[1] / double, m[2] / double
+    height, foot = double / length, dot(p, u)
+    # up: the direction of the height, from the edge to the opposite corner
+    up = _combined(1.0 / height, p, -foot / height, u)
+    part = foot / length
+    # how the height changes along up with x0 and x1; with the opposite corner by 1
+    dh0, dh1 = part - 1.0, -part
+    r = height / length
+    # ω = (1/h − f/(L h), f/(L h), −1/h) of x0, x1, opposite; ∂f/∂x0 = −u − r·up, ∂x1: r·up, opposite: u
+    w1 = part / height
+    w0, w2 = 1.0 / height - w1, -1.0 / height
+    k, inverse = 1.0 / (length * height), 1.0 / height
+    # ∂ω1 = ∂f/(L h) − ω1 ∂L/L − ω1 ∂h/h
+    d10 = _combined(w1 / length - k, u, -k * r - w1 * inverse * dh0, up)
+    d11 = _combined(-w1 / length, u, k * r - w1 * inverse * dh1, up)
+    d12 = _combined(k, u, -w1 * inverse, up)
+    # ∂ω2 = ∂h/h², ∂ω0 = −∂ω2 − ∂ω1
+    square = inverse * inverse
+    d20 = _combined(0.0, u, square * dh0, up)
+    d21 = _combined(0.0, u, square * dh1, up)
+    d22 = _combined(0.0, u, square, up)
+    d00, d01 = _combined(-1.0, d20, -1.0, d10), _combined(-1.0, d21, -1.0, d11)
+    d02 = _combined(-1.0, d22, -1.0, d12)
+    b0 = _combined(-1.0 / length, u, inverse * dh0, up)
+    b1 = _combined(1.0 / length, u, inverse * dh1, up)
+    b2 = _combined(0.0, u, inverse, up)
+    return n, (w0, w1, w2), (b0, b1, b2), ((d00, d01, d02), (d10, d11, d12), (d20, d21, d22))
+
+
 @kernel()
 def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-def]
-    """Add scale times the Hessian of θ [1/m²] to out (4, 4, 3, 3): [a, b, i, j] = ∂²θ / ∂x_a,i ∂x_b,j.
-
-    Of each triangle with unit normal n, barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the normal turns by
-    −Σ ∇b_d (n · δx_d), so that ∂²θ/∂x_c∂x_d = n (∂ω_c/∂x_d)ᵀ − ω_c ∇b_d nᵀ, with all but n in its plane.
-    """
+    """Add scale times the Hessian of θ [1/m²] to out (4, 4, 3, 3): [a, b, i, j] = ∂²θ / ∂x_a,i ∂x_b,j."""
     e = minus(x1, x0)
     length = math.sqrt(dot(e, e))
     u = e[0] / length, e[1] / length, e[2] / length
     for side in range(2):
         p = minus(x2, x0) if side == 0 else minus(x3, x0)
-        m = cross(e, p) if side == 0 else cross(p, e)
-        double = math.sqrt(dot(m, m))
-        n = m[0] / double, m[1] / double, m[2] / double
-        height, foot = double / length, dot(p, u)
-        # up: the direction of the height, from the edge to the opposite corner
-        up = _combined(1.0 / height, p, -foot / height, u)
-        part = foot / length
-        # how the height changes along up with x0 and x1; with the opposite corner by 1
-        dh0, dh1 = part - 1.0, -part
-        r = height / length
-        # ω = (1/h − f/(L h), f/(L h), −1/h) of x0, x1, opposite; ∂f/∂x0 = −u − r·up, ∂x1: r·up, opposite: u
-        w1 = part / height
-        w0, w2 = 1.0 / height - w1, -1.0 / height
-        k, inverse = 1.0 / (length * height), 1.0 / height
-        # ∂ω1 = ∂f/(L h) − ω1 ∂L/L − ω1 ∂h/h
-        d10 = _combined(w1 / length - k, u, -k * r - w1 * inverse * dh0, up)
-        d11 = _combined(-w1 / length, u, k * r - w1 * inverse * dh1, up)
-        d12 = _combined(k, u, -w1 * inverse, up)
-        # ∂ω2 = ∂h/h², ∂ω0 = −∂ω2 − ∂ω1
-        square = inverse * inverse
-        d20 = _combined(0.0, u, square * dh0, up)
-        d21 = _combined(0.0, u, square * dh1, up)
-        d22 = _combined(0.0, u, square, up)
-        d00, d01 = _combined(-1.0, d20, -1.0, d10), _combined(-1.0, d21, -1.0, d11)
-        d02 = _combined(-1.0, d22, -1.0, d12)
-        b0 = _combined(-1.0 / length, u, inverse * dh0, up)
-        b1 = _combined(1.0 / length, u, inverse * dh1, up)
-        b2 = _combined(0.0, u, inverse, up)
-        o = 2 + side
-        _add_turn(n, d00, w0, b0, scale, out[0, 0])
-        _add_turn(n, d01, w0, b1, scale, out[0, 1])
-        _add_turn(n, d02, w0, b2, scale, out[0, o])
-        _add_turn(n, d10, w1, b0, scale, out[1, 0])
-        _add_turn(n, d11, w1, b1, scale, out[1, 1])
-        _add_turn(n, d12, w1, b2, scale, out[1, o])
-        _add_turn(n, d20, w2, b0, scale, out[o, 0])
-        _add_turn(n, d21, w2, b1, scale, out[o, 1])
-        _add_turn(n, d22, w2, b2, scale, out[o, o])
+        n, w, b, d = triangle_turn(e, length, u, p, side)
+        for c in range(3):
+            for f in range(3):
+                row, column = c if c < 2 else 2 + side, f if f < 2 else 2 + side
+                _add_turn(n, d[c][f], w[c], b[f], scale, out[row, column])

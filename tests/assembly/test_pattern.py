@@ -67,8 +67,11 @@ def test_sums_of_element_blocks(monkeypatch: pytest.MonkeyPatch, largest: int) -
     product = np.einsum("rcij,cj->ri", expected[:N_OWNED], x)
     np.testing.assert_allclose(rows.product(values, x), product)
 
-    rows.add_diagonal(diagonal := rng.random(N_OWNED), values)
-    np.testing.assert_allclose(rows.product(values, x), product + diagonal[:, None] * x[:N_OWNED])
+    rows.scale(values, 2.0, diagonal := rng.random(N_OWNED), sums := np.ones_like(values))
+    of_diagonal = diagonal[:, None] * x[:N_OWNED]
+    np.testing.assert_allclose(rows.product(sums, x), 2.0 * product + of_diagonal)
+    rows.set_diagonal(diagonal, sums)
+    np.testing.assert_array_equal(rows.product(sums, x), of_diagonal)
 
 
 def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:

@@ -38,7 +38,8 @@ def test_the_first_fits_the_problem(vertices: int, ranks: int, more: dict[str, f
     assert chosen[0] == first
     assert len(set(chosen)) == len(chosen) > 1
     assert set(chosen) <= set(PRESETS)
-    assert {"multigrid", "multigrid-w", "gamg", "block-jacobi"} & set(chosen)  # what holds a matrix of any size
+    # what holds a matrix of any size
+    assert {"multigrid", "multigrid-w", "gamg", "block-jacobi"} & set(chosen)
 
 
 def test_iterations_are_limited_only_before_a_factorisation() -> None:

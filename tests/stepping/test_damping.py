@@ -23,10 +23,9 @@ def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: 
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
         damping.freeze(x)
         expected, found = blocks.zeros(), blocks.zeros()
-        damping.into(expected)
+        damping.into(expected, diagonal := 1.0 + np.arange(len(system.mass)))
         for term in system.elastic:
             blocks.add_stiffness(term, x, 1.0, 0.3, expected)
-        blocks.add_diagonal(diagonal := 1.0 + np.arange(len(system.mass)), expected)
         none = np.empty(0, dtype=np.int64)
         if damping.with_stiffness_into(x, 0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
