@@ -23,6 +23,7 @@ from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refus
 from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
+from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.guess import first_guess
 from lyra_petsc.stepping.newton import Newton
@@ -112,6 +113,7 @@ class Stepper:
         self._filled: list[str] = []
         self._linear_failed = False
         self._shape = (system.points.n_owned, 3)
+        self._extrapolation = Extrapolation(system.points.comm)
         self._create()
 
     # -- objects -------------------------------------------------------------------------------------
@@ -332,10 +334,11 @@ class Stepper:
         guess = u.getArray().reshape(self._shape)
         first_guess(self._system, guess)
         if not self._iterates:
-            # the linear solve sets out from the last velocities; its tolerance stays relative to the whole
-            last = self._system.v[: len(guess)].copy()
-            self._system.prescribe(last)
-            snes.getSolutionUpdate().setArray((guess - last).ravel())
+            # the linear solve sets out from there; its tolerance stays relative to the whole
+            system = self._system
+            ahead = self._extrapolation.to(system.t1, system.t0, system.v[: len(guess)])
+            system.prescribe(ahead)
+            snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat

@@ -1,0 +1,57 @@
+"""Where the linear solve of a semi-implicit step sets out: a polynomial in time through the last velocities."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MOST = 2
+"""Degree of the polynomial; the third gained no more, and each is an array to keep."""
+
+
+def weights(times: list[float], at: float) -> list[float]:
+    """Of the values at ``times`` (n,), of the polynomial of degree n − 1 through them at another time."""
+    return [
+        float(np.prod([(at - other) / (own - other) for other in times if other != own])) for own in times
+    ]
+
+
+class Extrapolation:
+    """Extrapolates by the degree that would have been the best for the step before; collective.
+
+    After a jump that is the constant, the last velocity itself.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    """
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self._comm = comm
+        self._times: list[float] = []
+        self._values: list[Array] = []
+        self._degree = 0
+
+    def to(self, t1: float, t0: float, v: Array) -> Array:
+        """Velocities (n, 3) [m/s] to expect at t1 [s], of ``v`` at t0."""
+        if not self._times or t0 > self._times[-1]:  # else the step is repeated
+            self._learn(t0, v)
+        return self._expected(t1, min(self._degree, len(self._times) - 1))
+
+    def _learn(self, t0: float, v: Array) -> None:
+        degrees = range(len(self._times))
+        if degrees:
+            errors = [float(np.sum((v - self._expected(t0, degree)) ** 2)) for degree in degrees]
+            self._degree = int(np.argmin(self._comm.allreduce(np.array(errors))))
+        self._times = [*self._times[-MOST:], t0]
+        self._values = [*self._values[-MOST:], v.copy()]
+
+    def _expected(self, t1: float, degree: int) -> Array:
+        times, values = self._times[-degree - 1 :], self._values[-degree - 1 :]
+        return sum(
+            (weight * value for weight, value in zip(weights(times, t1), values, strict=True)),
+            start=np.zeros_like(values[0]),
+        )

@@ -1,0 +1,80 @@
+"""Velocities expected from the steps before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import Simulation, grid
+
+from lyra_petsc.stepping.extrapolation import Extrapolation, weights
+
+TIMES = [0.0, 0.1, 0.25, 0.3, 0.42, 0.5]  # unequal steps, as before a state is written
+
+SHAPE = np.arange(1.0, 13.0).reshape(4, 3)
+
+
+def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
+    """What is expected for the last time, once the steps before are known."""
+    guess = np.empty(0)
+    extrapolation = Extrapolation(comm)
+    for t0, t1 in zip(TIMES, TIMES[1:], strict=False):
+        guess = extrapolation.to(t1, t0, motion(t0) * SHAPE)
+    return guess
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("motion", [lambda t: 3.0, lambda t: 2.0 - t, lambda t: 1.0 + t - 4.0 * t * t])
+def test_polynomials_are_gone_on_with(motion: Callable[[float], float], comm: MPI.Comm) -> None:
+    np.testing.assert_allclose(expected(comm, motion), motion(TIMES[-1]) * SHAPE, rtol=1e-12)
+
+
+@pytest.mark.parallel
+def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
+    extrapolation, sign = Extrapolation(comm), 1.0
+    for step in range(6):
+        v = sign * SHAPE
+        guess = extrapolation.to(step + 1.0, float(step), v)
+        sign = -sign
+    np.testing.assert_allclose(guess, v)
+
+
+def test_a_repeated_step_is_no_new_one() -> None:
+    extrapolation = Extrapolation(MPI.COMM_SELF)
+    extrapolation.to(1.0, 0.0, 1.0 * SHAPE)
+    extrapolation.to(2.0, 1.0, 2.0 * SHAPE)
+    extrapolation.to(3.0, 2.0, 3.0 * SHAPE)
+    for _ in range(2):
+        np.testing.assert_allclose(extrapolation.to(2.5, 2.0, 3.0 * SHAPE), 3.5 * SHAPE)
+
+
+def test_weights_are_one_at_their_own_time() -> None:
+    assert weights([0.0, 1.0, 3.0], 1.0) == [0.0, 1.0, 0.0]
+    assert sum(weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
+
+
+@pytest.mark.parallel
+def test_a_falling_sheet_takes_fewer_linear_iterations(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = {
+        "mesh": grid(1.0, 1.0, 12, 12),
+        "material": {"cloth": "gray-interlock", "damping": 0.03},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"nodes": [156, 168]}],
+        "time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"},
+        "petsc": {"pc_type": "pbjacobi"},
+    }
+
+    def iterations() -> tuple[int, np.ndarray]:
+        with Simulation(scene, comm) as simulation:
+            count = sum(simulation.step(0.005).linear_iterations for _ in range(40))
+            return count, simulation.x
+
+    fewer, x = iterations()
+    monkeypatch.setattr("lyra_petsc.stepping.extrapolation.MOST", 0)
+    more, same = iterations()
+    assert fewer < 0.9 * more
+    np.testing.assert_allclose(x, same, rtol=0.0, atol=1e-6)
