@@ -1,4 +1,4 @@
-"""Where the linear solve of a semi-implicit step sets out: on a polynomial in time through past velocities."""
+"""Where the linear solve of a semi-implicit step sets out: a polynomial in time through past velocities."""
 
 from __future__ import annotations
 
