@@ -22,6 +22,9 @@ CHUNK_ROWS = 1 << 13
 
 CHUNK_PRODUCTS = 1 << 20
 
+FAR = 255
+"""In place of an offset that does not fit into a byte, or of a block elsewhere than in the coarse rows."""
+
 
 @cached()
 def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type: ignore[no-untyped-def]
@@ -82,14 +85,16 @@ def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignor
 
 
 @cached(fastmath=True)
-def _project(indptr, columns, start, weights, slots, most, target, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
+def _project(indptr, columns, start, parents, weights, slots, most, first, offset, far, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add what fine rows give to the coarse ones (C, 9); diagonal blocks are half what they are to be.
 
+    The products of a row and of a parent go, one after the other, to the block ``offset`` behind the ``first``
+    one of the lesser coarse point's row, or, where that is FAR, to the next of ``far``, ~ of it if transposed.
     Rows and columns of coordinates that are not free are decoupled: only their diagonal must not count.
     Unsigned indices, and no views: numba looks at the sign of others, which takes four times as long.
     """
-    sums = np.empty((most, 9))
-    s = q = 0
+    sums, met = np.empty((most, 9)), np.empty(most, np.int64)
+    s = q = f = 0
     for row in range(len(indptr) - 1):
         m = 0
         for k in range(Index(indptr[row]), Index(indptr[row + 1])):
@@ -105,6 +110,7 @@ def _project(indptr, columns, start, weights, slots, most, target, values, free,
                 w, t = half * weights[p], Index(slots[s])
                 s += 1
                 if t == Index(m):
+                    met[m] = parents[p]
                     m += 1
                     sums[t, 0], sums[t, 1], sums[t, 2] = w * b0, w * b1, w * b2
                     sums[t, 3], sums[t, 4], sums[t, 5] = w * b3, w * b4, w * b5
@@ -120,9 +126,15 @@ def _project(indptr, columns, start, weights, slots, most, target, values, free,
                     sums[t, 7] += w * b7
                     sums[t, 8] += w * b8
         for p in range(start[row], start[row + 1]):
-            w = weights[p]
+            w, a = weights[p], parents[p]
             for u in range(Index(m)):
-                k = target[q]
+                if offset[q] == FAR:
+                    k = far[f]
+                    f += 1
+                elif a <= met[u]:
+                    k = first[a] + offset[q]
+                else:
+                    k = ~(first[met[u]] + offset[q])
                 q += 1
                 b0, b1, b2 = w * sums[u, 0], w * sums[u, 1], w * sums[u, 2]
                 b3, b4, b5 = w * sums[u, 3], w * sums[u, 4], w * sums[u, 5]
@@ -201,7 +213,8 @@ class Galerkin:
         near = np.unique(everyone[(everyone < first) | (everyone >= end)])
         n, width = end - first, end - first + len(near)
         self._fine = pattern
-        keys, target = self._products(local_numbers(everyone, near, first, end), n, width)
+        self._parents = local_numbers(everyone, near, first, end).astype(np.int32)
+        keys, target = self._products(width)
         one, other = np.divmod(keys, max(width, 1))
         inside = (one < n) & (other < n)
         mixed = ~inside
@@ -221,19 +234,32 @@ class Galerkin:
         place = np.empty(len(keys), dtype=np.int64)
         place[inside] = np.searchsorted(final, own)
         place[mixed] = len(final) + np.arange(len(pairs))
-        for lo in range(0, len(target), CHUNK_PRODUCTS):
-            part = target[lo : lo + CHUNK_PRODUCTS]
-            found = place[np.where(part < 0, ~part, part)]
-            part[:] = np.where(part < 0, ~found, found)
-        self._target = target
+        self._offset, self._far = self._where(target, place)
         self._sums = np.zeros((len(final) + len(pairs), 9))
         self.values = self._sums[: len(final)].reshape(-1, 3, 3)
         self.free = np.ones((n, 3))
 
-    def _products(self, parents: Ints, n_coarse: int, width: int) -> tuple[Ints, Ints]:
+    def _where(self, target: Ints, place: Ints) -> tuple[NDArray[np.uint8], Ints]:
+        """Where products go that add to these keys, whose blocks stand at ``place``."""
+        counts = np.diff(self.pattern.indptr)
+        behind = np.arange(self.pattern.n_blocks) - np.repeat(self.pattern.indptr[:-1], counts)
+        short = np.full(len(place), FAR, dtype=np.uint8)
+        inside = place < len(behind)
+        short[inside] = np.minimum(behind[place[inside]], FAR)
+        offset, far = np.empty(len(target), dtype=np.uint8), [np.empty(0, dtype=np.int64)]
+        for lo in range(0, len(target), CHUNK_PRODUCTS):
+            part = target[lo : lo + CHUNK_PRODUCTS]
+            key = np.where(part < 0, ~part, part)
+            offset[lo : lo + len(part)] = short[key]
+            beyond = short[key] == FAR
+            at = place[key[beyond]]
+            far.append(np.where(part[beyond] < 0, ~at, at))
+        return offset, np.concatenate(far)
+
+    def _products(self, width: int) -> tuple[Ints, Ints]:
         """All keys, ascending, and which of them each product adds to; ~ of it if transposed."""
         fine, n = self._fine, self._fine.n_owned
-        rows = fine.indptr, fine.columns, self._start, parents
+        rows = fine.indptr, fine.columns, self._start, self._parents
         n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
         _counts(*rows, width, n_slots, n_keys)
         self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
@@ -267,8 +293,9 @@ class Galerkin:
         """
         fine, n = self._fine, self.pattern.n_blocks
         self._sums[:] = 0.0
-        rows = fine.indptr, fine.columns, self._start, self._weights
-        _project(*rows, self._slots, self._most, self._target, values.reshape(-1, 9), free, self._sums)
+        rows = fine.indptr, fine.columns, self._start, self._parents, self._weights
+        into = self.pattern.indptr, self._offset, self._far
+        _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, self._sums)
         _finish_diagonal(self.pattern.indptr, self._sums)
         self._shared.add(self._sums[n:], self._sums[:n])
         _fill_diagonal(self.pattern.indptr, self._sums, self.free)
@@ -276,6 +303,8 @@ class Galerkin:
 
 def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:
     """Parents and weights of all local points, and where those of each begin; collective."""
+    if points.comm.size == 1:
+        return parents, weights, start
     counts = np.zeros((points.n_local, 3))
     counts[: points.n_owned, 0] = np.diff(start)
     points.update_ghosts(counts)
