@@ -88,8 +88,9 @@ def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignor
 def _project(indptr, columns, start, parents, weights, slots, most, first, offset, far, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
     """Add what fine rows give to the coarse ones (C, 9); diagonal blocks are half what they are to be.
 
-    The products of a row and of a parent go, one after the other, to the block ``offset`` behind the ``first``
-    one of the lesser coarse point's row, or, where that is FAR, to the next of ``far``, ~ of it if transposed.
+    The products of a row and of a parent go, one after the other, to the block ``offset`` behind the
+    ``first`` one of the lesser coarse point's row; where that is FAR, to the next of ``far``, ~ of it if
+    transposed.
     Rows and columns of coordinates that are not free are decoupled: only their diagonal must not count.
     Unsigned indices, and no views: numba looks at the sign of others, which takes four times as long.
     """

@@ -135,7 +135,7 @@ def test_options_reach_our_cycle(options: dict[str, Any], comm: MPI.Comm) -> Non
 
 
 def test_levels_visited_twice(comm: MPI.Comm) -> None:
-    content = hanging(45)
+    content = hanging(75)
     content["material"] |= {"stretching_scale": 1000.0, "bending_scale": 1000.0}
     once, counts = stepped(comm, content, 3, "python")
     twice, fewer = stepped(comm, content, 3, "python", pc_mg_w_from=1)
