@@ -80,10 +80,15 @@ class MatMult:
         self._local = np.zeros((points.n_local, 3)) if points.comm.size > 1 else None
         self._operations = 2.0 * 9.0 * pattern.n_couplings
         self._callback = _Operation(self._mult)
+        self._handle, usual = int(mat.handle), ctypes.c_void_p()
+        library.MatGetOperation(ctypes.c_void_p(mat.handle), MATOP_MULT, ctypes.byref(usual))
+        self._usual = ctypes.cast(usual, _Operation)
         library.MatSetOperation(ctypes.c_void_p(mat.handle), MATOP_MULT, self._callback)
 
     def _mult(self, mat: int, x: int, y: int) -> int:
         """y = A x; collective. Its result is PETSc's error code."""
+        if mat != self._handle:  # a copy, which has taken this operation along but has its own values
+            return int(self._usual(mat, x, y))
         source, target = ctypes.c_void_p(x), ctypes.c_void_p(y)
         begin, end = ctypes.c_void_p(), ctypes.c_void_p()
         try:

@@ -1,7 +1,7 @@
 """Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
 
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
-is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) each is visited twice,
+is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) three are visited twice,
 as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle; PETSc's own
 cycle on the same levels, with a choice of smoothers, is ``pcmg``.
 """
@@ -21,6 +21,9 @@ from lyra_petsc.solvers import sweeps
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 
 Floats = NDArray[np.float32]
+
+TWICE = 3
+"""Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
 
 
 class Smoother:
@@ -181,14 +184,14 @@ class VCycle:
         below = self._level(coarser)
         level.before(below.b, again=again)
         self._visit(coarser)
-        if 0 < self._twice_from <= coarser < len(self._smoothers):
+        if 0 < self._twice_from <= coarser < min(self._twice_from + TWICE, len(self._smoothers)):
             self._visit(coarser, again=True)
         level.after(below.x)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
         sizes = [level.points.n_global for level in (*self._smoothers, self._coarsest) if level is not None]
-        again = f", twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
+        again = f", {TWICE} of them twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
         viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices{again}\n")
 
     def destroy(self, pc: PETSc.PC) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -14,9 +16,7 @@ MOST = 2
 
 def weights(times: list[float], at: float) -> list[float]:
     """Of the values at ``times`` (n,), of the polynomial of degree n − 1 through them at another time."""
-    return [
-        float(np.prod([(at - other) / (own - other) for other in times if other != own])) for own in times
-    ]
+    return [math.prod((at - other) / (own - other) for other in times if other != own) for own in times]
 
 
 class Extrapolation:
@@ -44,14 +44,16 @@ class Extrapolation:
     def _learn(self, t0: float, v: Array) -> None:
         degrees = range(len(self._times))
         if degrees:
-            errors = [float(np.sum((v - self._expected(t0, degree)) ** 2)) for degree in degrees]
-            self._degree = int(np.argmin(self._comm.allreduce(np.array(errors))))
+            wrong = [(v - self._expected(t0, degree)).ravel() for degree in degrees]
+            errors = np.array([np.dot(error, error) for error in wrong])
+            self._comm.Allreduce(MPI.IN_PLACE, errors)
+            self._degree = int(errors.argmin())
         self._times = [*self._times[-MOST:], t0]
         self._values = [*self._values[-MOST:], v.copy()]
 
     def _expected(self, t1: float, degree: int) -> Array:
         times, values = self._times[-degree - 1 :], self._values[-degree - 1 :]
-        return sum(
-            (weight * value for weight, value in zip(weights(times, t1), values, strict=True)),
-            start=np.zeros_like(values[0]),
-        )
+        expected: Array = np.zeros_like(values[0])
+        for weight, value in zip(weights(times, t1), values, strict=True):
+            expected += weight * value
+        return expected

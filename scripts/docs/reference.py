@@ -51,7 +51,7 @@ OPTIONS = {
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
     "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
     "pc_python_type": "Class of `-pc_type python`; without it the program's own multigrid.",
-    "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on each is visited twice in a cycle "
+    "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on three are visited twice in a cycle "
     "(1: the next coarser than the mesh; without it none).",
     "pc_mg_levels": "Most levels of multigrid (`-pc_type python`, `mg`), on coarse meshes of the program's.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",

@@ -48,6 +48,24 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
             matrix.destroy()
 
 
+@pytest.mark.parallel
+def test_copies_of_a_matrix_multiply_by_their_own_values(comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        matrix = SystemMatrix(points, pattern, "sbaij", given=False)
+        matrix.set(symmetric(points, pattern, 0.5))
+        copy = matrix.mat.duplicate(copy=True)
+        copy.scale(3.0)
+        x, y = matrix.mat.createVecs()
+        z = y.duplicate()
+        x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
+        matrix.mat.mult(x, y)
+        copy.mult(x, z)
+        np.testing.assert_allclose(z.getArray(), 3.0 * y.getArray(), rtol=0.0, atol=1e-11)
+        for item in (matrix, copy):
+            item.destroy()
+
+
 def test_rows_are_put_together_where_petsc_keeps_them() -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, MPI.COMM_SELF) as simulation:
         points, pattern = simulation.model.points, simulation.model.pattern
