@@ -111,6 +111,7 @@ class Damping:
 
     def into(self, values: Array, diagonal: Array) -> None:
         """Let ``values`` (n_blocks, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
+        self.let_go()
         if self.acts:
             self._blocks.scale(self._own(), 1.0, diagonal, values)
         else:
@@ -125,6 +126,7 @@ class Damping:
         and D need not be stored beside it. Else False. The caller may change the blocks ``changing`` (n,)
         afterwards.
         """
+        self.let_go()
         if not self._gamma or self._at is None or not np.array_equal(x, self._at):
             return False
         factor = 1.0 + weight / self._gamma

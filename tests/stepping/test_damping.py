@@ -85,3 +85,20 @@ def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None
         expected = damping.product(v)
         scale = comm.allreduce(float(np.abs(expected).max(initial=0.0)), MPI.MAX)
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-11 * scale)
+
+
+def test_rows_that_become_another_matrix_are_let_go() -> None:
+    scene = {
+        "mesh": grid(0.5, 0.4, 5, 4),
+        "material": MATERIAL,
+        "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
+    }
+    with Simulation(scene, MPI.COMM_SELF) as simulation:
+        system = simulation.model.system
+        damping, rows, none = system._damping, system._blocks.zeros(), np.empty(0, dtype=np.int64)
+        damping.freeze(system.x)
+        assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)
+        once = damping.product(v := np.cos(3.0 * system.x))
+        damping.into(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may
+        damping.product.forget()
+        np.testing.assert_allclose(damping.product(v), once, rtol=0.0, atol=1e-12 * np.abs(once).max())
