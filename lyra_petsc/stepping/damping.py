@@ -86,6 +86,8 @@ class Damping:
         self.let_go()
         self._at, self._stored = x.copy(), False
         self.product.forget()
+        if not self._once:
+            self._own()
 
     def let_go(self) -> None:
         """Work no longer with the rows that ``with_stiffness_into`` was given."""
