@@ -108,7 +108,7 @@ class SystemMatrix:
         elif self._storage is not None:
             if self._half and values is not self.rows:
                 self.rows[:] = values
-            self._storage.write(values)
+            self._storage.write(self.rows if self._half else values)
         else:
             self._stored.insert(values, self.mat)
 

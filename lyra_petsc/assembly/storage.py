@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,12 +154,18 @@ class StoredRows:
 
     def insert_outside(self, values: Array, mat: PETSc.Mat) -> None:
         """Set the entries in columns of ghosts by ``MatSetValues``; not assembled after it."""
+        beyond, owned, indptr, columns = self._beyond
+        mat.setValuesBlockedIJV(indptr, columns, values[beyond], PETSc.InsertMode.INSERT, rowmap=owned)
+
+    @cached_property
+    def _beyond(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Blocks kept in columns of ghosts; their rows, where these begin, and columns, as PETSc wants it."""
         rows = np.flatnonzero(self.outside)
-        columns = np.flatnonzero(self._kept & (self._pattern.columns >= self._points.n_owned))
-        numbers = self._points.global_number[self._pattern.columns[columns]].astype(PETSc.IntType)
-        indptr = begins(self.outside[rows]).astype(PETSc.IntType)
-        owned = (self._points.start + rows).astype(PETSc.IntType)
-        mat.setValuesBlockedIJV(indptr, numbers, values[columns], PETSc.InsertMode.INSERT, rowmap=owned)
+        blocks = np.flatnonzero(self._kept & (self._pattern.columns >= self._points.n_owned))
+        columns = self._points.global_number[self._pattern.columns[blocks]]
+        indices = self._points.start + rows, begins(self.outside[rows]), columns
+        owned, indptr, numbers = (each.astype(PETSc.IntType) for each in indices)
+        return blocks, owned, indptr, numbers
 
 
 def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
@@ -217,11 +224,9 @@ class Storage:
         return np.ctypeslib.as_array(pointer, (size,)) if size else np.empty(0)
 
     def write(self, values: Array) -> None:
-        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+        """Replace all entries by block rows (n_blocks, 3, 3), by ``shared`` where that is; collective."""
         if self.shared is None:
             self._copy(values)
-        elif values is not self.shared:
-            self.shared[:] = values
         self._mat.assemble()
 
     def _copy(self, values: Array) -> None:

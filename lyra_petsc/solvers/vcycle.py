@@ -132,19 +132,18 @@ class VCycle:
     """What PETSc's PC of type python makes and calls; its levels are given to it by ``attach``."""
 
     def __init__(self) -> None:
-        self._smoothers: list[Smoother] = []
-        self._coarsest: Coarsest | None = None
+        self._levels: list[Smoother | Coarsest] = []
+        self._renew: Callable[[], None] | None = None
         self._twice_from = 0
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read ``-pc_mg_w_from``."""
         self._twice_from = PETSc.Options(pc.getOptionsPrefix()).getInt("pc_mg_w_from", 0)
-        self._renew: Callable[[], None] | None = None
 
     def attach(self, hierarchy: Hierarchy, renew: Callable[[], None]) -> None:
         """Work on these levels, which ``renew`` brings up to date; collective."""
-        self._smoothers = [Smoother(level) for level in hierarchy.levels[:-1]]
-        self._coarsest = Coarsest(hierarchy.levels[-1])
+        *finer, coarsest = hierarchy.levels
+        self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
         self._renew = renew
 
     def setUp(self, pc: PETSc.PC) -> None:
@@ -155,47 +154,42 @@ class VCycle:
         InputError
             As a part of another preconditioner, which has no levels to give.
         """
-        if self._coarsest is None or self._renew is None:
+        if self._renew is None:
             prefix = pc.getOptionsPrefix() or ""
             raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
         self._renew()
-        for smoother in self._smoothers:
-            smoother.set()
-        self._coarsest.set()
+        for level in self._levels:
+            level.set()
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one cycle on b; collective."""
-        finest, n = self._level(0), b.getLocalSize() // 3
+        finest, n = self._levels[0], b.getLocalSize() // 3
         finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
         self._visit(0)
         x.getArray()[:] = finest.x[:n].ravel()
 
-    def _level(self, number: int) -> Smoother | Coarsest:
-        level = self._smoothers[number] if number < len(self._smoothers) else self._coarsest
-        assert level is not None
-        return level
-
     def _visit(self, number: int, *, again: bool = False) -> None:
         """Let x of a level be what it finds for its b, from zero or going on; collective."""
-        level, coarser = self._level(number), number + 1
+        level, coarser = self._levels[number], number + 1
         if isinstance(level, Coarsest):
             level.solve()
             return
-        below = self._level(coarser)
+        below = self._levels[coarser]
         level.before(below.b, again=again)
         self._visit(coarser)
-        if 0 < self._twice_from <= coarser < min(self._twice_from + TWICE, len(self._smoothers)):
+        if 0 < self._twice_from <= coarser < min(self._twice_from + TWICE, len(self._levels) - 1):
             self._visit(coarser, again=True)
         level.after(below.x)
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
-        sizes = [level.points.n_global for level in (*self._smoothers, self._coarsest) if level is not None]
+        sizes = [level.points.n_global for level in self._levels]
         again = f", {TWICE} of them twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
         viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices{again}\n")
 
     def destroy(self, pc: PETSc.PC) -> None:
         """Free the PETSc objects; collective."""
-        if self._coarsest is not None:
-            self._coarsest.destroy()
-        self._smoothers, self._coarsest, self._renew = [], None, None
+        for level in self._levels:
+            if isinstance(level, Coarsest):
+                level.destroy()
+        self._levels, self._renew = [], None

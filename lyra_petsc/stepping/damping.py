@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Multiple:
-    """Block rows that are factor · D + diagonal · I, but for some rows, which are kept as they would be.
+    """Block rows that are factor · D + diagonal · I, but for blocks of which it keeps what they were.
 
     Parameters
     ----------

@@ -301,8 +301,8 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        given = values, self._prescribed.blocks
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, *given):
+        beside = self._prescribed.blocks
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, beside):
             self._damping.into(values, inertia)
             for term in self.elastic:
                 self._blocks.add_stiffness(term, x, blend, reach, values)
