@@ -25,11 +25,13 @@ cpu_target.target_context.refresh()
 
 @cache
 def digest(room: Path) -> str:
-    """Of all modules of a package.
+    """Of all modules of a package, and of ``block_rows``, whose kernels others call.
 
     A compiled function contains those of other modules that it calls, while numba looks at its own only.
     """
-    return sha256(b"\0".join(file.read_bytes() for file in sorted(room.glob("*.py")))).hexdigest()[:16]
+    rooms = sorted({room, room.parent / "block_rows"})
+    files = [file for each in rooms for file in sorted(each.glob("*.py"))]
+    return sha256(b"\0".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 
 class KernelCache(FunctionCache):

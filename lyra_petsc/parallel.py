@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
 from lyra_petsc.errors import LyraError
@@ -39,6 +40,26 @@ def all_here(comm: MPI.Comm) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+def on_one_machine(comm: MPI.Comm) -> bool:
+    """Whether all ranks share a machine; collective the first time, remembered with the communicator."""
+    from mpi4py import MPI
+
+    known = comm.Get_attr(_one_machine())
+    if known is None:
+        here = comm.Split_type(MPI.COMM_TYPE_SHARED)
+        known = here.size == comm.size
+        here.Free()
+        comm.Set_attr(_one_machine(), known)
+    return bool(known)
+
+
+@cache
+def _one_machine() -> int:
+    from mpi4py import MPI
+
+    return int(MPI.Comm.Create_keyval())
 
 
 def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -> Result | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,9 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.fields import Field, chosen
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
 from lyra_petsc.output.failure import Moment, remove_failure, write_failure
+from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
@@ -30,7 +33,8 @@ MOST_CHANGES = 12
 """Changes of a resumed scene that are told one by one."""
 
 CHEAP = 100.0
-"""Time since the last checkpoint, over the time it took to write, from which on another is written."""
+"""Time since the last checkpoint, over the time that took (with a state, if one was due), from which on
+another is written."""
 
 
 class Recorder:
@@ -83,7 +87,6 @@ class Recorder:
         self._open(folder, None)
         self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
         self.write_state()
-        self.write_checkpoint()
 
     def resume(self, folder: Path) -> None:
         """Put the newest checkpoint into the simulation and cut the files behind it.
@@ -185,7 +188,6 @@ class Recorder:
         control = self._simulation.control
         if control.writes_at(report.time) or self._simulation.finished:
             self.write_state()
-            self.write_checkpoint()
         elif self._due():
             self.write_checkpoint()
 
@@ -250,34 +252,43 @@ class Recorder:
     # -- states --------------------------------------------------------------------------------------
 
     def write_state(self) -> None:
-        """Write and announce the present state, unless it is written already."""
+        """Write and announce the present state, unless it is written already, and a checkpoint of it."""
         simulation = self._simulation
         if simulation.step_number == self._last_state:
+            self.write_checkpoint()
             return
         model = simulation.model
         values = {field: field.compute(model) for field in self._fields}
-        self._states.write(
-            simulation.step_number,
-            simulation.time,
-            model.system.x[: model.points.n_owned],
-            {field.name: value for field, value in values.items() if field.on == "vertex"},
-            {field.name: value for field, value in values.items() if field.on == "triangle"},
-        )
+        with self._checkpoint(last_state=simulation.step_number) as checkpoint:
+            self._states.write(
+                simulation.step_number,
+                simulation.time,
+                model.system.x[: model.points.n_owned],
+                {field.name: value for field, value in values.items() if field.on == "vertex"},
+                {field.name: value for field, value in values.items() if field.on == "triangle"},
+                beside=[checkpoint],  # what is announced is not written again after a kill
+            )
         self._last_state = simulation.step_number
 
     def write_checkpoint(self) -> None:
         """Replace the checkpoint by the present state."""
+        with self._checkpoint(self._last_state) as checkpoint:
+            write_collective([checkpoint], self._comm)
+
+    @contextmanager
+    def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
+        """A checkpoint of the present state, to be written within the context."""
         simulation = self._simulation
         system, n = simulation.model.system, simulation.model.points.n_owned
         arrays = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.departures.late)):
             arrays[f"start_{number}"] = system.departures.late[start]
         scalars = simulation.memory() | {
-            "last_state": self._last_state,
+            "last_state": last_state,
             "scheme": simulation.scene.time.scheme,
         }
         began = clock.monotonic()
-        write_checkpoint(self._folder, self._vertices, arrays, scalars)
+        yield checkpoint_file(self._folder, self._vertices, arrays, scalars)
         self._last_checkpoint = clock.monotonic()
         self._steps_since = 0
         self._checkpoint_seconds = self._last_checkpoint - began

@@ -172,7 +172,6 @@ class _Journey:
         """Write the last good state and the step that failed; where it can be looked at."""
         try:
             self._recorder.write_state()
-            self._recorder.write_checkpoint()
             self._summarise(outcome)
             if self._simulation.failure is None:
                 return ()

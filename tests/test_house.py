@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 LEVELS = [
     {"errors", "nearest"},
     {"extras", "kernel_cache", "parallel", "profiling"},
+    {"block_rows"},
     {"materials"},
     {"scene"},
     {"meshing"},

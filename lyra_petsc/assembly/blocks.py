@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.assembly.product import product
+from lyra_petsc.assembly.product import HalfStored
+from lyra_petsc.block_rows.scatter import add_elements
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.terms.term import Elastic, Viscous
 
@@ -21,24 +22,6 @@ Fill = Callable[[int, int, Array], None]
 
 CHUNK_VALUES = 32_768
 """Scalars of element blocks computed before they are scattered: they stay in cache."""
-
-
-@cached()
-def _scatter(blocks, offsets, weight, values):  # type: ignore[no-untyped-def]
-    """Add weight[e] blocks[e, a, b], b ≥ a, where ``offsets`` of the pattern say."""
-    for e in range(offsets.shape[0]):
-        w, pair = weight[e], 0
-        for a in range(blocks.shape[1]):
-            for b in range(a, blocks.shape[1]):
-                at = offsets[e, pair]
-                pair += 1
-                if at >= 0:
-                    k, row, column = at >> 1, a, b
-                    if at & 1:
-                        row, column = b, a
-                    for i in range(3):
-                        for j in range(3):
-                            values[k, i, j] += w * blocks[e, row, column, i, j]
 
 
 @cached()
@@ -116,7 +99,7 @@ class BlockRows:
             hi = min(lo + chunk, n_elements)
             blocks = buffer[: hi - lo]
             fill(lo, hi, blocks)
-            _scatter(blocks, offsets[lo:hi], weights[lo:hi], values)
+            add_elements(weights[lo:hi], blocks, offsets[lo:hi], values)
 
     def add_stiffness(
         self, term: Elastic, x: Array, blend: float, weight: Array | float, values: Array
@@ -140,8 +123,8 @@ class BlockRows:
 
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
-        out = np.zeros((self.pattern.n_owned, 3))
-        product(self.pattern.indptr, self.pattern.columns, values, x, out)
+        out = np.empty((self.pattern.n_owned, 3))
+        HalfStored(self.pattern, values)(x, out)
         return out
 
     def beside(self, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

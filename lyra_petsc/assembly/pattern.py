@@ -6,6 +6,7 @@ The matrices are symmetric: of two blocks that are each other's transpose one is
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,15 @@ class BlockPattern:
     @property
     def n_blocks(self) -> int:
         return len(self.columns)
+
+    @cached_property
+    def ends(self) -> Ints:
+        """Where (n_owned,) the blocks of a row in columns of ghosts begin."""
+        owned = self.columns < self.n_owned
+        if owned.all():
+            return self.indptr[1:]
+        ends: Ints = self.indptr[:-1] + np.diff(begins(owned)[self.indptr])
+        return ends
 
     @property
     def n_couplings(self) -> int:

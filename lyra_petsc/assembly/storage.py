@@ -195,6 +195,8 @@ class Storage:
     ----------
     shared : (n_blocks, 3, 3) or None
         PETSc's array, where that is block rows as the pattern has them; as long as the matrix lives.
+    whole : (blocks, 3, 3) or None
+        PETSc's array of all blocks of all rows on one rank; as long as the matrix lives.
 
     Raises
     ------
@@ -213,10 +215,12 @@ class Storage:
         self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if several and not self._half else None
         self._fill = {"aij": _to_aij, "baij": _to_baij, "sbaij": _to_sbaij}[kind]
         self.shared: Array | None = None
-        if self._half and not several:
+        self.whole: Array | None = None
+        if kind != "aij" and not several:
             part = ctypes.c_void_p(mat.handle)
-            self.shared = self._array(part, self._sizes[0]).reshape(-1, 3, 3)
+            array = self._array(part, self._sizes[0]).reshape(-1, 3, 3)
             self._give_back(part, ctypes.byref(ctypes.c_void_p()))
+            self.shared, self.whole = (array, None) if self._half else (None, array)
 
     def _array(self, part: ctypes.c_void_p, size: int) -> Array:
         pointer = ctypes.POINTER(ctypes.c_double)()

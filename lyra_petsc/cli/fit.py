@@ -21,7 +21,6 @@ class Facts:
     """OMP_NUM_THREADS as it stands; empty when unset."""
     petsc: tuple[int, ...] | None = None
     complex_scalars: bool = False
-    parallel_hdf5: bool | None = None
     mpi_libraries: tuple[str, ...] = ()
     """Files of the MPI libraries loaded."""
     missing: list[str] = field(default_factory=list)
@@ -36,7 +35,7 @@ def misfits(facts: Facts) -> list[str]:
         lines.append(
             f"The launcher started {facts.launched} ranks but each of them sees {facts.ranks}: mpi4py was "
             "built with another MPI. Use the mpirun (or srun --mpi=…) of the MPI named above, or rebuild "
-            "mpi4py, petsc4py and h5py with the launcher's."
+            "mpi4py and petsc4py with the launcher's."
         )
     if len(facts.mpi_libraries) > 1:
         lines.append(
@@ -50,12 +49,6 @@ def misfits(facts: Facts) -> list[str]:
         lines.append(
             "PETSc was built with complex scalars: use a real build (Debian: python3-petsc4py-real; "
             'conda-forge: "petsc=*=real*").'
-        )
-    if facts.ranks > 1 and facts.parallel_hdf5 is False:
-        lines.append(
-            "h5py is serial: states are written slab by slab through rank 0, which works and is slower. "
-            'A parallel one: Debian python3-h5py-mpi; conda-forge "h5py=*=mpi*"; else '
-            "HDF5_MPI=ON CC=mpicc pip install --no-binary=h5py h5py."
         )
     threads = int(facts.threads) if facts.threads.isdigit() else 1
     crowded = max(facts.ranks_per_host.values(), default=1)

@@ -166,8 +166,7 @@ def _petsc_packages(facts: Facts) -> str:
 def _h5py(facts: Facts) -> str:
     import h5py
 
-    facts.parallel_hdf5 = bool(h5py.get_config().mpi)
-    kind = "parallel" if facts.parallel_hdf5 else "serial"
+    kind = "parallel" if h5py.get_config().mpi else "serial"
     return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from lyra_petsc.errors import LyraError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
+Result = TypeVar("Result")
 
 # what h5py raises when the library reports a failure, depending on the call and its version
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError)
@@ -50,3 +53,21 @@ def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
         return
     shared = comm.bcast(problem, root=first)
     raise shared
+
+
+def on_each(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
+    """This rank's result of ``work``; if it fails on any rank, all raise the same. Collective.
+
+    Raises
+    ------
+    LyraError
+        What it raised on the lowest of those ranks.
+    """
+    problem: LyraError | None = None
+    result: Result | None = None
+    try:
+        result = work()
+    except LyraError as error:
+        problem = error
+    raise_together(comm, problem)
+    return cast(Result, result)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.hdf5 import read_slab, write_collective
+from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.parallel import on_root
 
@@ -50,13 +50,13 @@ class Checkpoint:
     note: str | None = None
 
 
-def write_checkpoint(
+def checkpoint_file(
     folder: str | os.PathLike[str],
     order: FileOrder,
     arrays: Mapping[str, NDArray[Any]],
     scalars: Mapping[str, Any],
-) -> None:
-    """Replace the checkpoint by a complete newer one; the old one is kept as the previous.
+) -> NewFile:
+    """A newer checkpoint, to be written; then the old one is kept as the previous.
 
     Parameters
     ----------
@@ -68,12 +68,7 @@ def write_checkpoint(
         Vertex arrays: ``position`` [m], ``velocity`` [m/s], and what the integrator remembers.
     scalars : mapping
         What JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
-        works, …; read on rank 0.
-
-    Raises
-    ------
-    OutputError
-        On every rank, if it could not be written; the old one stands.
+        works, …; the same on every rank.
     """
     folder = Path(folder)
     slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
@@ -82,17 +77,16 @@ def write_checkpoint(
         "/": {"format": FORMAT, "n_vertices": order.n_global, "scalars": json.dumps(dict(scalars))},
         **{name: {"sum": str(value)} for name, value in sums.items()},
     }
-    write_collective(folder / NEXT, slabs, attributes, order.comm)
+    return NewFile(folder / NEXT, slabs, attributes, publish=lambda: _rotate(folder))
 
-    def rotate() -> None:
-        try:
-            if (folder / CHECKPOINT).exists():
-                os.replace(folder / CHECKPOINT, folder / PREVIOUS)
-            os.replace(folder / NEXT, folder / CHECKPOINT)
-        except OSError as error:
-            raise OutputError(f"{folder / CHECKPOINT}: cannot be replaced: {reason(error)}") from error
 
-    on_root(order.comm, rotate)
+def _rotate(folder: Path) -> None:
+    try:
+        if (folder / CHECKPOINT).exists():
+            os.replace(folder / CHECKPOINT, folder / PREVIOUS)
+        os.replace(folder / NEXT, folder / CHECKPOINT)
+    except OSError as error:
+        raise OutputError(f"{folder / CHECKPOINT}: cannot be replaced: {reason(error)}") from error
 
 
 def read_checkpoint(folder: str | os.PathLike[str], order: FileOrder) -> Checkpoint:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.hdf5 import write_collective
+from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.mesh_file import MESH_FILE
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.xdmf import Field, State, group_name, xdmf_text
+from lyra_petsc.output.xdmf import Field, State, TimeSeries, group_name
 from lyra_petsc.parallel import on_root
 
 Array = NDArray[np.float64]
@@ -88,8 +88,8 @@ def write_failure(
             for name, values in moment.fields.items()
         )
         states.append(State(number, step + number, moment.time, DATA_FILE, fields))
-    write_collective(folder / DATA_FILE, datasets, attributes, vertices.comm)
-    document = xdmf_text(states, vertices.n_global, n_triangles, MESH_FILE)
+    write_collective([NewFile(folder / DATA_FILE, datasets, attributes)], vertices.comm)
+    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(states)
     on_root(vertices.comm, lambda: replace_text(folder / XDMF_FILE, document))
 
 

@@ -1,87 +1,127 @@
-"""Distributed arrays to and from HDF5 files, with or without an MPI build of h5py.
+"""Distributed arrays to and from HDF5 files, by any build of h5py.
 
-A file is built in three steps, so that a full disk is met where it does no harm: rank 0
-reserves the whole size and lays the file out, then the ranks write their slabs, then the
+A file is built in three steps, so that a full disk is met where it does no harm: one rank
+reserves the whole size and lays the file out, then all ranks write their slabs, then the
 finished file takes its name. (An HDF5 file that cannot grow while it is closed takes the
-process down with it.)
+process down with it.) As datasets are contiguous and have their places then, the slabs need
+no HDF5: its collective open alone takes longer than writing a state of moderate size.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.output.agreement import HDF5_ERRORS, raise_together, reason
+from lyra_petsc.output.agreement import HDF5_ERRORS, on_each, raise_together, reason
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.slabs import cannot_write, write_by_all, write_by_root
-from lyra_petsc.parallel import on_root
+from lyra_petsc.output.slabs import cannot_write, write_slabs
+from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
     from lyra_petsc.output.ordering import FileOrder
 
+Result = TypeVar("Result")
 Attributes = Mapping[str, Mapping[str, int | float | str]]
-
-# set to 1 to write through rank 0 even where h5py could write collectively
-SERIAL_VARIABLE = "LYRA_PETSC_SERIAL_HDF5"
 
 # bytes that a file with a few dozen datasets needs beyond their data and attributes
 LARGEST_OVERHEAD = 1 << 16
 
 
-def writes_collectively(comm: MPI.Comm) -> bool:
-    """Whether all ranks can write to one file at the same time. Collective."""
-    if comm.size == 1:
-        return False
-    able = bool(import_h5py().get_config().mpi) and os.environ.get(SERIAL_VARIABLE, "0") in ("", "0")
-    return bool(comm.allreduce(able, MPI.LAND))
+def _nothing() -> None:
+    pass
 
 
-def write_collective(
-    path: str | os.PathLike[str],
-    datasets: Mapping[str, NDArray[Any]],
-    attributes: Attributes,
-    comm: MPI.Comm,
-) -> None:
-    """Write distributed arrays to a new HDF5 file, which appears under its name when complete.
+@dataclass(frozen=True)
+class NewFile:
+    """A file to be written.
 
-    Parameters
+    Attributes
     ----------
-    path : path
-        The file; one that exists is replaced.
+    path : Path
+        One that exists is replaced.
     datasets : mapping of str to (n_slab, ...) array
         This rank's rows of each dataset; ranks' rows follow each other in rank order. Names,
         types and trailing shapes are the same on every rank; a rank may have no rows.
     attributes : mapping of str to mapping
-        Attributes of groups and datasets, by their path in the file; read on rank 0.
+        Attributes of groups and datasets, by their path in the file; of the last file read on rank 0,
+        of others on any rank.
+    publish : callable
+        What rank 0 does when all files have their names.
+    """
+
+    path: Path
+    datasets: Mapping[str, NDArray[Any]]
+    attributes: Attributes
+    publish: Callable[[], None] = _nothing
+
+    @property
+    def part(self) -> Path:
+        """What it is called until all files are complete."""
+        return self.path.with_name(self.path.name + ".part")
+
+
+def write_collective(files: Sequence[NewFile], comm: MPI.Comm) -> None:
+    """Write distributed arrays to new HDF5 files; they get their names, in this order, when all are complete.
+
+    Parameters
+    ----------
+    files : sequence of NewFile
+        As many on every rank. Where the ranks share a machine, one lays out and syncs a file while another
+        does the next: most of the time that small files take.
     comm : MPI.Comm
         All ranks; collective.
 
     Raises
     ------
     OutputError
-        On every rank, if the file could not be written; what stood there before stands.
+        On every rank, if a file could not be written; then none gets its name, and what stood there stands.
+        Or if one could not be published; then the ones before it are.
     """
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    slabs = {name: np.ascontiguousarray(slab) for name, slab in datasets.items()}
-    counts = {name: comm.allgather(len(slab)) for name, slab in slabs.items()}
+    slabs = [{name: np.ascontiguousarray(slab) for name, slab in file.datasets.items()} for file in files]
+    of_ranks = comm.allgather([[len(slab) for slab in of_file.values()] for of_file in slabs])
+    lengths = [np.array([of_files[number] for of_files in of_ranks]) for number in range(len(files))]
+    shared = comm.size if on_one_machine(comm) else 1
+    owners = [number % shared for number in reversed(range(len(files)))]
+    mine = [number for number, owner in enumerate(owners) if owner == comm.rank]
+
+    def lay_out(number: int) -> list[int]:
+        file, rows = files[number], lengths[number].sum(axis=0).tolist()
+        return _guarded(file.path, lambda: _lay_out(file.part, slabs[number], rows, file.attributes))
+
+    def sync_mine() -> None:
+        for number in mine:
+            _guarded(files[number].path, partial(_sync, files[number].part))
+
+    def take_names() -> None:
+        for file in files:
+            _guarded(file.path, partial(os.replace, file.part, file.path))
+        for file in files:
+            file.publish()
+
     try:
-        rows = {name: sum(count) for name, count in counts.items()}
-        on_root(comm, lambda: _guarded(path, lambda: _lay_out(part, slabs, rows, attributes)))
-        if not (writes_collectively(comm) and write_by_all(path, part, slabs, counts, comm)):
-            write_by_root(path, part, slabs, counts, comm)
-        on_root(comm, lambda: _guarded(path, lambda: _finish(part, path)))
+        known = comm.allgather(on_each(comm, lambda: {number: lay_out(number) for number in mine}))
+        for number, file in enumerate(files):
+            places, before = known[owners[number]][number], lengths[number][: comm.rank].sum(axis=0).tolist()
+            pieces = [
+                (place + start * slab.itemsize * math.prod(slab.shape[1:]), slab)
+                for place, start, slab in zip(places, before, slabs[number].values(), strict=True)
+            ]
+            write_slabs(file.path, file.part, pieces, comm)
+        on_each(comm, sync_mine)
+        on_root(comm, take_names)
     except LyraError:
-        if comm.rank == 0:
-            part.unlink(missing_ok=True)
+        for number in mine:
+            files[number].part.unlink(missing_ok=True)
         raise
 
 
@@ -125,20 +165,24 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
     return slab
 
 
-def _guarded(path: Path, work: Callable[[], None]) -> None:
+def _guarded(path: Path, work: Callable[[], Result]) -> Result:
     try:
-        work()
+        return work()
     except HDF5_ERRORS as error:
         raise cannot_write(path, error) from error
 
 
 def _lay_out(
-    part: Path, slabs: Mapping[str, NDArray[Any]], rows: Mapping[str, int], attributes: Attributes
-) -> None:
-    """Create the file with every dataset in its place and its whole size reserved on disk."""
+    part: Path, slabs: Mapping[str, NDArray[Any]], rows: Sequence[int], attributes: Attributes
+) -> list[int]:
+    """Create the file, its whole size reserved on disk; where each dataset is to be written [bytes].
+
+    By the library's own calls: h5py's objects over them take twice as long, which small states feel.
+    """
     h5py = import_h5py()
     texts = sum(len(str(value)) for values in attributes.values() for value in values.values())
-    data = sum(rows[name] * slab.itemsize * math.prod(slab.shape[1:]) for name, slab in slabs.items())
+    shapes = [(count, *slab.shape[1:]) for count, slab in zip(rows, slabs.values(), strict=True)]
+    data = sum(slab.itemsize * math.prod(shape) for shape, slab in zip(shapes, slabs.values(), strict=True))
     with open(part, "wb") as raw:
         os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD)
     early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -147,19 +191,39 @@ def _lay_out(
     early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
     links.set_create_intermediate_group(True)
-    with h5py.File(part, "w") as file:
-        for name, slab in slabs.items():
-            space = h5py.h5s.create_simple((rows[name], *slab.shape[1:]))
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=access)
+    try:
+        owners = {"/": file}
+        for (name, slab), shape in zip(slabs.items(), shapes, strict=True):
+            space = h5py.h5s.create_simple(shape)
             kind = h5py.h5t.py_create(slab.dtype, logical=True)
-            h5py.h5d.create(file.id, name.lstrip("/").encode(), kind, space, early, links)
-        for owner, values in attributes.items():
+            owners[name] = h5py.h5d.create(file, name.encode(), kind, space, early, links)
+        # a dataset without rows has no place
+        places = [owners[name].get_offset() or 0 for name in slabs]
+        for name, values in attributes.items():
+            if name not in owners:
+                made = name in file
+                owners[name] = (h5py.h5g.open if made else h5py.h5g.create)(file, name.encode())
+            owner = owners[name]
             for key, value in values.items():
-                (file[owner] if owner in file else file.create_group(owner)).attrs[key] = value
+                _write_attribute(owner, key, value)
+    finally:
+        file.close()
     with open(part, "r+b") as raw:
         os.posix_fallocate(raw.fileno(), 0, max(part.stat().st_size, 1))
+    return places
 
 
-def _finish(part: Path, path: Path) -> None:
+def _write_attribute(owner: Any, key: str, value: int | float | str) -> None:
+    h5py = import_h5py()
+    text = isinstance(value, str)
+    stored = np.array(value, dtype=h5py.string_dtype() if text else None)
+    kind = h5py.h5t.py_create(stored.dtype, logical=True)
+    h5py.h5a.create(owner, key.encode(), kind, h5py.h5s.create(h5py.h5s.SCALAR)).write(stored)
+
+
+def _sync(part: Path) -> None:
     with open(part, "rb") as raw:
         os.fsync(raw.fileno())
-    os.replace(part, path)

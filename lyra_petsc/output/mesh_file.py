@@ -15,7 +15,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.meshing.mesh import Group, Mesh
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.hdf5 import write_collective
+from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.parallel import on_root
 
 MESH_FILE = "mesh.h5"
@@ -60,7 +60,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
             names[f"groups/{number}"] = {"name": name}
             parts = _parts(group)
             datasets |= {f"groups/{number}/{part}": rows for part, rows in parts.items() if len(rows)}
-        write_collective(Path(folder) / MESH_FILE, datasets, names, MPI.COMM_SELF)
+        write_collective([NewFile(Path(folder) / MESH_FILE, datasets, names)], MPI.COMM_SELF)
 
     on_root(comm, work)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -109,17 +111,23 @@ class FileOrder:
     ) -> NDArray[Any]:
         rows = np.ascontiguousarray(rows)
         arrived = np.empty((int(receive.sum()), *rows.shape[1:]), dtype=rows.dtype)
-        # counting in rows keeps the counts within 32 bits whatever a row is wide
-        width = rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
-        row_type = MPI.BYTE.Create_contiguous(width).Commit()
-        try:
+        with row_type(rows) as kind:
             self.comm.Alltoallv(
-                [rows, (send, _offsets(send)), row_type], [arrived, (receive, _offsets(receive)), row_type]
+                [rows, (send, _offsets(send)), kind], [arrived, (receive, _offsets(receive)), kind]
             )
-        finally:
-            row_type.Free()
         return arrived
 
 
 def _offsets(counts: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate(([0], np.cumsum(counts)[:-1])).astype(np.int32)
+
+
+@contextmanager
+def row_type(rows: NDArray[Any]) -> Iterator[MPI.Datatype]:
+    """A row of an array for MPI: counting in rows keeps counts within 32 bits, whatever a row is wide."""
+    width = rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))
+    kind = MPI.BYTE.Create_contiguous(width).Commit()
+    try:
+        yield kind
+    finally:
+        kind.Free()

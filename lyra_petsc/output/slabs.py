@@ -1,8 +1,15 @@
-"""How slabs get into an HDF5 file that is laid out already: by all ranks, or through rank 0."""
+"""How the ranks' slabs get into a file that is laid out already.
+
+On one machine all ranks write at once, as processes may; on several they do so through MPI-IO, or where
+that fails one after the other.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Sequence
+from functools import partial
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -11,104 +18,96 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import LyraError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, raise_together, reason
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, on_each, raise_together, reason
+from lyra_petsc.output.ordering import row_type
+from lyra_petsc.parallel import on_one_machine
+
+TURNS_VARIABLE = "LYRA_PETSC_WRITE_IN_TURN"
+"""Set to 1 for rank 0 where MPI-IO opens files, but fails to write them."""
+
+Piece = tuple[int, NDArray[Any]]
+"""Offset in the file [bytes] of a rank's rows of a dataset, and the rows; they are contiguous."""
 
 
 def cannot_write(path: Path, error: BaseException) -> OutputError:
     return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
 
 
-def _write_rows(dataset: Any, start: int, slab: NDArray[Any], transfer: Any) -> None:
-    """Write (n, ...) rows at ``start``; takes part in a collective write also with n = 0."""
-    h5py = import_h5py()
-    target, source = dataset.id.get_space(), h5py.h5s.create_simple(slab.shape)
-    if slab.size:
-        target.select_hyperslab((start,) + (0,) * (slab.ndim - 1), slab.shape)
-    else:
-        target.select_none()
-        source.select_none()
-    dataset.id.write(source, target, slab, dxpl=transfer)
+def write_slabs(path: Path, part: Path, pieces: Sequence[Piece], comm: MPI.Comm) -> None:
+    """Write each rank's pieces; collective. What other machines than rank 0's wrote is on the disk then.
+
+    Parameters
+    ----------
+    path : Path
+        What the file will be called; for messages.
+    part : Path
+        The file as it is called now; holds room for all pieces.
+    pieces : sequence of (int, (n, ...) array)
+        As many on every rank; n may be 0.
+    comm : MPI.Comm
+        All ranks.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if any could not write.
+    """
+    if on_one_machine(comm):
+        on_each(comm, lambda: _write_alone(path, part, pieces, sync=False))
+        return
+    in_turn = comm.bcast(os.environ.get(TURNS_VARIABLE) == "1", root=0)
+    if in_turn or not _write_through_mpi(path, part, pieces, comm):
+        for rank in range(comm.size):
+            mine = pieces if rank == comm.rank else ()
+            on_each(comm, partial(_write_alone, path, part, mine, sync=True))
 
 
-def write_by_all(
-    path: Path,
-    part: Path,
-    slabs: Mapping[str, NDArray[Any]],
-    counts: Mapping[str, list[int]],
-    comm: MPI.Comm,
-) -> bool:
-    """All ranks write at once; ``False`` if none could open the file so (two different MPIs)."""
-    h5py = import_h5py()
+def _write_alone(path: Path, part: Path, pieces: Sequence[Piece], *, sync: bool) -> None:
+    """These pieces, if there are any, into a plain file."""
+    if not pieces:
+        return
+    try:
+        with open(part, "r+b", buffering=0) as file:
+            for offset, rows in pieces:
+                _write_rows(file, offset, rows)
+            if sync:
+                os.fsync(file.fileno())
+    except OSError as error:
+        raise cannot_write(path, error) from error
+
+
+def _write_rows(file: FileIO, offset: int, rows: NDArray[Any]) -> None:
+    file.seek(offset)
+    left = rows.reshape(-1).view(np.uint8).data
+    while left:  # one call writes 2 GiB at most
+        left = left[file.write(left) :]
+
+
+def _write_through_mpi(path: Path, part: Path, pieces: Sequence[Piece], comm: MPI.Comm) -> bool:
+    """All ranks at once; ``False`` if no rank could open the file so."""
     problem: LyraError | None = None
     try:
-        file = h5py.File(part, "r+", driver="mpio", comm=comm)
-    except HDF5_ERRORS as error:
+        file = MPI.File.Open(MPI.Intracomm(comm), os.fspath(part), MPI.MODE_RDWR)
+    except MPI.Exception as error:
         problem = cannot_write(path, error)
     if comm.allreduce(problem is not None, MPI.LAND):
         return False
     raise_together(comm, problem)
 
-    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
-    transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
-    for name, slab in slabs.items():
+    for offset, rows in pieces:
         try:
-            _write_rows(file[name], sum(counts[name][: comm.rank]), slab, transfer)
+            _write_rows_together(file, offset, rows)
         except HDF5_ERRORS as error:
             problem = problem or cannot_write(path, error)
     try:
-        file.close()
+        file.Sync()
+        file.Close()
     except HDF5_ERRORS as error:
         problem = problem or cannot_write(path, error)
     raise_together(comm, problem)
     return True
 
 
-def write_by_root(
-    path: Path,
-    part: Path,
-    slabs: Mapping[str, NDArray[Any]],
-    counts: Mapping[str, list[int]],
-    comm: MPI.Comm,
-) -> None:
-    """Rank 0 writes slab after slab, holding one of another rank at a time."""
-    if comm.rank > 0:
-        raise_together(comm, None)  # opened on rank 0?
-        for slab in slabs.values():
-            _transfer(comm.Send, slab, 0)
-        raise_together(comm, None)
-        return
-
-    problem: LyraError | None = None
-    try:
-        file = import_h5py().File(part, "r+")
-    except HDF5_ERRORS as error:
-        problem = cannot_write(path, error)
-    raise_together(comm, problem)
-    for name, slab in slabs.items():
-        start = 0
-        for rank, count in enumerate(counts[name]):
-            arrived = slab if rank == 0 else np.empty((count, *slab.shape[1:]), slab.dtype)
-            if rank > 0:  # received even after a failure: the sender must not wait for ever
-                _transfer(comm.Recv, arrived, rank)
-            try:
-                if problem is None and count:
-                    _write_rows(file[name], start, arrived, None)
-            except HDF5_ERRORS as error:
-                problem = cannot_write(path, error)
-            start += count
-    try:
-        file.close()
-    except HDF5_ERRORS as error:
-        problem = problem or cannot_write(path, error)
-    raise_together(comm, problem)
-
-
-def _transfer(send_or_receive: Callable[..., None], slab: NDArray[Any], other: int) -> None:
-    # counting in rows keeps the count within 32 bits
-    width = slab.dtype.itemsize * int(np.prod(slab.shape[1:], dtype=np.int64))
-    row_type = MPI.BYTE.Create_contiguous(width).Commit()
-    try:
-        send_or_receive([slab, len(slab), row_type], other)
-    finally:
-        row_type.Free()
+def _write_rows_together(file: MPI.File, offset: int, rows: NDArray[Any]) -> None:
+    with row_type(rows) as kind:
+        file.Write_at_all(offset, [rows, len(rows), kind])

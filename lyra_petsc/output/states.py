@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.hdf5 import write_collective
+from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.mesh_file import MESH_FILE
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.vtkhdf import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
-from lyra_petsc.output.xdmf import Field, State, group_name, xdmf_text
+from lyra_petsc.output.xdmf import Field, State, TimeSeries, group_name
 from lyra_petsc.parallel import on_root
 
 XDMF_FILE = "states.xdmf"
@@ -69,6 +69,7 @@ class StateWriter:
         self.triangles = triangles
         self.n_triangles = n_triangles
         self._states: list[State] = []  # kept on rank 0
+        self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
         self._next = 0
         self._vtkhdf = vtkhdf
         if vtkhdf:
@@ -92,6 +93,7 @@ class StateWriter:
         position: NDArray[np.float64],
         vertex_fields: Fields | None = None,
         triangle_fields: Fields | None = None,
+        beside: Sequence[NewFile] = (),
     ) -> int:
         """Write and announce one state; collective. Returns its number.
 
@@ -106,6 +108,8 @@ class StateWriter:
         vertex_fields, triangle_fields : mapping of str to (n_owned, ...) array
             Further fields on this rank's vertices and triangles: floats or integers, the same
             names, types and trailing shapes on every rank.
+        beside : sequence of NewFile
+            Files that are there, too, when the state is announced.
 
         Raises
         ------
@@ -127,13 +131,10 @@ class StateWriter:
         attributes = {group: stamp, f"{group}/position": {**stamp, "on": "vertex"}}
         attributes |= {f"{group}/{field.name}": {"on": field.on} for field in fields}
         name = f"states-{number:04d}.h5"
-        write_collective(
-            self.folder / name,
-            {f"{group}/{key}": slab for key, slab in slabs.items()},
-            attributes,
-            self._comm,
-        )
-        on_root(self._comm, lambda: self._announce(State(number, int(step), float(time), name, fields)))
+        state = State(number, int(step), float(time), name, fields)
+        datasets = {f"{group}/{key}": slab for key, slab in slabs.items()}
+        file = NewFile(self.folder / name, datasets, attributes, publish=lambda: self._announce(state))
+        write_collective([file, *beside], self._comm)
         self._next += 1
         return number
 
@@ -147,10 +148,9 @@ class StateWriter:
 
     def _announce(self, state: State | None) -> None:
         states = self._states if state is None else [*self._states, state]
-        sizes = self.vertices.n_global, self.n_triangles
-        replace_text(self.folder / XDMF_FILE, xdmf_text(states, *sizes, MESH_FILE))
+        replace_text(self.folder / XDMF_FILE, self._series.text(states))
         if self._vtkhdf:
-            write_vtkhdf(self.folder, states, *sizes, MESH_FILE)
+            write_vtkhdf(self.folder, states, self.vertices.n_global, self.n_triangles, MESH_FILE)
         self._states = states
 
     def _truncate(self, last_step: int) -> int:

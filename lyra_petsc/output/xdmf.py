@@ -66,40 +66,53 @@ def group_name(number: int) -> str:
     return f"states/{number:06d}"
 
 
-def xdmf_text(states: Sequence[State], n_vertices: int, n_triangles: int, mesh_file: str) -> str:
-    """The whole document, states in the order given.
+class TimeSeries:
+    """The document that shows states of one mesh; each state's part of it is made once.
 
     Parameters
     ----------
-    states : sequence of State
-        States on disk.
     n_vertices, n_triangles : int
         Rows of positions and of triangles.
     mesh_file : str
         Name of the file with ``/mesh/triangles`` and ``/mesh/rest``, relative to the XDMF file.
     """
-    triangles = _item((n_triangles, 3), "int64", f"{mesh_file}:/mesh/triangles")
-    rest = Field("rest", "vertex", (n_vertices, 3), "float64")
-    before = f'   <Topology TopologyType="Triangle" NumberOfElements="{n_triangles}">{triangles}</Topology>\n'
-    after = _attribute(rest, f"{mesh_file}:/mesh/rest")
-    grids = "".join(_grid(state, n_vertices, before, after) for state in states)
-    return (
-        '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n'
-        '  <Grid Name="states" GridType="Collection" CollectionType="Temporal">\n'
-        f"{grids}  </Grid>\n </Domain>\n</Xdmf>\n"
-    )
 
+    def __init__(self, n_vertices: int, n_triangles: int, mesh_file: str) -> None:
+        self._n_vertices = n_vertices
+        triangles = _item((n_triangles, 3), "int64", f"{mesh_file}:/mesh/triangles")
+        self._before = (
+            f'   <Topology TopologyType="Triangle" NumberOfElements="{n_triangles}">{triangles}</Topology>\n'
+        )
+        rest = Field("rest", "vertex", (n_vertices, 3), "float64")
+        self._after = _attribute(rest, f"{mesh_file}:/mesh/rest")
+        self._grids: dict[int, tuple[State, str]] = {}
 
-def _grid(state: State, n_vertices: int, before: str, after: str) -> str:
-    group = f"{state.file}:/{group_name(state.number)}"
-    position = _item((n_vertices, 3), "float64", f"{group}/position")
-    return (
-        f'  <Grid Name="state {state.number}" GridType="Uniform">\n'
-        f'   <Time Value="{state.time!r}"/>\n{before}'
-        f'   <Geometry GeometryType="XYZ">{position}</Geometry>\n'
-        + "".join(_attribute(field, f"{group}/{field.name}") for field in state.fields)
-        + f"{after}  </Grid>\n"
-    )
+    def text(self, states: Sequence[State]) -> str:
+        """The whole document, states in the order given."""
+        grids = "".join(map(self._known, states))
+        return (
+            '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n'
+            '  <Grid Name="states" GridType="Collection" CollectionType="Temporal">\n'
+            f"{grids}  </Grid>\n </Domain>\n</Xdmf>\n"
+        )
+
+    def _known(self, state: State) -> str:
+        made, text = self._grids.get(state.number, (None, ""))
+        if made is not state:  # a number is used again when its state could not be announced
+            text = self._grid(state)
+            self._grids[state.number] = state, text
+        return text
+
+    def _grid(self, state: State) -> str:
+        group = f"{state.file}:/{group_name(state.number)}"
+        position = _item((self._n_vertices, 3), "float64", f"{group}/position")
+        return (
+            f'  <Grid Name="state {state.number}" GridType="Uniform">\n'
+            f'   <Time Value="{state.time!r}"/>\n{self._before}'
+            f'   <Geometry GeometryType="XYZ">{position}</Geometry>\n'
+            + "".join(_attribute(field, f"{group}/{field.name}") for field in state.fields)
+            + f"{self._after}  </Grid>\n"
+        )
 
 
 def _attribute(field: Field, where: str) -> str:

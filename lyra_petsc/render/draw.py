@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import LyraError
-from lyra_petsc.output.agreement import raise_together
+from lyra_petsc.output.agreement import on_each
 from lyra_petsc.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.render.files import PictureFiles
 from lyra_petsc.render.ground import Bounds
@@ -25,8 +24,6 @@ from lyra_petsc.render.timing import decimals, spread_states
 
 if TYPE_CHECKING:
     from mpi4py import MPI
-
-Result = TypeVar("Result")
 
 LOOKED_AT = 9
 """States from which the direction of the camera is found."""
@@ -57,41 +54,29 @@ def draw(comm: MPI.Comm, asked: Asked, plan: Plan, tell: Callable[[int, int], No
         If a picture cannot be written; a film is whole or not there.
     """
     states = plan.states
-    shown = _together(comm, lambda: quantity(plan.run, asked.field) if asked.field else None)
-    sight = _together(comm, lambda: _line_of_sight(plan))
+    shown = on_each(comm, lambda: quantity(plan.run, asked.field) if asked.field else None)
+    sight = on_each(comm, lambda: _line_of_sight(plan))
     normals = Bounds.axes_of(upwards(plan.scene))
     fit = Fit(plan.scene, sight, normals[2], plan.size[0] / plan.size[1], bar=shown is not None)
     around = np.concatenate([fit.normals, normals, -normals])
     mine = plan.motion[comm.rank :: comm.size]
-    part = _together(comm, lambda: survey(plan.run, mine, around, shown if plan.limits is None else None))
+    part = on_each(comm, lambda: survey(plan.run, mine, around, shown if plan.limits is None else None))
     whole = comm.bcast(_joined(comm.gather(part)))
     with ExitStack() as open_now:
-        stage = _together(comm, lambda: _stage(asked, plan, shown, fit, whole))
+        stage = on_each(comm, lambda: _stage(asked, plan, shown, fit, whole))
         open_now.callback(stage.close)
         files = PictureFiles(plan) if comm.rank == 0 else None
         if files is not None:
             open_now.push(files)
-        _together(comm, lambda: files.__enter__() if files else None)
+        on_each(comm, lambda: files.__enter__() if files else None)
         for first in range(0, len(states), comm.size):
             tell(first, len(states))
-            image = _together(comm, lambda: _image(stage, plan, states[first:], comm.rank))  # noqa: B023
+            image = on_each(comm, lambda: _image(stage, plan, states[first:], comm.rank))  # noqa: B023
             images = comm.gather(image)
-            _together(comm, lambda: _take(files, states[first:], images))  # noqa: B023
-        written = _together(comm, lambda: files.finish() if files else [])
+            on_each(comm, lambda: _take(files, states[first:], images))  # noqa: B023
+        written = on_each(comm, lambda: files.finish() if files else [])
         tell(len(states), len(states))
         return written
-
-
-def _together(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
-    """Do ``work`` on all ranks; what goes wrong on one, all raise."""
-    result: Result | None = None
-    problem: LyraError | None = None
-    try:
-        result = work()
-    except LyraError as error:
-        problem = error
-    raise_together(comm, problem)
-    return result  # type: ignore[return-value]
 
 
 def _line_of_sight(plan: Plan) -> NDArray[np.float64]:

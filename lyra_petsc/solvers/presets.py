@@ -15,13 +15,25 @@ from lyra_petsc.solvers.options import Value, is_set
 PYTHON_TYPE = "lyra_petsc.solvers.vcycle.VCycle"
 """Our V cycle as ``-pc_python_type`` wants it."""
 
+_CYCLE: dict[str, Value] = {
+    "mat_type": "sbaij",
+    "ksp_type": "cg",
+    "ksp_max_it": 300,
+    "pc_type": "python",
+    "pc_python_type": PYTHON_TYPE,
+    "mg_coarse_pc_type": "redundant",
+    "mg_coarse_redundant_pc_type": "cholesky",
+}
+
 PRESETS: dict[str, dict[str, Value]] = {
     # for equilibria, where bending is a millionth of the membrane, and steps of stiff sheets. The last four
     # have all pivots counted, leave out scaling and pivoting (an indefinite matrix is given up anyway) and
-    # order by minimum degree
+    # order by minimum degree. The factors are of the regularised Hessian where the exact one is indefinite;
+    # where they are too unlike, more regularisation costs less than more iterations
     "direct": {
         "mat_type": "aij",
         "ksp_type": "cg",
+        "ksp_max_it": 50,
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "mumps",
         "mat_mumps_icntl_13": 1,
@@ -33,6 +45,7 @@ PRESETS: dict[str, dict[str, Value]] = {
     "cholesky": {
         "mat_type": "aij",
         "ksp_type": "cg",
+        "ksp_max_it": 50,
         "pc_type": "cholesky",
         "pc_factor_mat_ordering_type": "qmd",
     },
@@ -50,18 +63,10 @@ PRESETS: dict[str, dict[str, Value]] = {
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
     # iterations that hardly grow with the mesh. Hundreds of them mean a matrix close to singular, and another
     # one is needed
-    "multigrid": {
-        "mat_type": "sbaij",
-        "ksp_type": "cg",
-        "ksp_max_it": 300,
-        "pc_type": "python",
-        "pc_python_type": PYTHON_TYPE,
-        "mg_coarse_pc_type": "redundant",
-        "mg_coarse_redundant_pc_type": "cholesky",
-    },
+    "multigrid": _CYCLE,
     # with levels from the second coarser one on visited twice: a sixth more for a cycle, and iterations that
     # do not grow where there are many, by size or stiffness
-    "multigrid-w": {"pc_mg_w_from": 2},
+    "multigrid-w": _CYCLE | {"pc_mg_w_from": 2},
     # the same levels with PETSc's cycle: a forward sweep before and a backward one after the coarser level
     "pcmg": {
         "mat_type": "baij",
@@ -92,8 +97,6 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
-PRESETS["multigrid-w"] = PRESETS["multigrid"] | PRESETS["multigrid-w"]
-
 FACTORISATIONS = ("direct", "cholesky")
 
 MULTIGRID_FROM = {True: 2000, False: 3000}
@@ -106,11 +109,17 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
 
-FACTOR_COST = 50.0, 6.5
-"""Iterations of conjugate gradients that a factorisation costs: the first plus the second times √vertices."""
+FACTOR_COST = {True: (200.0, 6.5), False: (50.0, 6.5)}
+"""Iterations of block Jacobi that a factorisation costs: the first plus the second times √vertices.
 
-WORTH, PRICE = 4.0, 3.0
-"""How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least, and costs."""
+On one rank, where its products are ours, and on several.
+"""
+
+WORTH = 4.0
+"""How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least."""
+
+PRICE = {True: 4.0, False: 3.0}
+"""How many of them it costs, on one rank and on several."""
 
 TWICE_FROM = 30.0
 """Iterations of block Jacobi from which coarser levels are visited twice."""
@@ -135,11 +144,11 @@ def candidates(
         return last
     incomplete = "ilu" if ranks == 1 else "block-ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
-    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH):
+    if iterations > _factor_cost(n_vertices, ranks) * (1.0 if small else WORTH):
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
-    return ["block-jacobi", *factors, *last[:-1]] if newton else [incomplete, *factors, *last]
+    return [*([] if newton else [incomplete]), "block-jacobi", *factors, *last[:-1]]
 
 
 def _factorisations(ranks: int) -> list[str]:
@@ -149,16 +158,17 @@ def _factorisations(ranks: int) -> list[str]:
     return ["cholesky"] if ranks == 1 else []
 
 
-def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
+def linear_limit(n_vertices: int, ranks: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE)
+        return _factor_cost(n_vertices, ranks) / (1.0 if presets[0] == "block-jacobi" else PRICE[ranks == 1])
     return math.inf
 
 
-def _factor_cost(n_vertices: int) -> float:
-    """Iterations of conjugate gradients that cost as much as a factorisation."""
-    return FACTOR_COST[0] + FACTOR_COST[1] * math.sqrt(n_vertices)
+def _factor_cost(n_vertices: int, ranks: int) -> float:
+    """Iterations of conjugate gradients with block Jacobi that cost as much as a factorisation."""
+    first, more = FACTOR_COST[ranks == 1]
+    return first + more * math.sqrt(n_vertices)
 
 
 def options_of(name: str, ranks: int) -> dict[str, Value]:

@@ -8,6 +8,7 @@ cycle on the same levels, with a choice of smoothers, is ``pcmg``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -15,15 +16,19 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.matrix import SystemMatrix
+from lyra_petsc.block_rows import sweeps
 from lyra_petsc.errors import InputError
 from lyra_petsc.partition.distribute import local_numbers
-from lyra_petsc.solvers import sweeps
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 
 Floats = NDArray[np.float32]
 
 TWICE = 3
 """Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
+
+
+HUGE = 1e30
+"""No preconditioner has such entries."""
 
 
 class Smoother:
@@ -33,20 +38,20 @@ class Smoother:
     ----------
     b, x : (n_local, 3)
         Right-hand side and solution.
-    r : (n_owned, 3)
-        Residual.
+    r : (n_owned, 4)
+        Residual, and numbers without a meaning.
     """
 
     def __init__(self, level: Level) -> None:
         pattern, points = level.pattern, level.points
         self._level, self.points = level, points
         n = points.n_owned
-        self._rows = pattern.indptr, pattern.columns, n
+        self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
-        self.r = np.zeros((n, 3), dtype=np.float32)
+        self.r = np.zeros((n, 4), dtype=np.float32)
         rows = level.interpolation
         assert rows is not None
         assert level.galerkin is not None
@@ -73,7 +78,7 @@ class Smoother:
             self._subtract_ghosts(np.zeros_like(self.x[self.points.n_owned :]))
         else:
             self.x[:] = 0.0
-            self.r[:] = self.b[: len(self.r)]
+            self.r[:, :3] = self.b[: len(self.r)]
         seen = self.x[self.points.n_owned :].copy()
         sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
         self._subtract_ghosts(seen)
@@ -166,7 +171,12 @@ class VCycle:
         finest, n = self._levels[0], b.getLocalSize() // 3
         finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
         self._visit(0)
-        x.getArray()[:] = finest.x[:n].ravel()
+        found = finest.x[:n]
+        if math.isfinite(float(np.vdot(found, found))):
+            x.getArray()[:] = found.ravel()
+        else:
+            # sweeps over an indefinite matrix can grow without bound; of this PETSc says just that
+            x.getArray()[:] = -HUGE * b.getArray(readonly=True)
 
     def _visit(self, number: int, *, again: bool = False) -> None:
         """Let x of a level be what it finds for its b, from zero or going on; collective."""

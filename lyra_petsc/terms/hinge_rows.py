@@ -1,4 +1,4 @@
-"""Hessians of hinges added straight to block rows, where the ``offsets`` of the pattern say.
+"""Hessians of hinges added straight to block rows, as ``scatter`` adds blocks.
 
 Of each hinge the blocks (0, 0), (0, 1), …, (3, 3) on and above the diagonal; ``hinge_energy`` has them all.
 """
@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from lyra_petsc.block_rows.scatter import add_element
 from lyra_petsc.terms.hinge import angle_slopes, cross, dot, minus, point, triangle_turn
 from lyra_petsc.terms.hinge_energy import hinge_hessian, hinge_stiffness
 from lyra_petsc.terms.kernel import kernel
@@ -100,7 +101,7 @@ def add_exact(x, s, blend, k, rest, limit, weight, offsets, values):  # type: ig
         if not (square1 > limit[h, 0] and square2 > limit[h, 1]):
             limit1, limit2 = limit[h, 0], limit[h, 1]
             hinge_hessian(x0, x1, x2, x3, k[h], rest[h], limit1, limit2, blend, gradient, blocks)
-            _add_all(weight[h], blocks, offsets[h], values)
+            add_element(weight[h], blocks, offsets[h], values)
             continue
         e, o1, o2 = minus(x1, x0), minus(x2, x0), minus(x3, x0)
         length = math.sqrt(dot(e, e))
@@ -124,18 +125,3 @@ def add_exact(x, s, blend, k, rest, limit, weight, offsets, values):  # type: ig
             p, q = (g[3], g[2]) if at[8] & 1 else (g[2], g[3])
             _add_outer(w, p, q, values[at[8] >> 1])
         _add_three(at[9], _scaled(w, g[3]), g[3], _pair(two, z, 2, 2), values)
-
-
-@kernel()
-def _add_all(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight times the blocks (4, 4, 3, 3) of one hinge."""
-    pair = 0
-    for a in range(4):
-        for b in range(a, 4):
-            at = offsets[pair]
-            pair += 1
-            if at >= 0:
-                row, column = (b, a) if at & 1 else (a, b)
-                for i in range(3):
-                    for j in range(3):
-                        values[at >> 1, i, j] += weight * blocks[row, column, i, j]

@@ -174,7 +174,7 @@ def overhead(comm: Comm, job: Result) -> Result:
 
 
 def output(comm: Comm, job: Result) -> Result:
-    """States written by turns with plain files of the same size, both brought to the disk (fsync)."""
+    """States with their checkpoints, by turns with plain files of the same sizes; all on the disk (fsync)."""
     folder = Path(job["folder"])
     simulation = Simulation(comm, Scene.model_validate(job["scene"]))
     recorder = Recorder(simulation)
@@ -185,13 +185,13 @@ def output(comm: Comm, job: Result) -> Result:
         began = now(comm)
         recorder.write_state()
         ours.append(now(comm) - began)
-        size = (folder / f"states-{number:04d}.h5").stat().st_size
-        block = os.urandom(size) if comm.rank == 0 else b""
+        written = [(folder / name).stat().st_size for name in (f"states-{number:04d}.h5", "checkpoint.h5")]
+        blocks = [os.urandom(size) for size in written] if comm.rank == 0 else []
         began = now(comm)
-        if comm.rank == 0:
-            _write_plain(folder / f"plain-{number}", block)
+        for block in blocks:
+            _write_plain(folder / f"plain-{number}-{len(block)}", block)
         raw.append(now(comm) - began)
-        sizes.append(size)
+        sizes.append(sum(written))
     recorder.close()
     return {
         "vertices": simulation.model.outline.n_vertices,

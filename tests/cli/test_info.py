@@ -58,7 +58,7 @@ def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
 
 
 def test_all_fits_when_nothing_is_wrong():
-    facts = Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5), parallel_hdf5=True)
+    facts = Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
     assert misfits(facts) == []
 
 
@@ -69,7 +69,6 @@ def test_all_fits_when_nothing_is_wrong():
         (Facts(mpi_libraries=("/a/libmpi.so.12", "/b/libmpi.so.40")), "Two MPI libraries"),
         (Facts(petsc=(3, 17, 4)), "PETSc 3.17.4 is too old: 3.18"),
         (Facts(petsc=(3, 20, 0), complex_scalars=True), "complex scalars"),
-        (Facts(ranks=2, launched=2, parallel_hdf5=False), "h5py is serial"),
         (Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=4, threads="4"), "OMP_NUM_THREADS=4"),
         (Facts(missing=["numba"]), "numba is missing: pip install numba"),
     ],
@@ -78,10 +77,6 @@ def test_each_misfit_is_one_line(facts, words):
     (line,) = misfits(facts)
     assert words in line
     assert "\n" not in line
-
-
-def test_a_serial_h5py_is_right_for_one_rank():
-    assert misfits(Facts(ranks=1, parallel_hdf5=False)) == []
 
 
 @pytest.mark.parametrize(

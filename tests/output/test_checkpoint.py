@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, read_checkpoint, write_checkpoint
+from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, checkpoint_file, read_checkpoint
+from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.ordering import FileOrder
 
 pytestmark = pytest.mark.parallel
@@ -28,7 +29,8 @@ def dealt(comm):
 def write(comm, folder, factor=1.0, **scalars):
     mine = dealt(comm)
     arrays = {"position": factor * X[mine], "velocity": -factor * X[mine], "kind": mine % 3}
-    write_checkpoint(folder, FileOrder(comm, mine, N), arrays, {**SCALARS, **scalars})
+    file = checkpoint_file(folder, FileOrder(comm, mine, N), arrays, {**SCALARS, **scalars})
+    write_collective([file], comm)
 
 
 def change(comm, work):

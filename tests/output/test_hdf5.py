@@ -3,11 +3,12 @@ import resource
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output import slabs
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.hdf5 import SERIAL_VARIABLE, read_slab, write_collective, writes_collectively
+from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.ordering import FileOrder
 
 pytestmark = pytest.mark.parallel
@@ -15,10 +16,15 @@ pytestmark = pytest.mark.parallel
 h5py = import_h5py()
 
 
-@pytest.fixture(params=["library's choice", "through rank 0"])
-def path_of_writing(request, monkeypatch):
-    monkeypatch.setenv(SERIAL_VARIABLE, "1" if request.param == "through rank 0" else "0")
-    return request.param
+WAYS = {"one machine": "_write_alone", "MPI-IO": "_write_through_mpi", "in turn": "_write_alone"}
+
+
+@pytest.fixture(params=WAYS)
+def way(request, monkeypatch):
+    """How slabs are written, with the name of the function that does it."""
+    monkeypatch.setattr(slabs, "on_one_machine", lambda comm: request.param == "one machine")
+    monkeypatch.setenv(slabs.TURNS_VARIABLE, "1" if request.param == "in turn" else "0")
+    return WAYS[request.param]
 
 
 def whole(n):
@@ -37,22 +43,40 @@ def everything(path):
         return found
 
 
-def test_the_path_under_test_is_the_one_taken(comm, path_of_writing):
-    able = comm.size > 1 and h5py.get_config().mpi
-    assert writes_collectively(comm) == (able and path_of_writing == "library's choice")
+def test_the_way_under_test_is_the_one_taken(comm, shared_tmp, way, monkeypatch):
+    taken = set()
+    for name in WAYS.values():
+        work = getattr(slabs, name)
+
+        def noted(*given, work=work, name=name, **keywords):
+            taken.add(name)
+            return work(*given, **keywords)
+
+        monkeypatch.setattr(slabs, name, noted)
+    write_collective([NewFile(shared_tmp / "a.h5", {"x": slab_of(comm, whole(10))}, {})], comm)
+    assert taken == {way}
+
+
+def test_ranks_take_turns_where_mpi_io_opens_nothing(comm, shared_tmp, monkeypatch):
+    class Closed:
+        @staticmethod
+        def Open(*arguments):
+            raise MPI.Exception(MPI.ERR_FILE)
+
+    x = whole(10)
+    monkeypatch.setattr(slabs, "on_one_machine", lambda comm: False)
+    monkeypatch.setattr(slabs.MPI, "File", Closed)
+    write_collective([NewFile(shared_tmp / "a.h5", {"x": slab_of(comm, x)}, {})], comm)
+    np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
 
 
 @pytest.mark.parametrize("n", [1, 2, 1001])
-def test_slabs_become_one_array(comm, shared_tmp, path_of_writing, n):
+def test_slabs_become_one_array(comm, shared_tmp, way, n):
     x, owner = whole(n), np.arange(n, dtype=np.int32)
     attributes = {"states/000000": {"time": 0.1, "step": 3}, "states/000000/x": {"unit": "m"}}
     path = shared_tmp / "a.h5"
-    write_collective(
-        path,
-        {"states/000000/x": slab_of(comm, x), "states/000000/owner": slab_of(comm, owner)},
-        attributes,
-        comm,
-    )
+    datasets = {"states/000000/x": slab_of(comm, x), "states/000000/owner": slab_of(comm, owner)}
+    write_collective([NewFile(path, datasets, attributes)], comm)
     found = everything(path)
     np.testing.assert_array_equal(found["states/000000/x"], x)
     np.testing.assert_array_equal(found["states/000000/owner"], owner)
@@ -64,16 +88,16 @@ def test_slabs_become_one_array(comm, shared_tmp, path_of_writing, n):
     assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
 
 
-def test_ranks_without_rows(comm, shared_tmp, path_of_writing):
+def test_ranks_without_rows(comm, shared_tmp, way):
     x = whole(10)
     mine = x if comm.rank == comm.size - 1 else x[:0]
-    write_collective(shared_tmp / "a.h5", {"x": mine}, {}, comm)
+    write_collective([NewFile(shared_tmp / "a.h5", {"x": mine}, {})], comm)
     np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
 
 
-def test_read_on_another_cut_of_rows(comm, shared_tmp, path_of_writing):
+def test_read_on_another_cut_of_rows(comm, shared_tmp, way):
     x = whole(50)
-    write_collective(shared_tmp / "a.h5", {"x": x if comm.rank == 0 else x[:0]}, {}, comm)
+    write_collective([NewFile(shared_tmp / "a.h5", {"x": x if comm.rank == 0 else x[:0]}, {})], comm)
     mine = np.arange(comm.rank, 50, comm.size)[::-1]
     order = FileOrder(comm, mine, 50)
     np.testing.assert_array_equal(order.from_slab(read_slab(shared_tmp / "a.h5", "x", order)), x[mine])
@@ -90,39 +114,41 @@ def still_there(comm, path, x):
     comm.Barrier()
 
 
-def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, path_of_writing):
+def test_a_full_disk_leaves_the_old_file(comm, shared_tmp, way):
     """A limit on the size of files stands for the full disk."""
     path = shared_tmp / "a.h5"
-    write_collective(path, {"x": slab_of(comm, whole(4))}, {}, comm)
+    write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
     try:
         with pytest.raises(OutputError, match=r"a\.h5: cannot be written: File too large"):
-            write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
+            write_collective([NewFile(path, {"x": slab_of(comm, whole(20_000))}, {})], comm)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     still_there(comm, path, whole(4))
-    write_collective(path, {"x": slab_of(comm, whole(20_000))}, {}, comm)
+    write_collective([NewFile(path, {"x": slab_of(comm, whole(20_000))}, {})], comm)
     still_there(comm, path, whole(20_000))
 
 
-def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, path_of_writing, monkeypatch):
+def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, way, monkeypatch):
     path = shared_tmp / "a.h5"
-    write_collective(path, {"x": slab_of(comm, whole(4))}, {}, comm)
-    failing = comm.size - 1 if writes_collectively(comm) else 0
-    write_rows = slabs._write_rows
+    write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
+    name = "_write_rows_together" if way == "_write_through_mpi" else "_write_rows"
+    right = getattr(slabs, name)
 
     def write_and_fail(*arguments):
-        write_rows(*arguments)
-        if comm.rank == failing:
+        right(*arguments)
+        if comm.rank == comm.size - 1:
             raise OSError(errno.ENOSPC, "as the library words it")
 
-    monkeypatch.setattr(slabs, "_write_rows", write_and_fail)
+    monkeypatch.setattr(slabs, name, write_and_fail)
     with pytest.raises(OutputError, match=r"a\.h5: cannot be written: No space left on device"):
-        write_collective(path, {"x": slab_of(comm, whole(100)), "y": slab_of(comm, whole(7))}, {}, comm)
+        write_collective(
+            [NewFile(path, {"x": slab_of(comm, whole(100)), "y": slab_of(comm, whole(7))}, {})], comm
+        )
     still_there(comm, path, whole(4))
 
 
-def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, path_of_writing):
+def test_a_missing_folder_is_an_output_error_on_every_rank(comm, shared_tmp, way):
     with pytest.raises(OutputError, match="cannot be written"):
-        write_collective(shared_tmp / "missing" / "a.h5", {"x": slab_of(comm, whole(4))}, {}, comm)
+        write_collective([NewFile(shared_tmp / "missing" / "a.h5", {"x": slab_of(comm, whole(4))}, {})], comm)

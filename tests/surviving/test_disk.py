@@ -29,10 +29,10 @@ sys.exit(run_command_line(sys.argv))
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 200 kB."""
+    """A file system of 300 kB."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(folder)]
+    words = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
     if shutil.which("mount") is None or subprocess.run(words, capture_output=True).returncode != 0:
         pytest.skip("mounting a tmpfs is not permitted here")
     yield folder
@@ -72,7 +72,7 @@ def test_a_full_disk(tmp_path: Path, small_disk: Path, ranks: int) -> None:
 
 
 def test_a_disk_full_from_the_start(tmp_path: Path, small_disk: Path) -> None:
-    (small_disk / "filler").write_bytes(bytes(150_000))
+    (small_disk / "filler").write_bytes(bytes(250_000))
     left = lyra(["run", write_scene(tmp_path, ENDLESS), "--out", "disk/out"], tmp_path)
     refused(left, "No space left on device")
     (small_disk / "filler").unlink()

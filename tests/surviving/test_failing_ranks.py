@@ -52,7 +52,7 @@ PLACES = {
     "assembly": ("model", "BlockPattern", 0),
     "residual": ("stepping.system", "ReducedSystem.residual", 25),
     "jacobian": ("stepping.system", "ReducedSystem.jacobian", 9),
-    "writing a state": ("output.hdf5", "write_by_all", 3),
+    "writing a state": ("output.hdf5", "write_slabs", 3),
     "a row of the history": ("output.history", "History.append", 4),
 }
 

@@ -12,13 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lyra_petsc.block_rows.vectors import AHEAD, gather, scatter
 from lyra_petsc.kernel_cache import cached
-from lyra_petsc.solvers.prefetch import prefetch
 
 Index = np.uintp
-
-AHEAD = Index(64)
-"""Blocks by which they are fetched before they are used: each row waits for the one before it."""
 
 TINY = np.float32(1e-20)
 """Velocities [m/s] below it are none."""
@@ -74,82 +71,57 @@ def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
         inverse[row, 6], inverse[row, 7], inverse[row, 8] = r, v, w
 
 
+@cached(inline="always")
+def _solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """A point's unknowns by the inverse of its block."""
+    y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
+    y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
+    y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
+    return _flushed(y0), _flushed(y1), _flushed(y2)
+
+
 @cached(fastmath=True)
-def backward(indptr, columns, n_owned, blocks, inverse, x, r):  # type: ignore[no-untyped-def]
+def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-untyped-def]
     """A backward sweep from x (n_local, 3) over the owned points: (D + Lᵀ) x = r.
 
-    r (n_owned, 3) is what ``forward`` leaves, b − L x before (b, where x is zero), and b − A x after it; but
+    ``ends`` (n_owned,) says where a row's couplings to ghosts begin. r (n_owned, 4), whose last numbers mean
+    nothing, is what ``forward`` leaves, b − L x before (b, where x is zero), and b − A x after it; but
     for what has changed in couplings to ghosts.
     """
-    for below in range(Index(n_owned)):
-        row = Index(n_owned - 1) - below
-        s0, s1, s2 = r[row, 0], r[row, 1], r[row, 2]
+    n = Index(len(ends))
+    for below in range(n):
+        row = n - Index(1) - below
+        lo, hi = Index(indptr[row] + 1), Index(ends[row])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
+        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
-        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
-        for k in range(lo, hi):
-            c = Index(columns[k])
-            if c >= Index(n_owned):
-                hi = Index(k)
-                break
-            prefetch(blocks, k - AHEAD)
-            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            s0 -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
-            s1 -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
-            s2 -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
-        y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
-        y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
-        y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
-        y0, y1, y2 = _flushed(y0), _flushed(y1), _flushed(y2)
-        d0, d1, d2 = y0 - x[row, 0], y1 - x[row, 1], y2 - x[row, 2]
-        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
-        for k in range(lo, hi):
-            c = Index(columns[k])
-            r[c, 0] -= blocks[k, 0] * d0 + blocks[k, 1] * d1 + blocks[k, 2] * d2
-            r[c, 1] -= blocks[k, 3] * d0 + blocks[k, 4] * d1 + blocks[k, 5] * d2
-            r[c, 2] -= blocks[k, 6] * d0 + blocks[k, 7] * d1 + blocks[k, 8] * d2
+        scatter(blocks, columns, r, lo, hi, less)
 
 
 @cached(fastmath=True)
-def subtract_ghosts(indptr, columns, n_owned, blocks, x, r):  # type: ignore[no-untyped-def]
+def subtract_ghosts(indptr, ends, columns, blocks, x, r):  # type: ignore[no-untyped-def]
     """r −= the couplings of the owned rows to ghosts times x (n_local, 3)."""
-    for row in range(Index(n_owned)):
-        for k in range(indptr[row + Index(1)] - 1, indptr[row], -1):
-            c = Index(columns[k])
-            if c < Index(n_owned):
-                break
-            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            r[row, 0] -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
-            r[row, 1] -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
-            r[row, 2] -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
+    for row in range(Index(len(ends))):
+        s0, s1, s2 = gather(blocks, columns, x, Index(ends[row]), Index(indptr[row + Index(1)]), AHEAD)
+        r[row, 0] -= s0
+        r[row, 1] -= s1
+        r[row, 2] -= s2
 
 
 @cached(fastmath=True)
-def forward(indptr, columns, n_owned, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
-    """A forward sweep from x (n_local, 3), ghosts as they are; r (n_owned, 3) becomes b − L x."""
-    for row in range(Index(n_owned)):
+def forward(indptr, ends, columns, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
+    """A forward sweep from x (n_local, 3), ghosts as they are; r (n_owned, 4) becomes b − L x."""
+    n = Index(len(ends))
+    for row in range(n):
         r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
-    for row in range(Index(n_owned)):
-        s0, s1, s2 = r[row, 0], r[row, 1], r[row, 2]
+    for row in range(n):
         lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
-        for k in range(lo, hi):
-            c = Index(columns[k])
-            prefetch(blocks, k + AHEAD)
-            x0, x1, x2 = x[c, 0], x[c, 1], x[c, 2]
-            s0 -= blocks[k, 0] * x0 + blocks[k, 3] * x1 + blocks[k, 6] * x2
-            s1 -= blocks[k, 1] * x0 + blocks[k, 4] * x1 + blocks[k, 7] * x2
-            s2 -= blocks[k, 2] * x0 + blocks[k, 5] * x1 + blocks[k, 8] * x2
-        y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
-        y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
-        y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
-        y0, y1, y2 = _flushed(y0), _flushed(y1), _flushed(y2)
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
-        for k in range(lo, hi):
-            c = Index(columns[k])
-            if c >= Index(n_owned):
-                break
-            r[c, 0] -= blocks[k, 0] * y0 + blocks[k, 1] * y1 + blocks[k, 2] * y2
-            r[c, 1] -= blocks[k, 3] * y0 + blocks[k, 4] * y1 + blocks[k, 5] * y2
-            r[c, 2] -= blocks[k, 6] * y0 + blocks[k, 7] * y1 + blocks[k, 8] * y2
+        scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
 
 
 @cached(fastmath=True)

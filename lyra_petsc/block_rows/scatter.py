@@ -1,0 +1,31 @@
+"""Element blocks added to block rows, where the ``offsets`` of the pattern say.
+
+An element's offsets are those of its pairs of points (0, 0), (0, 1), …, (n − 1, n − 1): twice the number of
+the block that the pair is added to, plus 1 where it is added transposed; negative where others have it.
+"""
+
+from __future__ import annotations
+
+from lyra_petsc.kernel_cache import cached
+
+
+@cached(fastmath={"contract", "nsz"})
+def add_element(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
+    """Add weight times the blocks (n, n, 3, 3) of one element to values (n_blocks, 3, 3)."""
+    pair = 0
+    for a in range(blocks.shape[0]):
+        for b in range(a, blocks.shape[0]):
+            at = offsets[pair]
+            pair += 1
+            if at >= 0:
+                row, column = (b, a) if at & 1 else (a, b)
+                for i in range(3):
+                    for j in range(3):
+                        values[at >> 1, i, j] += weight * blocks[row, column, i, j]
+
+
+@cached(fastmath={"contract", "nsz"})
+def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
+    """Add weight (E,) times the blocks (E, n, n, 3, 3) of elements with offsets (E, n (n + 1) / 2)."""
+    for e in range(offsets.shape[0]):
+        add_element(weight[e], blocks[e], offsets[e], values)

@@ -1,0 +1,170 @@
+"""What kernels do with a row of 3×3 blocks, a column of a block at a time in the processor's vectors.
+
+Numba leaves such loops scalar; here they are written in LLVM's language, which every processor has vectors
+or a substitute for. Blocks are (n_blocks, 9), column by column. A fourth number is read, and computed, with
+each three; of the blocks it is always one of the same block.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
+
+WIDTH = 4
+"""Numbers in a vector."""
+
+AHEAD = 64
+"""Blocks by which they are fetched before they are used: in a sweep each row waits for the one before it."""
+
+FLAGS = ("contract", "nsz")
+"""What may be done to sums and products: fused, and the sign of zero forgotten."""
+
+READ, KEEP, DATA = 0, 3, 1
+"""Arguments of ``llvm.prefetch``: to be read, to stay in all caches, no instructions."""
+
+Value = Any
+"""A value, or a pointer, in LLVM's language."""
+
+INDEX, LANE = ir.IntType(64), ir.IntType(32)
+
+
+class _Code:
+    """Writes the code of one call with named arguments."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any, names: str) -> None:
+        self._context, self.builder = context, builder
+        self.given = dict(zip(names.split(), arguments, strict=True))
+        self._types = dict(zip(names.split(), signature.args, strict=True))
+        self.vector = ir.VectorType(context.get_value_type(self._types["blocks"].dtype), WIDTH)
+
+    def begin(self, name: str) -> Value:
+        """Where an array begins."""
+        made = self._context.make_array(self._types[name])
+        return made(self._context, self.builder, self.given[name]).data
+
+    def integer(self, name: str) -> Value:
+        return self._context.cast(self.builder, self.given[name], self._types[name], types.int64)
+
+    def at(self, begin: Value, row: Value, width: int) -> Value:
+        """Where a row of an array begins."""
+        return self.builder.gep(begin, [self.builder.mul(row, INDEX(width))])
+
+    def number(self, begin: Value, position: Value) -> Value:
+        """An entry of an array of indices."""
+        found = self.builder.load(self.builder.gep(begin, [position]))
+        return found if found.type == INDEX else self.builder.zext(found, INDEX)
+
+    def load(self, pointer: Value) -> Value:
+        """A vector of what stands in memory from there on."""
+        found = self.builder.load(self.builder.bitcast(pointer, self.vector.as_pointer()))
+        found.align = self._size
+        return found
+
+    def store(self, vector: Value, pointer: Value) -> None:
+        self.builder.store(vector, self.builder.bitcast(pointer, self.vector.as_pointer())).align = self._size
+
+    @property
+    def _size(self) -> int:
+        return 8 if isinstance(self.vector.element, ir.DoubleType) else 4
+
+    def pick(self, one: Value, other: Value, *lanes: int) -> Value:
+        """A vector of these numbers of two vectors; those of the other are counted on."""
+        return self.builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(LANE, WIDTH), list(lanes)))
+
+    def nothing(self) -> Value:
+        return ir.Constant(self.vector, ir.Undefined)
+
+    def repeat(self, scalar: Value) -> Value:
+        """A vector of one number."""
+        first = self.builder.insert_element(self.nothing(), scalar, LANE(0))
+        return self.pick(first, self.nothing(), 0, 0, 0, 0)
+
+    def columns(self, block: Value) -> list[Value]:
+        """The three columns of a block; what follows the last is not read."""
+        one, two, last = (self.load(self.builder.gep(block, [INDEX(first)])) for first in (0, 3, 5))
+        return [one, two, self.pick(last, self.nothing(), 1, 2, 3, 3)]
+
+    def times(self, one: Value, other: Value) -> Value:
+        return self.builder.fmul(one, other, flags=FLAGS)
+
+    def plus(self, one: Value, other: Value) -> Value:
+        return self.builder.fadd(one, other, flags=FLAGS)
+
+    def fetch(self, pointer: Value) -> None:
+        """Let memory come into the caches; it need not be ours."""
+        byte = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, LANE, LANE, LANE])
+        function = self.builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        self.builder.call(function, [self.builder.bitcast(pointer, byte), LANE(READ), LANE(KEEP), LANE(DATA)])
+
+    def loop(self) -> Any:
+        """Over the blocks from ``lo`` to ``hi``."""
+        return cgutils.for_range_slice(
+            self.builder, self.integer("lo"), self.integer("hi"), INDEX(1), intp=INDEX
+        )
+
+
+def _check(*arrays: Any) -> None:
+    kinds = {array.dtype for array in arrays}
+    if len(kinds) > 1 or any(array.layout != "C" or array.ndim != 2 for array in arrays):
+        raise TypingError("contiguous arrays of two dimensions and one type are expected")
+
+
+def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
+    """Sum of blocks[k] x[columns[k]] for lo ≤ k < hi, three numbers; x (n, 3).
+
+    Each time the block is fetched that will be needed ``ahead`` blocks later.
+    """
+    _check(blocks, x)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks columns x lo hi ahead")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("x")
+        ahead = code.integer("ahead")
+        zero = ir.Constant(code.vector, [0.0] * WIDTH)
+        sums = [cgutils.alloca_once_value(builder, zero) for _ in range(3)]  # type: ignore[no-untyped-call]
+        with code.loop() as (k, _):
+            code.fetch(code.at(block_rows, builder.add(k, ahead), 9))
+            source = code.at(vectors, code.number(numbers, k), 3)
+            for i, column in enumerate(code.columns(code.at(block_rows, k, 9))):
+                factor = code.repeat(builder.load(builder.gep(source, [INDEX(i)])))
+                builder.store(code.plus(builder.load(sums[i]), code.times(column, factor)), sums[i])
+        one, two, three = map(builder.load, sums)
+        total = code.plus(code.plus(one, two), three)
+        found = [builder.extract_element(total, LANE(i)) for i in range(3)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
+    return three(blocks, columns, x, lo, hi, ahead), generate
+
+
+def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
+    """out[columns[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; out (n, 4), the last of no meaning."""
+    _check(blocks, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks columns out lo hi factors")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("out")
+        row = code.nothing()
+        for i, factor in enumerate(cgutils.unpack_tuple(builder, code.given["factors"])):  # type: ignore[no-untyped-call]
+            row = builder.insert_element(row, factor, LANE(i))
+        with code.loop() as (k, _):
+            a, b, c = (code.times(column, row) for column in code.columns(code.at(block_rows, k, 9)))
+            # the sums of a, b and c, whose fourth numbers mean nothing
+            ab, last = code.pick(a, b, 0, 4, 1, 5), code.pick(a, b, 2, 6, 2, 6)
+            first, second = code.pick(ab, c, 0, 1, 4, 4), code.pick(ab, c, 2, 3, 5, 5)
+            total = code.plus(code.plus(first, second), code.pick(last, c, 0, 1, 6, 6))
+            target = code.at(vectors, code.number(numbers, k), WIDTH)
+            code.store(code.plus(code.load(target), total), target)
+        return context.get_dummy_value()
+
+    return types.void(blocks, columns, out, lo, hi, factors), generate
+
+
+# their callers leave out ``typing``
+gather: Any = intrinsic(_gather)
+scatter: Any = intrinsic(_scatter)
