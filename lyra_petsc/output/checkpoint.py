@@ -13,11 +13,12 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.slabs import cannot_write
 from lyra_petsc.parallel import on_root
 
 CHECKPOINT = "checkpoint.h5"
@@ -86,7 +87,7 @@ def _rotate(folder: Path) -> None:
             os.replace(folder / CHECKPOINT, folder / PREVIOUS)
         os.replace(folder / NEXT, folder / CHECKPOINT)
     except OSError as error:
-        raise OutputError(f"{folder / CHECKPOINT}: cannot be replaced: {reason(error)}") from error
+        raise cannot_write(folder / CHECKPOINT, error) from error
 
 
 def read_checkpoint(folder: str | os.PathLike[str], order: FileOrder) -> Checkpoint:
