@@ -43,7 +43,7 @@ SMALLEST_ADAPTED = 1e-6
 
 @dataclass
 class StepReport:
-    """One accepted step; ``increment`` [m] is what the last Newton iteration still moved."""
+    """One accepted step; ``left`` [m] is what more Newton iterations would move."""
 
     step: int
     time: float
@@ -55,7 +55,7 @@ class StepReport:
     wall_seconds: float
     smallest_stretch: float = 1.0
     largest_stretch: float = 1.0
-    increment: float = math.inf
+    left: float = math.inf
 
 
 def _positive(name: str, seconds: float) -> float:
@@ -204,7 +204,7 @@ class Simulation:
         seconds = clock.perf_counter() - started
         took = newton, linear, rejected, attempt.residual, seconds
         stretch = self.compression.smallest, self.compression.largest
-        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.increment)
+        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.left)
 
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""

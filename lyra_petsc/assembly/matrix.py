@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.assembly.product import HalfStored, MatMult, Multiply, Whole
+from lyra_petsc.assembly.product import HalfStored, MatMult, Whole
 from lyra_petsc.assembly.storage import KINDS, Storage, StoredRows
 from lyra_petsc.errors import InputError
 from lyra_petsc.partition.points import Points
@@ -80,17 +80,19 @@ class SystemMatrix:
                 self._storage = Storage(self.mat, self.kind, pattern, self._stored)
         self._shape, self._beside = (pattern.n_blocks, 3, 3), beside
         self._half = self.kind == "sbaij" and self._storage is not None
-        multiply = self._product(pattern)
-        if multiply is not None:
-            with suppress(AttributeError, OSError):
-                self._mult = MatMult(self.mat, points, multiply, pattern.n_couplings)
+        with suppress(AttributeError, OSError):
+            self._mult = self._faster_product(points, pattern)
 
-    def _product(self, pattern: BlockPattern) -> Multiply | None:
-        """A product that is faster than PETSc's, if there is one."""
+    def _faster_product(self, points: Points, pattern: BlockPattern) -> MatMult | None:
+        """A product in place of PETSc's, if there is a faster one."""
         if self._half:
-            return HalfStored(pattern, self.rows)
+            return MatMult(self.mat, HalfStored(pattern, self.rows), pattern.n_couplings, points)
         array = self._storage.whole if self._storage is not None else None
-        return Whole(self.mat, array) if array is not None else None
+        if array is None:
+            return None
+        # of several ranks PETSc multiplies by this part while the ghosts' values are on their way
+        inside = self.mat.getDiagonalBlock()
+        return MatMult(inside, Whole(inside, array), len(array))
 
     def _preallocate(self, comm: MPI.Comm) -> None:
         inside, outside = self._stored.inside, self._stored.outside

@@ -59,7 +59,7 @@ class HalfStored:
 
 
 class Whole:
-    """Products with all blocks of the rows of a matrix on one rank.
+    """Products with all blocks of the rows of a matrix of one rank.
 
     Parameters
     ----------
@@ -83,11 +83,12 @@ class MatMult:
     Parameters
     ----------
     mat : PETSc.Mat
-    points : Points
     multiply : Multiply
         By the values of this matrix.
     couplings : int
         Blocks that are multiplied, for PETSc's count of operations.
+    points : Points or None
+        Whose ghosts a product takes; a matrix of one rank takes none.
 
     Raises
     ------
@@ -95,14 +96,17 @@ class MatMult:
         If the C library does not offer the calls.
     """
 
-    def __init__(self, mat: PETSc.Mat, points: Points, multiply: Multiply, couplings: int) -> None:
+    def __init__(
+        self, mat: PETSc.Mat, multiply: Multiply, couplings: int, points: Points | None = None
+    ) -> None:
         library = ctypes.CDLL(PETSc.__file__)
         self._read, self._read_ended = library.VecGetArrayRead, library.VecRestoreArrayRead
         self._write, self._write_ended = library.VecGetArray, library.VecRestoreArray
-        self._points, self._multiply = points, multiply
-        self._size = ctypes.c_double * (3 * points.n_owned)
+        self._multiply = multiply
+        self._size = ctypes.c_double * mat.getLocalSize()[0]
         self._seen: dict[int | None, Array] = {None: np.empty((0, 3))}  # of no rows
-        self._local = np.zeros((points.n_local, 3)) if points.comm.size > 1 else None
+        self._points = points if points is not None and points.comm.size > 1 else None
+        self._local = np.zeros((points.n_local if points is not None else 0, 3))
         self._operations = 2.0 * 9.0 * couplings
         self._callback = _Operation(self._mult)
         self._handle, usual = int(mat.handle), ctypes.c_void_p()
@@ -111,7 +115,7 @@ class MatMult:
         library.MatSetOperation(ctypes.c_void_p(mat.handle), MATOP_MULT, self._callback)
 
     def _mult(self, mat: int, x: int, y: int) -> int:
-        """y = A x; collective. Its result is PETSc's error code."""
+        """y = A x; collective where there are ghosts. Its result is PETSc's error code."""
         if mat != self._handle:  # a copy, which has taken this operation along but has its own values
             return int(self._usual(mat, x, y))
         source, target = ctypes.c_void_p(x), ctypes.c_void_p(y)
@@ -140,7 +144,7 @@ class MatMult:
         return found
 
     def _with_ghosts(self, x: Array) -> Array:
-        if self._local is None:
+        if self._points is None:
             return x
         self._local[: len(x)] = x
         self._points.update_ghosts(self._local)

@@ -196,7 +196,7 @@ class Storage:
     shared : (n_blocks, 3, 3) or None
         PETSc's array, where that is block rows as the pattern has them; as long as the matrix lives.
     whole : (blocks, 3, 3) or None
-        PETSc's array of all blocks of all rows on one rank; as long as the matrix lives.
+        PETSc's array of all blocks in owned columns, of ``baij``; as long as the matrix lives.
 
     Raises
     ------
@@ -211,13 +211,14 @@ class Storage:
         self._mat, self._stored = mat, stored
         self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
         self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
-        self._half, several = kind == "sbaij", mat.getComm().size > 1
-        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if several and not self._half else None
+        self._half, self._several = kind == "sbaij", mat.getComm().size > 1
+        split = self._several and not self._half
+        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if split else None
         self._fill = {"aij": _to_aij, "baij": _to_baij, "sbaij": _to_sbaij}[kind]
         self.shared: Array | None = None
         self.whole: Array | None = None
-        if kind != "aij" and not several:
-            part = ctypes.c_void_p(mat.handle)
+        if kind == "baij" or (self._half and not self._several):
+            part = self._parts()[0]
             array = self._array(part, self._sizes[0]).reshape(-1, 3, 3)
             self._give_back(part, ctypes.byref(ctypes.c_void_p()))
             self.shared, self.whole = (array, None) if self._half else (None, array)
@@ -233,15 +234,20 @@ class Storage:
             self._copy(values)
         self._mat.assemble()
 
-    def _copy(self, values: Array) -> None:
+    def _parts(self) -> list[ctypes.c_void_p]:
+        """The matrices of this rank that keep the entries: of owned columns, and of ghosts."""
         whole = ctypes.c_void_p(self._mat.handle)
-        parts = [whole]
-        diagonal = None
-        if self._split is not None:
-            inside, outside, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
-            self._split(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
-            parts = [inside, outside]
-        elif self._half:  # PETSc does not tell where the other part is
+        if not self._several:
+            return [whole]
+        if self._split is None:
+            return []
+        inside, outside, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
+        self._split(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
+        return [inside, outside]
+
+    def _copy(self, values: Array) -> None:
+        parts, diagonal = self._parts(), None
+        if self._half and not parts:  # PETSc does not tell where the other part is
             diagonal = self._mat.getDiagonalBlock()
             parts = [ctypes.c_void_p(diagonal.handle)]
         arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]

@@ -200,7 +200,7 @@ class Solver(Block):
     force_tolerance : float
         Force residual over the forces at work.
     step_tolerance : float
-        Last increment over element size.
+        How far a coordinate is expected to move yet, over element size.
     max_iterations : int
         Newton iterations a step may take.
     hessian : str

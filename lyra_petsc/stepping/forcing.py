@@ -1,7 +1,7 @@
 """How exactly a Newton iteration's linear system is solved: as exactly as pays.
 
 A loose solve is enough where the residual falls from iteration to iteration. In stiff sheets what it leaves
-is stretch, and the residual does not fall: then the next solves are ten times as exact.
+is stretch, and the residual does not fall: then the next solves are ten times as exact, until it does.
 """
 
 from __future__ import annotations
@@ -13,6 +13,9 @@ LOOSEST, TIGHTEST = 1e-2, 1e-6
 
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
+
+FAST = 0.03
+"""Fraction below which a looser one would have done."""
 
 
 class Forcing:
@@ -41,5 +44,7 @@ class Forcing:
             return
         if self._norm > 0.0 and norm > SLOW * self._norm:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
+        elif norm < FAST * self._norm:
+            self.tolerance = min(LOOSEST, 10.0 * self.tolerance)
         self._norm = norm
         self._ksp.setTolerances(rtol=self.tolerance)

@@ -30,6 +30,9 @@ STALLED = 0.5
 FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
+SLOWEST = 0.5
+"""Fraction of the increment before above which an increment says nothing of the next ones."""
+
 RECENT = 0.1
 """Weight of the last Newton iteration in the mean of linear iterations that judges the linear solver."""
 
@@ -61,8 +64,8 @@ class Newton:
         Last residual norm [N].
     at_roundoff : bool
         Whether the solve ended because only round-off was left.
-    increment : float
-        Largest change of a coordinate [m] in the last iteration.
+    left : float
+        What any coordinate is expected to move yet [m], should iterations go on.
     more_linear : int
         Linear iterations of directions that were solved for again.
     too_slow : bool
@@ -101,7 +104,7 @@ class Newton:
         self._length = self._first_norm = self._at_norm = 0.0
         self._at = (0.0, 0.0)
         self._slope, self._returns = 0.0, False
-        self._stalled, self.too_slow, self.increment = 0, False, np.inf
+        self._stalled, self.too_slow, self.left, self._increment = 0, False, np.inf, 0.0
         self._fell = self._kept = self._same = False
         # a step begins as the one before did
         self._convex = self._began_convex
@@ -218,7 +221,7 @@ class Newton:
         if not np.isfinite(residual):
             return NOT_A_NUMBER
         if iteration > 0:
-            self.increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach
+            self._moved_by(snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY) * self._system.stage.reach)
         stalls = iteration > 0 and STALLED * before < residual <= self._floor
         self._stalled = self._stalled + 1 if stalls else 0
         if self._stalled > 1 or residual == 0.0:
@@ -242,9 +245,18 @@ class Newton:
         scale = self._system.largest_force()
         if (
             residual <= self._tolerances.force_tolerance * scale
-            and self.increment <= self._tolerances.step_tolerance * self._spacing
+            and self.left <= self._tolerances.step_tolerance * self._spacing
         ):
             return int(Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < self.increment <= stol * self._spacing:
+        if 0.0 < self.left <= stol * self._spacing:
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
+
+    def _moved_by(self, increment: float) -> None:
+        """Expect increments to go on falling as they fell last, where the residual shows that they may.
+
+        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.)
+        """
+        fell = increment / self._increment if self._fell and self._increment > 0.0 else 1.0
+        self._increment = increment
+        self.left = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)

@@ -42,7 +42,7 @@ class Attempt:
     newton_iterations: int
     linear_iterations: int
     residual: float
-    increment: float = math.inf
+    left: float = math.inf
     words: str = ""
     at_roundoff: bool = False
     stuck: Stuck | None = None
@@ -280,7 +280,7 @@ class Stepper:
                     newton,
                     linear,
                     self._newton.norm,
-                    self._newton.increment,
+                    self._newton.left,
                     at_roundoff=self._newton.at_roundoff,
                 )
         else:

@@ -54,9 +54,9 @@ def resolved(record: Record) -> Verdict:
     """
     steps = zip(record.balances, record.reports, strict=True)
     by_force = [_over(balance.residual, RESOLVED * balance.driving) for balance in record.balances]
-    by_way = [_over(report.increment, RESOLVED * balance.push) for balance, report in steps]
+    by_way = [_over(report.left, RESOLVED * balance.push) for balance, report in steps]
     number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_way[i]))
-    worst, last = record.balances[number], record.reports[number].increment
+    worst, last = record.balances[number], record.reports[number].left
     words = (
         f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
     )

@@ -49,10 +49,11 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel
-def test_copies_of_a_matrix_multiply_by_their_own_values(comm: MPI.Comm) -> None:
+@pytest.mark.parametrize("kind", ["baij", "sbaij"])
+def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.model.points, simulation.model.pattern
-        matrix = SystemMatrix(points, pattern, "sbaij", given=False)
+        matrix = SystemMatrix(points, pattern, kind, given=False)
         matrix.set(symmetric(points, pattern, 0.5))
         copy = matrix.mat.duplicate(copy=True)
         copy.scale(3.0)

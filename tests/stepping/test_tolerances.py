@@ -1,0 +1,56 @@
+"""What a step still lacks when it counts as solved is what its tolerances allow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.simulation import Simulation
+
+pytestmark = pytest.mark.parallel
+
+
+def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:
+    """A square that falls from level on two corners in a side wind, 1/8 m between its vertices."""
+    membrane = {name: stiffness * value for name, value in CLOTH["membrane"].items()}
+    return {
+        "mesh": grid(1.0, 1.0, 8, 8, "alternating"),
+        "material": CLOTH | {"membrane": membrane, "bending": 1e-4, "damping": 0.002},
+        "gravity": [0.0, 0.0, -9.81],
+        "wind": {"velocity": [2.0, 3.0, 0.0], "density": 1.2, "drag": 0.1},
+        "handles": [{"nodes": [0, 8]}],
+        "time": {"end": 12 * dt, "step": dt},
+        "solver": {"force_tolerance": tolerance, "step_tolerance": tolerance},
+    }
+
+
+def state_of(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    return simulation.model.system.x, simulation.model.system.v
+
+
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+@pytest.mark.parametrize(("stiffness", "dt"), [(1.0, 0.01), (1.0, 0.04), (1000.0, 0.01)])
+def test_positions_are_as_near_as_asked(
+    stiffness: float, dt: float, tolerance: float, comm: MPI.Comm
+) -> None:
+    asked = Simulation(comm, scene_of(sheet(stiffness, dt, tolerance)))
+    exact = Simulation(comm, scene_of(sheet(stiffness, dt, 1e-11)))
+    spacing = asked.model.outline.spacing
+    iterations = []
+    while not asked.finished:
+        for values, state in zip(state_of(exact), state_of(asked), strict=True):
+            points = exact.model.points
+            values[: points.n_owned] = gathered(asked.model.points, state)[points.original]
+            points.update_ghosts(values)
+        report, beside = asked.step(), exact.step()
+        iterations.append((report.newton_iterations, beside.newton_iterations))
+        x, true = (gathered(one.model.points, one.model.system.x) for one in (asked, exact))
+        assert np.abs(x - true).max() <= tolerance * spacing
+        assert report.left <= tolerance * spacing
+    assert any(fewer < more for fewer, more in iterations)
+    asked.destroy()
+    exact.destroy()
