@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.fields import Field, chosen
 from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.background import Background
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
 from lyra_petsc.output.failure import Moment, remove_failure, write_failure
 from lyra_petsc.output.hdf5 import NewFile, write_collective
@@ -69,6 +70,7 @@ class Recorder:
             own = elements.index[: elements.n_owned]
             self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
         self._comm = points.comm
+        self._background = Background(points.comm)
         self._last_checkpoint = clock.monotonic()
         self._steps_since = 0
         self._last_state = -1
@@ -87,6 +89,7 @@ class Recorder:
         self._open(folder, None)
         self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
         self.write_state()
+        self.settle()
 
     def resume(self, folder: Path) -> None:
         """Put the newest checkpoint into the simulation and cut the files behind it.
@@ -171,6 +174,7 @@ class Recorder:
             n_triangles=self._simulation.model.outline.n_triangles,
             resume_after=resume_after,
             vtkhdf=self._simulation.scene.output.vtkhdf,
+            background=self._background,
         )
         opened = {
             name: History(folder / name, columns, self._comm, resume_after=resume_after)
@@ -182,7 +186,7 @@ class Recorder:
     # -- a step --------------------------------------------------------------------------------------
 
     def record(self, report: StepReport) -> None:
-        """Everything that the step just accepted has to leave on disk."""
+        """Everything that the step just accepted has to leave on disk, be it during the next ones."""
         self._write_row(report)
         self._steps_since += 1
         control = self._simulation.control
@@ -252,7 +256,7 @@ class Recorder:
     # -- states --------------------------------------------------------------------------------------
 
     def write_state(self) -> None:
-        """Write and announce the present state, unless it is written already, and a checkpoint of it."""
+        """Write the present state, to be announced, unless it is written already, and a checkpoint of it."""
         simulation = self._simulation
         if simulation.step_number == self._last_state:
             self.write_checkpoint()
@@ -273,7 +277,7 @@ class Recorder:
     def write_checkpoint(self) -> None:
         """Replace the checkpoint by the present state."""
         with self._checkpoint(self._last_state) as checkpoint:
-            write_collective([checkpoint], self._comm)
+            write_collective([checkpoint], self._comm, self._background)
 
     @contextmanager
     def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
@@ -311,8 +315,19 @@ class Recorder:
             failure.text,
         )
 
+    def settle(self) -> None:
+        """Return when all that was written is on the disk and announced.
+
+        Raises
+        ------
+        OutputError
+            If it could not be; what was announced before stands.
+        """
+        self._background.settle()
+
     def close(self) -> None:
-        """Close the tables."""
+        """Close the tables; for one rank. What of the rest goes wrong now, only `settle` tells."""
+        self._background.close()
         for table in (self._history, self._probes, self._reactions):
             if table is not None:
                 table.close()

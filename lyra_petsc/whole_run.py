@@ -129,6 +129,8 @@ class _Journey:
                 self._tell()
                 watcher.step(simulation, report)
                 self._obey(stop)
+            with simulation.phases("output"):
+                recorder.settle()
         except SolverError as error:
             if error.collective:
                 error.details += self._keep(str(error))
@@ -172,6 +174,7 @@ class _Journey:
         """Write the last good state and the step that failed; where it can be looked at."""
         try:
             self._recorder.write_state()
+            self._recorder.settle()
             self._summarise(outcome)
             if self._simulation.failure is None:
                 return ()
@@ -184,6 +187,7 @@ class _Journey:
         number = stop()
         if number:
             self._recorder.write_checkpoint()
+            self._recorder.settle()
             raise Interrupted(
                 f"stopped by {signal.Signals(number).name} after step {self._simulation.step_number} "
                 f"(t = {self._simulation.time:g} s); the checkpoint is written, --resume goes on",

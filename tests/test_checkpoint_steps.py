@@ -45,6 +45,7 @@ def test_checkpoints_by_steps(
     steps = [written(comm, shared_tmp)]
     while not simulation.finished:
         recorder.record(simulation.step())
+        recorder.settle()
         steps.append(written(comm, shared_tmp))
     recorder.close()
     simulation.destroy()

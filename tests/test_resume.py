@@ -47,6 +47,13 @@ WAYS: dict[str, dict[str, Any]] = {
 }
 
 
+def scene_with(time: dict[str, Any]) -> dict[str, Any]:
+    scene = SCENE | {"time": time}
+    if "analysis" in time:
+        del scene["wind"]  # which turns with the sheet, and takes ten times as long to balance
+    return scene
+
+
 def journey(
     comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
 ) -> tuple[int, float]:
@@ -68,6 +75,7 @@ def journey(
     while not simulation.finished and simulation.step_number != stop:
         recorder.record(simulation.step())
     recorder.write_checkpoint()
+    recorder.settle()
     recorder.close()
     simulation.destroy()
     for name in [*options, *simulation.stepper.our_options]:
@@ -106,13 +114,13 @@ def same_files(resumed: Path, straight: Path, tolerance: float) -> None:
     assert [document.count(f">{name}:") for name in states] == [3] * len(states)  # position, velocity, stress
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("stop", [1, 2, 9])
+STOPS = [(way, stop) for way in WAYS for stop in ([1, 2] if way == "static" else [1, 2, 9])]
+
+
+@pytest.mark.parametrize(("way", "stop"), STOPS)
 def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path) -> None:
     """To round-off, on the same ranks with a direct solver."""
-    scene = SCENE | {"time": WAYS[way]}
-    if way == "static":
-        stop = min(stop, 2)
+    scene = scene_with(WAYS[way])
     straight, halted = tmp_path / "straight", tmp_path / "halted"
     end = journey(MPI.COMM_SELF, scene, straight, None)
     assert journey(MPI.COMM_SELF, scene, halted, stop)[0] == stop
@@ -124,7 +132,7 @@ def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize("way", ["bdf2", "alpha2, adaptive", "static"])
 def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
     time = WAYS[way] if way == "static" else WAYS[way] | {"end": 0.06}
-    scene = SCENE | {"time": time}
+    scene = scene_with(time)
     straight, halted, alone = (shared_tmp / name for name in ("straight", "halted", "alone"))
     end = journey(comm, scene, straight, None)
     journey(comm, scene, halted, 2 if way == "static" else 9)

@@ -1,10 +1,11 @@
 """Distributed arrays to and from HDF5 files, by any build of h5py.
 
 A file is built in three steps, so that a full disk is met where it does no harm: one rank
-reserves the whole size and lays the file out, then all ranks write their slabs, then the
-finished file takes its name. (An HDF5 file that cannot grow while it is closed takes the
-process down with it.) As datasets are contiguous and have their places then, the slabs need
-no HDF5: its collective open alone takes longer than writing a state of moderate size.
+reserves the whole size and lays the file out, then all ranks write their slabs, then it is
+synced and takes its name, for which nobody need wait. (An HDF5 file that cannot grow while
+it is closed takes the process down with it.) As datasets are contiguous and have their
+places then, the slabs need no HDF5: its collective open alone takes longer than writing a
+state of moderate size.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.agreement import HDF5_ERRORS, on_each, raise_together, reason
+from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.slabs import cannot_write, write_slabs
 from lyra_petsc.parallel import on_one_machine, on_root
@@ -35,6 +37,9 @@ Attributes = Mapping[str, Mapping[str, int | float | str]]
 
 # bytes that a file with a few dozen datasets needs beyond their data and attributes
 LARGEST_OVERHEAD = 1 << 16
+
+# bytes of data up to which a file is laid out in memory, a copy of the data's places included
+MOST_IN_MEMORY = 1 << 22
 
 
 def _nothing() -> None:
@@ -70,23 +75,28 @@ class NewFile:
         return self.path.with_name(self.path.name + ".part")
 
 
-def write_collective(files: Sequence[NewFile], comm: MPI.Comm) -> None:
+def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Background | None = None) -> None:
     """Write distributed arrays to new HDF5 files; they get their names, in this order, when all are complete.
 
     Parameters
     ----------
     files : sequence of NewFile
-        As many on every rank. Where the ranks share a machine, one lays out and syncs a file while another
-        does the next: most of the time that small files take.
+        As many on every rank. Where the ranks share a machine, one lays out a file while another does the
+        next.
     comm : MPI.Comm
         All ranks; collective.
+    background : Background or None
+        Who syncs the files and gives them their names, after what it was given before.
 
     Raises
     ------
     OutputError
         On every rank, if a file could not be written; then none gets its name, and what stood there stands.
-        Or if one could not be published; then the ones before it are.
+        Or if one could not be published; then the ones before it are. With ``background`` of the files
+        before, and of these when it is asked next.
     """
+    if background is not None:
+        background.settle()
     slabs = [{name: np.ascontiguousarray(slab) for name, slab in file.datasets.items()} for file in files]
     of_ranks = comm.allgather([[len(slab) for slab in of_file.values()] for of_file in slabs])
     lengths = [np.array([of_files[number] for of_files in of_ranks]) for number in range(len(files))]
@@ -98,16 +108,6 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm) -> None:
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
         return _guarded(file.path, lambda: _lay_out(file.part, slabs[number], rows, file.attributes))
 
-    def sync_mine() -> None:
-        for number in mine:
-            _guarded(files[number].path, partial(_sync, files[number].part))
-
-    def take_names() -> None:
-        for file in files:
-            _guarded(file.path, partial(os.replace, file.part, file.path))
-        for file in files:
-            file.publish()
-
     try:
         known = comm.allgather(on_each(comm, lambda: {number: lay_out(number) for number in mine}))
         for number, file in enumerate(files):
@@ -117,12 +117,29 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm) -> None:
                 for place, start, slab in zip(places, before, slabs[number].values(), strict=True)
             ]
             write_slabs(file.path, file.part, pieces, comm)
-        on_each(comm, sync_mine)
-        on_root(comm, take_names)
     except LyraError:
         for number in mine:
             files[number].part.unlink(missing_ok=True)
         raise
+    if background is not None:
+        background.begin(partial(_complete, files))
+    else:
+        on_root(comm, partial(_complete, files))
+
+
+def _complete(files: Sequence[NewFile]) -> None:
+    """Sync the files, then give them their names. Call on one rank."""
+    try:
+        for file in files:
+            _guarded(file.path, partial(_sync, file.part))
+        for file in files:
+            _guarded(file.path, partial(os.replace, file.part, file.path))
+    except LyraError:
+        for file in files:
+            file.part.unlink(missing_ok=True)
+        raise
+    for file in files:
+        file.publish()
 
 
 def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> NDArray[Any]:
@@ -177,23 +194,19 @@ def _lay_out(
 ) -> list[int]:
     """Create the file, its whole size reserved on disk; where each dataset is to be written [bytes].
 
-    By the library's own calls: h5py's objects over them take twice as long, which small states feel.
+    By the library's own calls: h5py's objects over them take twice as long, which small states feel. So does
+    a file that HDF5 opens beside one that is made in memory.
     """
     h5py = import_h5py()
     texts = sum(len(str(value)) for values in attributes.values() for value in values.values())
     shapes = [(count, *slab.shape[1:]) for count, slab in zip(rows, slabs.values(), strict=True)]
     data = sum(slab.itemsize * math.prod(shape) for shape, slab in zip(shapes, slabs.values(), strict=True))
-    with open(part, "wb") as raw:
-        os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD)
-    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    early.set_layout(h5py.h5d.CONTIGUOUS)
-    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
-    links.set_create_intermediate_group(True)
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-    file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=access)
+    in_memory = data <= MOST_IN_MEMORY
+    if not in_memory:
+        with open(part, "wb") as raw:
+            os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD)
+    early, links = _of_datasets()
+    file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=_of_files(in_memory))
     try:
         owners = {"/": file}
         for (name, slab), shape in zip(slabs.items(), shapes, strict=True):
@@ -209,11 +222,38 @@ def _lay_out(
             owner = owners[name]
             for key, value in values.items():
                 _write_attribute(owner, key, value)
+        h5py.h5f.flush(file)
+        image = file.get_file_image() if in_memory else b""
     finally:
         file.close()
-    with open(part, "r+b") as raw:
-        os.posix_fallocate(raw.fileno(), 0, max(part.stat().st_size, 1))
+    with open(part, "wb" if in_memory else "r+b") as raw:
+        os.posix_fallocate(raw.fileno(), 0, len(image) or part.stat().st_size)
+        raw.write(image)
     return places
+
+
+@cache
+def _of_datasets() -> tuple[Any, Any]:
+    """How datasets, and the groups they are in, are made."""
+    h5py = import_h5py()
+    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    early.set_layout(h5py.h5d.CONTIGUOUS)
+    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
+    links.set_create_intermediate_group(True)
+    return early, links
+
+
+@cache
+def _of_files(in_memory: bool) -> Any:
+    """How files are made."""
+    h5py = import_h5py()
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    if in_memory:
+        access.set_fapl_core(LARGEST_OVERHEAD, False)
+    return access
 
 
 def _write_attribute(owner: Any, key: str, value: int | float | str) -> None:

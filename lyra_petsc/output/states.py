@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.mesh_file import MESH_FILE
@@ -63,6 +64,7 @@ class StateWriter:
         n_triangles: int,
         resume_after: int | None = None,
         vtkhdf: bool = False,
+        background: Background | None = None,
     ) -> None:
         self.folder = Path(folder)
         self.vertices = vertices
@@ -71,7 +73,7 @@ class StateWriter:
         self._states: list[State] = []  # kept on rank 0
         self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
         self._next = 0
-        self._vtkhdf = vtkhdf
+        self._vtkhdf, self._background = vtkhdf, background
         if vtkhdf:
             on_root(self._comm, lambda: write_cells(self.folder, MESH_FILE))
         if resume_after is not None:
@@ -114,7 +116,7 @@ class StateWriter:
         Raises
         ------
         OutputError
-            On every rank; the states announced before stand.
+            On every rank; the states announced before stand. With a background, of the state before.
         """
         number, group = self._next, group_name(self._next)
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
@@ -134,7 +136,7 @@ class StateWriter:
         state = State(number, int(step), float(time), name, fields)
         datasets = {f"{group}/{key}": slab for key, slab in slabs.items()}
         file = NewFile(self.folder / name, datasets, attributes, publish=lambda: self._announce(state))
-        write_collective([file, *beside], self._comm)
+        write_collective([file, *beside], self._comm, self._background)
         self._next += 1
         return number
 

@@ -267,10 +267,8 @@ class Stepper:
         words = "the velocities are not finite"
         self._linear_failed = False
         if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
-            velocity = self.velocity.getArray().reshape(self._shape).copy()
+            velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
             if system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0:
-                if theta < 1.0:
-                    velocity = (1.0 - theta) * system.history + theta * velocity
                 system.accept(velocity)
                 self.velocity.setArray(system.v[: self._shape[0]].ravel())
                 self.ts.setTime(t1)

@@ -138,6 +138,9 @@ def _repeat(
                     with phases("files"):
                         recorder.record(report)
                 watch((repeat + min(1.0, simulation.time / simulation.control.end)) / repeats)
+            if recorder is not None:
+                with phases("files"):
+                    recorder.settle()
         finally:
             if recorder is not None:
                 recorder.close()

@@ -184,6 +184,7 @@ def output(comm: Comm, job: Result) -> Result:
         simulation.step_number, simulation.time = number, number * simulation.control.step
         began = now(comm)
         recorder.write_state()
+        recorder.settle()
         ours.append(now(comm) - began)
         written = [(folder / name).stat().st_size for name in (f"states-{number:04d}.h5", "checkpoint.h5")]
         blocks = [os.urandom(size) for size in written] if comm.rank == 0 else []

@@ -51,6 +51,6 @@ def at_end(integrator: str, steps: int, comm: MPI.Comm, **time: float) -> Array:
 
 @pytest.mark.parametrize("integrator", ORDERS)
 def test_observed_order(integrator: str, comm: MPI.Comm) -> None:
-    shapes = [at_end(integrator, steps, comm) for steps in (80, 160, 320)]
+    shapes = [at_end(integrator, steps, comm) for steps in (40, 80, 160)]
     first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
     assert np.log2(first / second) == pytest.approx(ORDERS[integrator], abs=0.1)

@@ -1,0 +1,70 @@
+"""What rank 0 does beside the steps: done when it is asked for, and its failures told to all."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.background import Background
+from lyra_petsc.output.hdf5 import NewFile, write_collective
+
+pytestmark = pytest.mark.parallel
+
+
+def fail() -> None:
+    raise OutputError("a.h5: cannot be written: No space left on device")
+
+
+def test_it_goes_on_meanwhile_and_is_waited_for(comm: MPI.Comm) -> None:
+    background, go, done = Background(comm), threading.Event(), []
+
+    def work() -> None:
+        go.wait()
+        done.append(comm.rank)
+
+    background.begin(work)
+    assert not done
+    go.set()
+    background.settle()
+    assert done == [0] * (comm.rank == 0)
+    background.close()
+
+
+def test_failures_are_told_once_and_to_every_rank(comm: MPI.Comm) -> None:
+    background = Background(comm)
+    background.begin(fail)
+    with pytest.raises(OutputError, match="No space left"):
+        background.settle()
+    background.settle()
+    background.close()
+
+
+def test_mistakes_are_not_hidden(comm: MPI.Comm) -> None:
+    background = Background(comm)
+    background.begin(lambda: [][0])
+    if comm.rank == 0:
+        with pytest.raises(IndexError):
+            background.settle()
+    background.close()
+
+
+def test_files_have_their_names_when_it_has_settled(comm: MPI.Comm, shared_tmp: Path) -> None:
+    background, go, row = Background(comm), threading.Event(), {"x": np.full(3, float(comm.rank))}
+
+    def last_word() -> None:
+        go.wait()
+        fail()
+
+    first = NewFile(shared_tmp / "a.h5", row, {}, publish=last_word)
+    write_collective([first], comm, background)
+    go.set()
+    with pytest.raises(OutputError, match="No space left"):
+        write_collective([NewFile(shared_tmp / "b.h5", row, {})], comm, background)
+    comm.Barrier()
+    assert [path.name for path in shared_tmp.iterdir()] == ["a.h5"]
+    background.close()
