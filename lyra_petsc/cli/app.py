@@ -37,6 +37,8 @@ def run_command_line(argv: Sequence[str]) -> int:
     if COMPLETION in os.environ:  # the shell asks at a press of the tab key: PETSc is not needed
         verbs.main([], prog_name=PROGRAM)
     ours, petsc = split(argv[1:])
+    # without a launcher Open MPI starts a daemon, which only a process that spawns others would need
+    os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
     try:
         import petsc4py
 
