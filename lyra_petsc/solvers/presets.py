@@ -109,17 +109,17 @@ BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""
 
-FACTOR_COST = {True: (200.0, 6.5), False: (50.0, 6.5)}
+FACTOR_COST = 200.0, 6.5
 """Iterations of block Jacobi that a factorisation costs: the first plus the second times √vertices.
 
-On one rank, where its products are ours, and on several.
+Measured are 300 to 400 for 1000 to 5000 vertices; a buckling sheet needs more than one for an iteration.
 """
 
 WORTH = 4.0
 """How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least."""
 
-PRICE = {True: 4.0, False: 3.0}
-"""How many of them it costs, on one rank and on several."""
+PRICE = 4.0
+"""How many of them it costs."""
 
 TWICE_FROM = 30.0
 """Iterations of block Jacobi from which coarser levels are visited twice."""
@@ -144,7 +144,7 @@ def candidates(
         return last
     incomplete = "ilu" if ranks == 1 else "block-ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
-    if iterations > _factor_cost(n_vertices, ranks) * (1.0 if small else WORTH):
+    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH):
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
@@ -158,16 +158,16 @@ def _factorisations(ranks: int) -> list[str]:
     return ["cholesky"] if ranks == 1 else []
 
 
-def linear_limit(n_vertices: int, ranks: int, presets: Sequence[str]) -> float:
+def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        return _factor_cost(n_vertices, ranks) / (1.0 if presets[0] == "block-jacobi" else PRICE[ranks == 1])
+        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE)
     return math.inf
 
 
-def _factor_cost(n_vertices: int, ranks: int) -> float:
+def _factor_cost(n_vertices: int) -> float:
     """Iterations of conjugate gradients with block Jacobi that cost as much as a factorisation."""
-    first, more = FACTOR_COST[ranks == 1]
+    first, more = FACTOR_COST
     return first + more * math.sqrt(n_vertices)
 
 

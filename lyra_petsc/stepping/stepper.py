@@ -147,7 +147,7 @@ class Stepper:
         self.snes = snes = ts.getSNES()
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
-        limit = linear_limit(points.n_global, points.comm.size, self.presets)
+        limit = linear_limit(points.n_global, self.presets)
         self._newton = newton = Newton(
             snes,
             system,
