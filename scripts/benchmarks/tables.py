@@ -32,6 +32,8 @@ COLUMNS = (
     "rest ms",
     "MatMult ms",
     "assembly, MatMults",
+    "PETSc's MatMult ms",
+    "assembly, PETSc's MatMults",
     "CG iterations",
     "Newton iterations",
     "preset",
@@ -93,12 +95,17 @@ def _cells(row: Result, first: Result | None) -> list[str]:
     cells += [spread(times, 1e3), number(1e3 * cpu), number(ratio)]
     if "step_seconds" in row:
         return cells + ["–"] * (len(COLUMNS) - len(cells))
-    matmult = statistics.median(row["matmult_seconds"])
+    products = [row["matmult_seconds"], row["petsc_matmult_seconds"]]
+    assembly = [step["assembly"] for step in row["steps"]]
+    compared = [
+        cell
+        for times in products
+        for cell in (spread(times, 1e3), spread([each / statistics.median(times) for each in assembly]))
+    ]
     return [
         *cells,
         *(number(1e3 * median_of(row, part)) for part in PARTS),
-        spread(row["matmult_seconds"], 1e3),
-        spread([step["assembly"] / matmult for step in row["steps"]]),
+        *compared,
         number(median_of(row, "cg")),
         number(median_of(row, "newton")),
         row["preset"],
