@@ -86,7 +86,8 @@ class SystemMatrix:
     def _faster_product(self, points: Points, pattern: BlockPattern) -> MatMult | None:
         """A product in place of PETSc's, if there is a faster one."""
         if self._half:
-            return MatMult(self.mat, HalfStored(pattern, self.rows), pattern.n_couplings, points)
+            ghosts_of = points if points.comm.size > 1 else None
+            return MatMult(self.mat, HalfStored(pattern, self.rows), pattern.n_couplings, ghosts_of)
         array = self._storage.whole if self._storage is not None else None
         if array is None:
             return None

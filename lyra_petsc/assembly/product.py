@@ -88,7 +88,7 @@ class MatMult:
     couplings : int
         Blocks that are multiplied, for PETSc's count of operations.
     points : Points or None
-        Whose ghosts a product takes; a matrix of one rank takes none.
+        Whose ghosts a product takes; None: it takes none.
 
     Raises
     ------
@@ -105,8 +105,8 @@ class MatMult:
         self._multiply = multiply
         self._size = ctypes.c_double * mat.getLocalSize()[0]
         self._seen: dict[int | None, Array] = {None: np.empty((0, 3))}  # of no rows
-        self._points = points if points is not None and points.comm.size > 1 else None
-        self._local = np.zeros((points.n_local if points is not None else 0, 3))
+        self._points = points
+        self._local = np.zeros((points.n_local, 3)) if points is not None else np.empty((0, 3))
         self._operations = 2.0 * 9.0 * couplings
         self._callback = _Operation(self._mult)
         self._handle, usual = int(mat.handle), ctypes.c_void_p()

@@ -235,7 +235,7 @@ class Storage:
         self._mat.assemble()
 
     def _parts(self) -> list[ctypes.c_void_p]:
-        """The matrices of this rank that keep the entries: of owned columns, and of ghosts."""
+        """This rank's matrices of entries in owned columns and in ghosts'; none where PETSc tells none."""
         whole = ctypes.c_void_p(self._mat.handle)
         if not self._several:
             return [whole]
@@ -247,7 +247,7 @@ class Storage:
 
     def _copy(self, values: Array) -> None:
         parts, diagonal = self._parts(), None
-        if self._half and not parts:  # PETSc does not tell where the other part is
+        if not parts:
             diagonal = self._mat.getDiagonalBlock()
             parts = [ctypes.c_void_p(diagonal.handle)]
         arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]

@@ -222,8 +222,10 @@ def _lay_out(
             owner = owners[name]
             for key, value in values.items():
                 _write_attribute(owner, key, value)
-        h5py.h5f.flush(file)
-        image = file.get_file_image() if in_memory else b""
+        image = b""
+        if in_memory:
+            h5py.h5f.flush(file)
+            image = file.get_file_image()
     finally:
         file.close()
     with open(part, "wb" if in_memory else "r+b") as raw:
