@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
     {"errors", "nearest"},
-    {"extras", "kernel_cache", "parallel", "profiling"},
+    {"extras", "kernel_cache", "parallel", "profiling", "remembered"},
     {"block_rows"},
     {"materials"},
     {"scene"},

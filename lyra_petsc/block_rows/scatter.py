@@ -6,7 +6,19 @@ the block that the pair is added to, plus 1 where it is added transposed; negati
 
 from __future__ import annotations
 
+from lyra_petsc.block_rows.vectors import fetch
 from lyra_petsc.kernel_cache import cached
+
+AHEAD = 8
+"""Elements by which blocks are fetched before they are added to: neighbours' lie far apart in memory."""
+
+
+@cached(forceinline=True)
+def fetch_ahead(element, offsets, values):  # type: ignore[no-untyped-def]
+    """Let the blocks of a later element with offsets (E, n (n + 1) / 2) come into the caches."""
+    later = min(element + AHEAD, offsets.shape[0] - 1)
+    for pair in range(offsets.shape[1]):
+        fetch(values, offsets[later, pair] >> 1)
 
 
 @cached(fastmath={"contract", "nsz"})
@@ -28,4 +40,5 @@ def add_element(weight, blocks, offsets, values):  # type: ignore[no-untyped-def
 def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks (E, n, n, 3, 3) of elements with offsets (E, n (n + 1) / 2)."""
     for e in range(offsets.shape[0]):
+        fetch_ahead(e, offsets, values)
         add_element(weight[e], blocks[e], offsets[e], values)

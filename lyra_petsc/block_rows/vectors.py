@@ -1,12 +1,14 @@
-"""What kernels do with a row of 3×3 blocks, a column of a block at a time in the processor's vectors.
+"""What kernels do with 3×3 blocks and numba has no words for.
 
-Numba leaves such loops scalar; here they are written in LLVM's language, which every processor has vectors
-or a substitute for. Blocks are (n_blocks, 9), column by column. A fourth number is read, and computed, with
-each three; of the blocks it is always one of the same block.
+A row of blocks is multiplied a column of a block at a time in the processor's vectors. Numba leaves such
+loops scalar; here they are written in LLVM's language, which every processor has vectors or a substitute
+for. Blocks are (n_blocks, 9), column by column. A fourth number is read, and computed, with each three; of
+the blocks it is always one of the same block. And what will soon be needed is fetched into the caches.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -77,6 +79,18 @@ class _Code:
 
     def nothing(self) -> Value:
         return ir.Constant(self.vector, ir.Undefined)
+
+    def vectors(self, name: str) -> list[tuple[Value, list[Value]]]:
+        """Of a tuple of tuples of three numbers: each as a vector, and number by number."""
+        unpack = partial(cgutils.unpack_tuple, self.builder)
+        return [(self.filled(numbers), numbers) for numbers in map(unpack, unpack(self.given[name]))]
+
+    def filled(self, numbers: list[Value]) -> Value:
+        """A vector that begins with these numbers."""
+        vector = self.nothing()
+        for i, number in enumerate(numbers):
+            vector = self.builder.insert_element(vector, number, LANE(i))
+        return vector
 
     def repeat(self, scalar: Value) -> Value:
         """A vector of one number."""
@@ -149,9 +163,7 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = _Code(context, builder, signature, arguments, "blocks columns out lo hi factors")
         block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("out")
-        row = code.nothing()
-        for i, factor in enumerate(cgutils.unpack_tuple(builder, code.given["factors"])):  # type: ignore[no-untyped-call]
-            row = builder.insert_element(row, factor, LANE(i))
+        row = code.filled(cgutils.unpack_tuple(builder, code.given["factors"]))  # type: ignore[no-untyped-call]
         with code.loop() as (k, _):
             a, b, c = (code.times(column, row) for column in code.columns(code.at(block_rows, k, 9)))
             # the sums of a, b and c, whose fourth numbers mean nothing
@@ -165,6 +177,56 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     return types.void(blocks, columns, out, lo, hi, factors), generate
 
 
+def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
+    """blocks[at // 2] += diagonal I + Σ left[m] right[m]ᵀ, transposed where ``at`` is odd.
+
+    Nothing where it is negative. Left and right are tuples of vectors, tuples of three numbers.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks at diagonal left right")
+        at, pick = code.integer("at"), code.pick
+        block = code.at(code.begin("blocks"), builder.ashr(at, INDEX(1)), 9)
+        lefts, rights = code.vectors("left"), code.vectors("right")
+        with builder.if_then(builder.icmp_signed(">=", at, INDEX(0)), likely=True):
+            rows = []
+            for i in range(3):
+                zero = ir.Constant(code.vector, [0.0] * WIDTH)
+                row = builder.insert_element(zero, code.given["diagonal"], LANE(i))
+                for (_, numbers), (vector, _) in zip(lefts, rights, strict=True):
+                    row = code.plus(row, code.times(code.repeat(numbers[i]), vector))
+                rows.append(row)
+            one, two, three = rows
+            plain = pick(one, two, 0, 1, 2, 4), pick(two, three, 1, 2, 4, 5)
+            last, below = pick(one, two, 2, 6, 2, 6), pick(two, three, 1, 5, 1, 5)
+            turned = pick(pick(one, two, 0, 4, 1, 5), three, 0, 1, 4, 2), pick(below, last, 0, 1, 4, 5)
+            odd = builder.trunc(at, ir.IntType(1))
+            for i in range(2):
+                target = builder.gep(block, [INDEX(WIDTH * i)])
+                code.store(code.plus(code.load(target), builder.select(odd, turned[i], plain[i])), target)
+            target = builder.gep(block, [INDEX(8)])
+            corner = builder.extract_element(three, LANE(2))
+            builder.store(code.plus(builder.load(target), corner), target)
+        return context.get_dummy_value()
+
+    return types.void(blocks, at, diagonal, left, right), generate
+
+
+def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
+    """Let block k come into the caches; there need be no such block."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks k")
+        block = code.at(code.begin("blocks"), code.integer("k"), 9)
+        for last in (0, 8):  # it may lie on two cache lines
+            code.fetch(builder.gep(block, [INDEX(last)]))
+        return context.get_dummy_value()
+
+    return types.void(blocks, k), generate
+
+
 # their callers leave out ``typing``
 gather: Any = intrinsic(_gather)
+add_outer: Any = intrinsic(_add_outer)
+fetch: Any = intrinsic(_fetch)
 scatter: Any = intrinsic(_scatter)

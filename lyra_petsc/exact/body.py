@@ -85,8 +85,7 @@ class Body:
         found = bending.elements(self.rest)
         if len(found.stencil) == 0:
             return False
-        angles = np.empty(len(found.stencil))
-        bending.angles(self.mesh.positions, found.stencil, angles)
+        angles = bending.dihedral_angles(self.mesh.positions, found.stencil)
         return bool(np.abs(angles - found.data["rest_angle"]).max() > 1e-7)
 
     # -- assumptions that solutions share ----------------------------------------------------------------

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.partition.points import Points
-from lyra_petsc.stepping.remembered import Remembered
+from lyra_petsc.remembered import Remembered
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from lyra_petsc.assembly.blocks import BlockRows
 from lyra_petsc.handles.held import Held
 from lyra_petsc.partition.points import Points
+from lyra_petsc.remembered import Remembered
 from lyra_petsc.stepping.clamped import clamped_energy
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.departures import Departures
 from lyra_petsc.stepping.prescribed import Prescribed
-from lyra_petsc.stepping.remembered import Remembered
 from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.partition.elements import Elements
+from lyra_petsc.remembered import Remembered
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.hinge import angle, point
+from lyra_petsc.terms.hinge import angle_parts, point
 from lyra_petsc.terms.hinge_energy import (
     fading_limit,
     hinge_energy,
@@ -30,14 +31,23 @@ from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
 
 Array = NDArray[np.float64]
+Stencil = NDArray[np.int32] | NDArray[np.int64]
 
 
 @kernel()
-def angles(x, s, out):  # type: ignore[no-untyped-def]
-    """Dihedral angle [rad] of the first len(out) hinges."""
-    for e in range(out.shape[0]):
+def _angle_parts(x, s, sine, cosine):  # type: ignore[no-untyped-def]
+    """Into (E,) each, up to a factor."""
+    for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        out[e] = angle(x0, x1, x2, x3)[0]
+        sine[e], cosine[e], _, _ = angle_parts(x0, x1, x2, x3)
+
+
+def dihedral_angles(x: Array, stencil: Stencil) -> Array:
+    """Dihedral angles θ [rad] in [−π, π] of hinges (E, 4), (E,); 0 where a triangle has no normal."""
+    sine, cosine = np.empty(len(stencil)), np.empty(len(stencil))
+    _angle_parts(x, stencil, sine, cosine)
+    # all at once: NumPy's are several at a time where the processor can
+    return np.arctan2(sine, cosine, out=sine)
 
 
 @kernel()
@@ -45,37 +55,40 @@ def weights(x, s, limit, out):  # type: ignore[no-untyped-def]
     """Part of its energy that each hinge has left, 1 but for collapsed triangles, into out (E,)."""
     for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        _, square1, square2 = angle(x0, x1, x2, x3)
+        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
         out[e] = hinge_weight(square1, square2, limit[e, 0], limit[e, 1])
 
 
 @kernel()
-def energies(x, s, k, rest, limit, out):  # type: ignore[no-untyped-def]
+def energies(x, s, theta, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) hinges."""
     for e in range(out.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        out[e] = hinge_energy(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1])
+        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
+        out[e] = hinge_energy(theta[e], square1, square2, k[e], rest[e], (limit[e, 0], limit[e, 1]))
 
 
 @kernel()
-def add_gradient(x, s, k, rest, limit, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, s, theta, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        moment = hinge_gradient(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], g)
+        limits = limit[e, 0], limit[e, 1]
+        moment = hinge_gradient(x0, x1, x2, x3, theta[e], k[e], rest[e], limits, g)
         for a in range(4):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
 
 
 @kernel()
-def hessians(x, s, lo, hi, blend, k, rest, limit, out):  # type: ignore[no-untyped-def]
+def hessians(x, s, lo, hi, theta, blend, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
     g = np.empty((4, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e, 0], limit[e, 1], blend, g, out[e - lo])
+        limits = limit[e, 0], limit[e, 1]
+        hinge_hessian(x0, x1, x2, x3, theta[e], k[e], rest[e], limits, blend, g, out[e - lo])
 
 
 class Bending(Elastic):
@@ -95,12 +108,12 @@ class Bending(Elastic):
         super().__init__(elements)
         data = elements.data
         self._constants = data["k"], data["rest_angle"], data["limit"]
+        # energy, gradient and Hessian are asked for at one place after the other
+        self._angles = Remembered(lambda x: dihedral_angles(x, self.stencil))
 
     def angles(self, x: Array) -> Array:
-        """Dihedral angles of all hinges of this rank [rad], (E,)."""
-        out = np.empty(self.n_elements)
-        angles(x, self.stencil, out)
-        return out
+        """Dihedral angles of all hinges of this rank [rad], (E,), not to be written to."""
+        return self._angles(x)
 
     def weights(self, x: Array) -> Array:
         """Part of its energy that each hinge of this rank has left, (E,): 1 but for collapsed triangles."""
@@ -114,19 +127,20 @@ class Bending(Elastic):
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
         out = np.empty(n)
-        energies(x, self.stencil, *self._constants, out)
+        energies(x, self.stencil, self.angles(x), *self._constants, out)
         return out
 
     def add_gradient(self, x: Array, out: Array) -> None:
-        add_gradient(x, self.stencil, *self._constants, out)
+        add_gradient(x, self.stencil, self.angles(x), *self._constants, out)
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, blend, *self._constants, out)
+        hessians(x, self.stencil, lo, hi, self.angles(x), blend, *self._constants, out)
 
     def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
         k, rest, limit = self._constants
         if blend < 1.0:
-            add_exact(x, self.stencil, blend, k, rest, limit, weight, offsets, values)
+            theta = self.angles(x)
+            add_exact(x, self.stencil, theta, blend, k, rest, limit, weight, offsets, values)
         else:
             add_regularised(x, self.stencil, k, limit, weight, offsets, values)
         return True
@@ -238,9 +252,7 @@ def elements(rest: RestShape) -> Elements:
     damping = rest.per_triangle("damping")[faces].mean(axis=1)
     rest_angle = np.zeros(len(quad))
     surface = ~rest.mesh.flat_rest[faces].all(axis=1)
-    of_surface = np.empty(int(surface.sum()))
-    angles(rest.mesh.rest, quad[surface], of_surface)
-    rest_angle[surface] = of_surface
+    rest_angle[surface] = dihedral_angles(rest.mesh.rest, quad[surface])
     if any(shell.rest_curvature for shell in rest.shells):
         rest_angle += _angles_from_curvature(rest, quad, faces)
     bends = b > 0.0

@@ -20,7 +20,7 @@ from lyra_petsc.meshing.topology import boundary_edges
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import edge_in_material, mirrored_angles
-from lyra_petsc.terms.hinge import point
+from lyra_petsc.terms.hinge import angle, point
 from lyra_petsc.terms.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
@@ -38,7 +38,8 @@ def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) edges."""
     for e in range(out.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        out[e] = hinge_energy(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT)
+        theta, square1, square2 = angle(x0, x1, x2, x3)
+        out[e] = hinge_energy(theta, square1, square2, k[e], rest[e], (limit[e], NO_LIMIT))
 
 
 @kernel()
@@ -47,7 +48,8 @@ def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        moment = hinge_gradient(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, g)
+        theta = angle(x0, x1, x2, x3)[0]
+        moment = hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
         for a in range(3):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
@@ -59,7 +61,8 @@ def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[
     g, o = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     for e in range(lo, hi):
         x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        hinge_hessian(x0, x1, x2, x3, k[e], rest[e], limit[e], NO_LIMIT, blend, g, o)
+        theta = angle(x0, x1, x2, x3)[0]
+        hinge_hessian(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), blend, g, o)
         out[e - lo] = o[:3, :3]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_gradient, cross, dot, minus
+from lyra_petsc.terms.hinge import add_angle_hessian, angle_slopes, cross, dot, minus
 from lyra_petsc.terms.kernel import kernel
 
 FADES_BELOW = 0.1
@@ -54,22 +54,30 @@ def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-d
 
 
 @kernel(inline="always")
-def hinge_energy(x0, x1, x2, x3, k, rest, limit1, limit2):  # type: ignore[no-untyped-def]
-    """Energy [J] of stiffness k [N·m] and rest angle [rad]."""
-    theta, square1, square2 = angle(x0, x1, x2, x3)
+def hinge_energy(theta, square1, square2, k, rest, limits):  # type: ignore[no-untyped-def]
+    """Energy [J] of stiffness k [N·m] at angle theta, with rest angle ``rest`` [rad]."""
     full = k * (theta - rest) * (theta - rest)
-    if square1 > limit1 and square2 > limit2:
+    if square1 > limits[0] and square2 > limits[1]:
         return full
-    return full * hinge_weight(square1, square2, limit1, limit2)
+    return full * hinge_weight(square1, square2, limits[0], limits[1])
 
 
 @kernel(inline="always")
-def hinge_gradient(x0, x1, x2, x3, k, rest, limit1, limit2, g):  # type: ignore[no-untyped-def]
+def _set_slopes(x0, x1, x2, x3, g):  # type: ignore[no-untyped-def]
+    """The gradient of θ into g (4, 3); |n1|² and |n2|² [m⁴]."""
+    slopes, square1, square2 = angle_slopes(x0, x1, x2, x3)
+    for a in range(4):
+        g[a, 0], g[a, 1], g[a, 2] = slopes[a]
+    return square1, square2
+
+
+@kernel(inline="always")
+def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[no-untyped-def]
     """A moment [N·m] by which g (4, 3) [1/m] is to be multiplied: the energy's gradient [N]."""
-    theta, square1, square2 = angle_gradient(x0, x1, x2, x3, g)
+    square1, square2 = _set_slopes(x0, x1, x2, x3, g)
     change = theta - rest
-    if not (square1 > limit1 and square2 > limit2):
-        change = _fade_gradient(x0, x1, x2, x3, square1, square2, limit1, limit2, change, g)
+    if not (square1 > limits[0] and square2 > limits[1]):
+        change = _fade_gradient(x0, x1, x2, x3, square1, square2, limits[0], limits[1], change, g)
     return 2.0 * k * change
 
 
@@ -82,12 +90,12 @@ def hinge_stiffness(square1, square2, k, limit1, limit2):  # type: ignore[no-unt
 
 
 @kernel(inline="always")
-def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, out):  # type: ignore[no-untyped-def]
+def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] into out (4, 4, 3, 3).
 
     ``blend`` 0 is exact, 1 the positive-semidefinite 2 k ∇θ ∇θᵀ w w; g (4, 3) is overwritten.
     """
-    theta, square1, square2 = angle_gradient(x0, x1, x2, x3, g)
+    square1, square2 = _set_slopes(x0, x1, x2, x3, g)
     change = theta - rest
     stiffness = 2.0 * k
     for a in range(4):
@@ -97,8 +105,8 @@ def hinge_hessian(x0, x1, x2, x3, k, rest, limit1, limit2, blend, g, out):  # ty
                     out[a, b, i, j] = stiffness * g[a, i] * g[b, j]
     if blend < 1.0:
         add_angle_hessian(x0, x1, x2, x3, (1.0 - blend) * stiffness * change, out)
-    if not (square1 > limit1 and square2 > limit2):
-        _fade_hessian(x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out)
+    if not (square1 > limits[0] and square2 > limits[1]):
+        _fade_hessian(x0, x1, x2, x3, square1, square2, limits[0], limits[1], k, change, blend, g, out)
 
 
 @kernel()

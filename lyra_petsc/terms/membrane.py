@@ -13,6 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.block_rows.scatter import fetch_ahead
+from lyra_petsc.block_rows.vectors import add_outer
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
@@ -133,19 +135,12 @@ def _factors(stress, law, ga, gb):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _add_block(f, uu, uv, vu, vv, geometric, o):  # type: ignore[no-untyped-def]
+def _sides(f, uu, uv, vu, vv):  # type: ignore[no-untyped-def]
+    """Vectors left and right whose Σ left rightᵀ a block is but for its geometric part."""
     ux, uy, uz, vx, vy, vz = f
-    px, py, pz = uu * ux + uv * vx, uu * uy + uv * vy, uu * uz + uv * vz
-    qx, qy, qz = vu * ux + vv * vx, vu * uy + vv * vy, vu * uz + vv * vz
-    o[0, 0] += ux * px + vx * qx + geometric
-    o[0, 1] += ux * py + vx * qy
-    o[0, 2] += ux * pz + vx * qz
-    o[1, 0] += uy * px + vy * qx
-    o[1, 1] += uy * py + vy * qy + geometric
-    o[1, 2] += uy * pz + vy * qz
-    o[2, 0] += uz * px + vz * qx
-    o[2, 1] += uz * py + vz * qy
-    o[2, 2] += uz * pz + vz * qz + geometric
+    one = uu * ux + uv * vx, uu * uy + uv * vy, uu * uz + uv * vz
+    two = vu * ux + vv * vx, vu * uy + vv * vy, vu * uz + vv * vz
+    return ((ux, uy, uz), (vx, vy, vz)), (one, two)
 
 
 @kernel()
@@ -154,30 +149,31 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-
 
     Their geometric part has the stress that the linearised strain predicted at x from y; y = x: exact.
     """
-    out[:] = 0.0
     for e in range(lo, hi):
         f, stress, law, g = _prepared(x, y, s, e, blend, inverse, area[e], c)
         for a in range(3):
             for b in range(3):
                 uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
-                _add_block(f, uu, uv, vu, vv, geometric, out[e - lo, a, b])
+                left, right = _sides(f, uu, uv, vu, vv)
+                for i in range(3):
+                    for j in range(3):
+                        out[e - lo, a, b, i, j] = left[0][i] * right[0][j] + left[1][i] * right[1][j]
+                    out[e - lo, a, b, i, i] += geometric
 
 
 @kernel()
 def add_hessians(x, y, s, blend, inverse, area, c, weight, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
     for e in range(s.shape[0]):
+        fetch_ahead(e, offsets, values)
         f, stress, law, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c)
         pair = 0
         for a in range(3):
             for b in range(a, 3):
-                at = offsets[e, pair]
+                uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
+                left, right = _sides(f, uu, uv, vu, vv)
+                add_outer(values, offsets[e, pair], geometric, left, right)
                 pair += 1
-                if at >= 0:
-                    uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
-                    if at & 1:
-                        uv, vu = vu, uv
-                    _add_block(f, uu, uv, vu, vv, geometric, values[at >> 1])
 
 
 @kernel()

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
 
-from lyra_petsc.stepping.remembered import Remembered
+from lyra_petsc.remembered import Remembered
 
 
 def test_a_function_is_called_where_it_was_not_called_last() -> None:
