@@ -64,7 +64,7 @@ class SystemMatrix:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
-        self._stored = StoredRows(points, pattern, self.kind)
+        self._stored, self._diagonal = StoredRows(points, pattern, self.kind), pattern.indptr[:-1]
         self._preallocate(comm)
         # all rows are owned ones, and a block's values stand column by column
         for option, value in (("SYMMETRIC", True), ("NO_OFF_PROC_ENTRIES", True), ("ROW_ORIENTED", False)):
@@ -110,8 +110,14 @@ class SystemMatrix:
             return np.zeros(self._shape)
         return self._beside.rows
 
-    def set(self, values: NDArray[np.float64]) -> None:
-        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective."""
+    def set(self, values: NDArray[np.float64], larger: float = 0.0) -> None:
+        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective.
+
+        Diagonal blocks become ``larger`` by this fraction.
+        """
+        if larger > 0.0:
+            values = values.copy()
+            values[self._diagonal] *= 1.0 + larger
         for follower in self.followers:
             follower(values)
         if not self.read:

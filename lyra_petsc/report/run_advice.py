@@ -33,8 +33,8 @@ SLOW_FIRST_STEP = 5.0
 
 OPTIONS = {
     "block-jacobi": "-pc_type pbjacobi",
-    "ilu": "-pc_type ilu -pc_factor_levels 1",
-    "block-ilu": "-pc_type bjacobi -sub_pc_type ilu -sub_pc_factor_levels 1",
+    "ilu": "-pc_type ilu",
+    "block-ilu": "-pc_type bjacobi -sub_pc_type ilu",
     "multigrid": "-pc_type python",
     "multigrid-w": "-pc_type python -pc_mg_w_from 2",
     "pcmg": "-pc_type mg",

@@ -14,10 +14,19 @@ RESEMBLING = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu", "icc", "gamg
 
 def shows_negative_curvature(pc: PETSc.PC) -> bool:
     """Whether it would be noticed, by conjugate gradients or by ``negative_pivots``."""
-    kind = pc.getType()
-    if kind == "bjacobi":
-        kind = PETSc.Options().getString("sub_pc_type", "ilu")
-    return kind in RESEMBLING or _counts_pivots(pc)
+    return _kind(pc) in RESEMBLING or _counts_pivots(pc)
+
+
+def is_incomplete(pc: PETSc.PC) -> bool:
+    """Whether it is made of incomplete factors."""
+    return _kind(pc) in ("ilu", "icc")
+
+
+def _kind(pc: PETSc.PC) -> str:
+    """Its type, or that of its blocks."""
+    if pc.getType() == "bjacobi":
+        return str(PETSc.Options().getString("sub_pc_type", "ilu"))
+    return str(pc.getType())
 
 
 def negative_pivots(pc: PETSc.PC) -> int:

@@ -49,16 +49,9 @@ PRESETS: dict[str, dict[str, Value]] = {
         "pc_type": "cholesky",
         "pc_factor_mat_ordering_type": "qmd",
     },
-    # a tenth of the iterations of block Jacobi for a few times the price; on fine meshes under load the
-    # factors stop existing
-    "ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "ilu", "pc_factor_levels": 1},
-    "block-ilu": {
-        "mat_type": "baij",
-        "ksp_type": "cg",
-        "pc_type": "bjacobi",
-        "sub_pc_type": "ilu",
-        "sub_pc_factor_levels": 1,
-    },
+    # a fifth of the iterations of block Jacobi for a few times the price; ``stepping.shift`` helps
+    "ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "ilu"},
+    "block-ilu": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "bjacobi", "sub_pc_type": "ilu"},
     # always exists for a positive-definite matrix; iterations grow like 1/h
     "block-jacobi": {"mat_type": "baij", "ksp_type": "cg", "pc_type": "pbjacobi"},
     # iterations that hardly grow with the mesh. Hundreds of them mean a matrix close to singular, and another
@@ -97,6 +90,7 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
+INCOMPLETE = ("ilu", "block-ilu")
 FACTORISATIONS = ("direct", "cholesky")
 
 MULTIGRID_FROM = {True: 2000, False: 3000}
@@ -148,7 +142,7 @@ def candidates(
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
-    return [*([] if newton else [incomplete]), "block-jacobi", *factors, *last[:-1]]
+    return [incomplete, *factors, "block-jacobi", *last[:-1]]
 
 
 def _factorisations(ranks: int) -> list[str]:

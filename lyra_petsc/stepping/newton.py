@@ -14,6 +14,7 @@ from lyra_petsc.solvers.options import is_set
 from lyra_petsc.solvers.reasons import NOT_A_NUMBER
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import Forcing
+from lyra_petsc.stepping.shift import Shift
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.stepping.watchdog import Watchdog
 
@@ -96,6 +97,7 @@ class Newton:
         self._usual = 0.0
         self._began_convex = False
         self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol"))
+        self.shift = Shift(self._ksp, acts=preconditioner is not matrix)
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -110,6 +112,7 @@ class Newton:
         self._convex = self._began_convex
         self._spent = 0
         self._watchdog.begin()
+        self.shift.begin()
         self.forcing.begin()
 
     @logged(JACOBIAN)
@@ -119,22 +122,25 @@ class Newton:
         if self._iterates:
             self._system.new_iterate(v)
             self.forcing.before_solve(self.norm)
-        self._set(self._matrix, v, self._blend.after(self._taken(u)))
+        self._set_matrix(v, self._blend.after(self._taken(u)))
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         separate = self._preconditioner is not self._matrix
         self._kept = separate and self._fell
-        self._same = (
-            separate and self._convex and not self._kept and shows_negative_curvature(self._ksp.getPC())
-        )
+        convex = not self._iterates or (self._convex and shows_negative_curvature(self._ksp.getPC()))
+        self._same = separate and convex and not self._kept
         if self._same:
             # as long as it is positive definite there is no better preconditioner
-            self._preconditioner.set(self._matrix.rows)
+            self._preconditioner.set(self._matrix.rows, self.shift.value)
         elif separate and not self._kept:
-            self._set(self._preconditioner, v, 1.0)
+            self._set_preconditioner(v)
 
-    def _set(self, matrix: SystemMatrix, v: Array, blend: float) -> None:
-        self._system.jacobian(v, blend, matrix.rows)
-        matrix.set(matrix.rows)
+    def _set_matrix(self, v: Array, blend: float) -> None:
+        self._system.jacobian(v, blend, self._matrix.rows)
+        self._matrix.set(self._matrix.rows)
+
+    def _set_preconditioner(self, v: Array) -> None:
+        self._system.jacobian(v, 1.0, self._preconditioner.rows)
+        self._preconditioner.set(self._preconditioner.rows, self.shift.value)
 
     def remember(self, u: PETSc.Vec) -> None:
         """Note energy and residual of the present iterate, against which trial points are judged."""
@@ -166,16 +172,19 @@ class Newton:
         self._convex = not useless
         if self._snes.getIterationNumber() == 0:
             self._began_convex = self._convex
-        while useless and (self._kept or self._same or self._blend.raise_()):
-            self._assemble_again(x)
+        while useless:
+            if self._kept or self._same or self.shift.raise_():
+                self._precondition_again(x)
+            elif self._blend.raise_():
+                self._assemble_again(x)
+            else:
+                y.zeroEntries()
+                return True
             self._ksp.setOperators(self._matrix.mat, self._preconditioner.mat)
             self._ksp.solve(residual, y)
             self.more_linear += self._ksp.getIterationNumber()
             changed = True
             useless = self._useless(residual, y)
-        if useless:
-            y.zeroEntries()
-            return True
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
@@ -183,13 +192,13 @@ class Newton:
         return changed
 
     @logged(JACOBIAN_AGAIN)
+    def _precondition_again(self, u: PETSc.Vec) -> None:
+        self._set_preconditioner(u.getArray(readonly=True).reshape(self._shape))
+        self._kept = self._same = False
+
+    @logged(JACOBIAN_AGAIN)
     def _assemble_again(self, u: PETSc.Vec) -> None:
-        v = u.getArray(readonly=True).reshape(self._shape)
-        if self._kept or self._same:
-            self._set(self._preconditioner, v, 1.0)
-            self._kept = self._same = False
-        else:
-            self._set(self._matrix, v, self._blend.value)
+        self._set_matrix(u.getArray(readonly=True).reshape(self._shape), self._blend.value)
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

@@ -20,7 +20,7 @@ from lyra_petsc.solvers import reasons
 from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.solvers.presets import candidates, linear_limit, options_of
+from lyra_petsc.solvers.presets import INCOMPLETE, candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.extrapolation import Extrapolation
@@ -198,8 +198,10 @@ class Stepper:
         So it stays positive definite, and conjugate gradients see negative curvature of the exact
         Hessian only where there is some.
         """
+        if not self._iterates:
+            return self.preset in INCOMPLETE  # their diagonal is a little larger
         kind = PETSc.Options().getString("ksp_type", "cg")
-        return self._iterates and self._scene.solver.hessian != "regularised" and kind != "preonly"
+        return self._scene.solver.hessian != "regularised" and kind != "preonly"
 
     def _fill(self, options: Mapping[str, Value]) -> None:
         self._filled = fill_gaps(options)
@@ -289,6 +291,8 @@ class Stepper:
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
+        if not self._iterates and self._newton.shift.raise_():
+            return self.attempt(t0, t1)
         return Attempt(False, newton, linear, self._newton.norm, words=words, stuck=stuck)
 
     def _linear_iterations(self) -> int:
@@ -321,12 +325,8 @@ class Stepper:
 
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
-        v, rate = (
-            u.getArray(readonly=True).reshape(self._shape),
-            udot.getArray(readonly=True).reshape(self._shape),
-        )
-        out = f.getArray().reshape(self._shape)
-        self._system.residual(v, rate, out)
+        v, rate = (vec.getArray(readonly=True).reshape(self._shape) for vec in (u, udot))
+        self._system.residual(v, rate, f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
