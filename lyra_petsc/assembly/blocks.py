@@ -111,7 +111,8 @@ class BlockRows:
 
     def add_viscosity(self, term: Viscous, v: Array, values: Array) -> None:
         """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
-        self.add(term.name, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
+        if not term.add_hessians(v, self.pattern.offsets[term.name], values):
+            self.add(term.name, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""

@@ -102,6 +102,10 @@ class MatMult:
         library = ctypes.CDLL(PETSc.__file__)
         self._read, self._read_ended = library.VecGetArrayRead, library.VecRestoreArrayRead
         self._write, self._write_ended = library.VecGetArray, library.VecRestoreArray
+        for call in (self._read, self._read_ended, self._write, self._write_ended):
+            call.argtypes = ctypes.c_void_p, ctypes.c_void_p
+        self._begin, self._end = ctypes.c_void_p(), ctypes.c_void_p()
+        self._at_begin, self._at_end = ctypes.addressof(self._begin), ctypes.addressof(self._end)
         self._multiply = multiply
         self._size = ctypes.c_double * mat.getLocalSize()[0]
         self._seen: dict[int | None, Array] = {None: np.empty((0, 3))}  # of no rows
@@ -118,14 +122,12 @@ class MatMult:
         """y = A x; collective where there are ghosts. Its result is PETSc's error code."""
         if mat != self._handle:  # a copy, which has taken this operation along but has its own values
             return int(self._usual(mat, x, y))
-        source, target = ctypes.c_void_p(x), ctypes.c_void_p(y)
-        begin, end = ctypes.c_void_p(), ctypes.c_void_p()
         try:
-            self._read(source, ctypes.byref(begin))
-            self._write(target, ctypes.byref(end))
-            self._multiply(self._with_ghosts(self._array(begin.value)), self._array(end.value))
-            self._write_ended(target, ctypes.byref(end))
-            self._read_ended(source, ctypes.byref(begin))
+            self._read(x, self._at_begin)
+            self._write(y, self._at_end)
+            self._multiply(self._with_ghosts(self._array(self._begin.value)), self._array(self._end.value))
+            self._write_ended(y, self._at_end)
+            self._read_ended(x, self._at_begin)
             PETSc.Log.logFlops(self._operations)
         except Exception as error:  # it cannot pass through C
             sys.stderr.write(f"product of the matrix with a vector: {error!r}\n")

@@ -98,6 +98,13 @@ class Points:
         self._forest.reduceEnd(triple, ghosts, owned, MPI.SUM)
         values[: self.n_owned] = owned
 
+    def summed(self, *numbers: float) -> NDArray[np.float64]:
+        """Sums over all ranks of each rank's numbers; collective."""
+        sums = np.array(numbers)
+        if self.comm.size > 1:
+            self.comm.Allreduce(MPI.IN_PLACE, sums)
+        return sums
+
     def destroy(self) -> None:
         """Free the communication objects; collective."""
         self._forest.destroy()

@@ -115,6 +115,9 @@ WORTH = 4.0
 PRICE = 4.0
 """How many of them it costs."""
 
+INCOMPLETE_FROM = 5.0
+"""Iterations of block Jacobi from which a small sheet's Newton iterations use incomplete factors."""
+
 TWICE_FROM = 30.0
 """Iterations of block Jacobi from which coarser levels are visited twice."""
 
@@ -142,6 +145,8 @@ def candidates(
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
+    if newton and iterations <= INCOMPLETE_FROM:
+        return ["block-jacobi", *factors, *last[:-1]]
     return [incomplete, *factors, "block-jacobi", *last[:-1]]
 
 

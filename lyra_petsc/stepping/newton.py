@@ -218,7 +218,7 @@ class Newton:
             return value
         trial = np.empty(self._shape)
         self._system.residual(v, self._system.stage.sigma * (v - self._system.history), trial)
-        square = self._system.points.comm.allreduce(float(np.vdot(trial, trial)))
+        (square,) = self._system.points.summed(float(np.vdot(trial, trial)))
         smaller = bool(np.sqrt(square) < self._at_norm)
         return here - noise if smaller else here + noise
 

@@ -15,7 +15,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from mpi4py import MPI
@@ -101,7 +101,6 @@ class ReducedSystem:
         self._xh, self.history = self.x, self.v[:n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
         self._force = np.zeros((n_local, 3))
-        self._stiffnesses = [term.force_scale(1.0)[: term.n_owned] for term in elastic]
         self._objectives: list[tuple[Array, tuple[float, float]]] = []
         self.dt = self.t0 = self.t1 = self.anchored = self._size = 0.0
         self.followers: list[Follower] = [scheme]
@@ -233,6 +232,10 @@ class ReducedSystem:
         self._prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
+    @cached_property
+    def _stiffnesses(self) -> list[Array]:
+        return [term.force_scale(1.0)[: term.n_owned] for term in self.elastic]
+
     # -- what Newton asks for ----------------------------------------------------------------------
 
     def _evaluate_at(self, v: Array) -> tuple[Array, Array]:
@@ -277,8 +280,8 @@ class ReducedSystem:
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free coordinates; collective."""
-        squares = np.array([np.sum(p * p, where=self._prescribed.free) for p in self._last_parts.values()])
-        return float(np.sqrt(self.points.comm.allreduce(squares).max()))
+        squares = (np.sum(p * p, where=self._prescribed.free) for p in self._last_parts.values())
+        return float(np.sqrt(self.points.summed(*squares).max()))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
@@ -333,18 +336,15 @@ class ReducedSystem:
         n, sigma, rate = self.points.n_owned, self.stage.sigma, 1.0 / self.stage.reach
         x, vs = self._evaluate_at(v)
         change = v - self.history
-        inertia = 0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))
-        energies, square = [], 0.0
+        parts, square = [0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))], 0.0
         for term, stiffness in zip(self.elastic, self._stiffnesses, strict=True):
             each = term.energies(x)
-            energies.append(rate * float(each.sum()))
+            parts.append(rate * float(each.sum()))
             square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
-        work = float(np.vdot(self._force[:n], x[:n] - self.x[:n]))
-        parts = [inertia, *energies, -rate * work]
+        parts.append(-rate * float(np.vdot(self._force[:n], x[:n] - self.x[:n])))
         if self._damping.acts:
             parts.append(0.5 * float(np.vdot(v, self._damping.product(vs))))
         if not self.scheme.explicit:
             parts += [float(wind.potentials(vs).sum()) for wind in self.viscous]
-        local = np.array([sum(parts), sum(abs(part) for part in parts), square])
-        value, size, square = self.points.comm.allreduce(local)
+        value, size, square = self.points.summed(sum(parts), sum(abs(part) for part in parts), square)
         return float(value), float(size) + float(np.sqrt(square))

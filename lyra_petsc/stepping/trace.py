@@ -108,8 +108,8 @@ class Trace:
         linear = self._linear_iterations()
         taken = None
         if number > 0 and self._last is not None:
-            local = float(np.sum((here - self._last) ** 2))
-            moved = np.sqrt(self._system.points.comm.allreduce(local))
+            (square,) = self._system.points.summed(float(np.sum((here - self._last) ** 2)))
+            moved = np.sqrt(square)
             length = snes.getSolutionUpdate().norm()
             taken = float(moved / length) if length > 0.0 else 0.0
         reason = int(self._ksp.getConvergedReason()) if number > 0 else 0

@@ -48,10 +48,6 @@ class Ledger:
         self._system = system
         self.budget = Budget()
         self.reaction: Array = np.zeros((system.points.n_owned, 3))
-        self._weight = np.zeros((system.points.n_local, 3))
-        for load in system.loads:
-            if load.name == "gravity":
-                load.add_force(system.x, 0.0, 0.0, self._weight)
         self._anchored = 0.0
         self._pull = np.zeros_like(self.reaction)
         self.measure()
@@ -70,14 +66,8 @@ class Ledger:
                 if term.name == "clamp":
                     self._anchored = energy
         local[3] = sum(load.potential(system.x) for load in system.loads)
-        kinetic, membrane, bending, potential = system.points.comm.allreduce(local)
-        budget = self.budget
-        budget.kinetic, budget.membrane, budget.bending, budget.potential = (
-            float(kinetic),
-            float(membrane),
-            float(bending),
-            float(potential),
-        )
+        budget, sums = self.budget, map(float, system.points.summed(*local))
+        budget.kinetic, budget.membrane, budget.bending, budget.potential = sums
         return budget
 
     def record(self, x_before: Array) -> Budget:
@@ -89,7 +79,12 @@ class Ledger:
         self.reaction = sum(parts.values())  # type: ignore[assignment]
         self.reaction[~system.mask[:n]] = 0.0
         moved = x - x_before
-        external = -parts["loads"] - system.load_factor * self._weight[:n] + self.reaction
+        external = self.reaction - parts["loads"]
+        for load in system.loads:
+            if load.name == "gravity":  # it has a potential, and does no work from outside
+                weight = np.zeros_like(external)
+                load.add_force(system.x, 0.0, 0.0, weight)
+                external -= system.load_factor * weight
         if "wind" in parts:
             external -= parts["wind"]
         if "springs" in parts:
@@ -101,7 +96,7 @@ class Ledger:
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         if "damping" in parts:
             local[1] = dt * float(np.vdot(system.stage_velocity, parts["damping"]))
-        work, heat = system.points.comm.allreduce(local)
+        work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
         return self.measure()

@@ -20,13 +20,13 @@ class Gravity(Load):
 
     def __init__(self, mass: Array, acceleration: Array) -> None:
         super().__init__(Elements(np.empty((0, 1), dtype=np.int32)))
-        self._weight = mass[:, None] * np.asarray(acceleration, dtype=np.float64)
+        self._mass, self._acceleration = mass, np.asarray(acceleration, dtype=np.float64)
 
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
-        out[: len(self._weight)] += self._weight
+        out[: len(self._mass)] += self._mass[:, None] * self._acceleration
 
     def potential(self, x: Array) -> float:
-        return -float(np.vdot(self._weight, x[: len(self._weight)]))
+        return -float(self._mass @ x[: len(self._mass)] @ self._acceleration)
 
 
 def elements(rest: RestShape) -> None:

@@ -106,6 +106,10 @@ class Viscous(Term):
     def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
         """Hessian blocks [N s/m] with respect to velocity into ``out`` (hi − lo, n, n, 3, 3)."""
 
+    def add_hessians(self, v: Array, offsets: Offsets, values: Array) -> bool:
+        """Add Hessian blocks [N s/m] to block rows as `Elastic.add_hessians` does; whether it did."""
+        return False
+
 
 class Load(Term):
     """A force that does not change within a step."""

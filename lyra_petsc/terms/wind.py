@@ -15,11 +15,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.block_rows.scatter import fetch_ahead
+from lyra_petsc.block_rows.vectors import add_outer
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Viscous
+from lyra_petsc.terms.term import Offsets, Viscous
 
 Array = NDArray[np.float64]
 
@@ -93,6 +95,20 @@ def hessians(v, s, lo, hi, area, n, wind, density, drag, out):  # type: ignore[n
                         out[e - lo, a, b, i, j] = value
 
 
+@kernel()
+def add_hessians(v, s, area, n, wind, density, drag, offsets, values):  # type: ignore[no-untyped-def]
+    """Add the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
+    for e in range(s.shape[0]):
+        fetch_ahead(e, offsets, values)
+        _, _, _, vn = _relative(v, s, e, n, wind)
+        w = area[e] / 9.0
+        along = w * (2.0 * density * abs(vn) - drag)
+        right = n[e, 0], n[e, 1], n[e, 2]
+        left = along * right[0], along * right[1], along * right[2]
+        for pair in range(6):
+            add_outer(values, offsets[e, pair], w * drag, (left,), (right,))
+
+
 class Wind(Viscous):
     """Wind on all triangles.
 
@@ -128,6 +144,10 @@ class Wind(Viscous):
 
     def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
         hessians(v, self.stencil, lo, hi, self._area, self._normals, *self._law, out)
+
+    def add_hessians(self, v: Array, offsets: Offsets, values: Array) -> bool:
+        add_hessians(v, self.stencil, self._area, self._normals, *self._law, offsets, values)
+        return True
 
 
 def elements(rest: RestShape) -> Elements:

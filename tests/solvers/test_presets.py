@@ -13,8 +13,10 @@ from lyra_petsc.solvers.presets import PRESETS, candidates, linear_limit
 @pytest.mark.parametrize(
     ("vertices", "ranks", "more", "first"),
     [
-        (500, 1, {}, "ilu"),
-        (500, 3, {}, "block-ilu"),
+        (500, 1, {}, "block-jacobi"),
+        (500, 3, {}, "block-jacobi"),
+        (500, 1, {"iterations": 50.0}, "ilu"),
+        (500, 3, {"iterations": 50.0}, "block-ilu"),
         (500, 1, {"newton": False}, "ilu"),
         (500, 2, {"newton": False}, "block-ilu"),
         (500, 1, {"iterations": 1e4}, "direct"),
