@@ -109,10 +109,10 @@ FACTOR_COST = 200.0, 6.5
 Measured are 300 to 400 for 1000 to 5000 vertices; a buckling sheet needs more than one for an iteration.
 """
 
-WORTH = 4.0
-"""How many iterations of block Jacobi one of multigrid or incomplete factors is worth at least."""
+WORTH, WORTH_INCOMPLETE = 4.0, 2.0
+"""How many iterations of block Jacobi one of multigrid, or of incomplete factors, is worth at least."""
 
-PRICE = 4.0
+PRICE, PRICE_INCOMPLETE = 4.0, 2.0
 """How many of them it costs."""
 
 INCOMPLETE_FROM = 5.0
@@ -141,7 +141,7 @@ def candidates(
         return last
     incomplete = "ilu" if ranks == 1 else "block-ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
-    if iterations > _factor_cost(n_vertices) * (1.0 if small else WORTH):
+    if iterations > _factor_cost(n_vertices) * (WORTH_INCOMPLETE if small else WORTH):
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
@@ -160,7 +160,8 @@ def _factorisations(ranks: int) -> list[str]:
 def linear_limit(n_vertices: int, presets: Sequence[str]) -> float:
     """Linear iterations per Newton iteration from which the factorisation that is next pays."""
     if len(presets) > 1 and presets[1] in FACTORISATIONS:
-        return _factor_cost(n_vertices) / (1.0 if presets[0] == "block-jacobi" else PRICE)
+        prices = {"block-jacobi": 1.0} | dict.fromkeys(INCOMPLETE, PRICE_INCOMPLETE)
+        return _factor_cost(n_vertices) / prices.get(presets[0], PRICE)
     return math.inf
 
 

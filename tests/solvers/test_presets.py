@@ -46,6 +46,7 @@ def test_the_first_fits_the_problem(vertices: int, ranks: int, more: dict[str, f
 
 def test_iterations_are_limited_only_before_a_factorisation() -> None:
     assert linear_limit(1000, ["block-jacobi", "direct"]) == 4.0 * linear_limit(1000, ["gamg", "direct"])
+    assert linear_limit(1000, ["ilu", "direct"]) == 2.0 * linear_limit(1000, ["gamg", "direct"])
     assert linear_limit(9000, ["gamg", "direct"]) > linear_limit(1000, ["gamg", "direct"])
     assert linear_limit(10**6, ["gamg", "block-jacobi"]) == np.inf
 
