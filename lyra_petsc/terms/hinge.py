@@ -77,7 +77,7 @@ def angle_slopes(x0, x1, x2, x3):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def triangle_turn(e, length, u, p, m):  # type: ignore[no-untyped-def]
+def triangle_turn(length, u, p, m):  # type: ignore[no-untyped-def]
     """Of one triangle of a hinge: its unit normal n, ω_c and ∇b_c of its three corners, and a vector t.
 
     With barycentric coordinates b_c and ∂θ/∂x_c = ω_c n the normal turns by −Σ ∇b_d (n · δx_d), so that,
@@ -85,7 +85,7 @@ def triangle_turn(e, length, u, p, m):  # type: ignore[no-untyped-def]
 
         ∂²θ/∂x_c∂x_d = −ω_d n ∇b_cᵀ − ω_c ∇b_d nᵀ + σ_c σ_d (n tᵀ + t nᵀ),   σ = 1, −1, 0.
 
-    It has n tᵀ twice in each alone, whose antisymmetric halves cancel. The edge e = x1 − x0 has the direction
+    It has n tᵀ twice in each alone, whose antisymmetric halves cancel. The edge x1 − x0 has the direction
     u, p goes from x0 to the opposite corner, and m is the normal with twice the triangle's area.
     """
     inverse = 1.0 / math.sqrt(dot(m, m))
@@ -108,7 +108,7 @@ def add_angle_hessian(x0, x1, x2, x3, scale, out):  # type: ignore[no-untyped-de
     u = scaled(1.0 / length, e)
     for side in range(2):
         p = minus(x2, x0) if side == 0 else minus(x3, x0)
-        n, w, b, t = triangle_turn(e, length, u, p, cross(e, p) if side == 0 else cross(p, e))
+        n, w, b, t = triangle_turn(length, u, p, cross(e, p) if side == 0 else cross(p, e))
         for c in range(3):
             for d in range(3):
                 turned = 0.0 if c == 2 or d == 2 else (1.0 if c == d else -1.0)

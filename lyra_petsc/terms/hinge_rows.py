@@ -95,8 +95,8 @@ def add_exact(x, s, theta, blend, k, rest, limit, weight, offsets, values):  # t
         u = scaled(1.0 / length, e)
         w = 2.0 * k[h] * weight[h]
         z = (1.0 - blend) * w * (theta[h] - rest[h])
-        one = _times(z, triangle_turn(e, length, u, o1, m1))
-        two = _times(z, triangle_turn(e, length, u, o2, m2))
+        one = _times(z, triangle_turn(length, u, o1, m1))
+        two = _times(z, triangle_turn(length, u, o2, m2))
         n1, n2, p, q = one[0], two[0], one[1], two[1]
         g = combined(p[0], n1, q[0], n2), combined(p[1], n1, q[1], n2)
         _add_edge(at[0], w, 1.0, g, one, two, 0, 0, values)

@@ -78,18 +78,24 @@ def add_gradient(v, s, area, n, wind, density, drag, out):  # type: ignore[no-un
             out[i, 2] -= fz
 
 
+@kernel(inline="always")
+def _slopes(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-def]
+    """Factors of n nᵀ and of the identity in every block of the Hessian of triangle e."""
+    _, _, _, vn = _relative(v, s, e, n, wind)
+    w = area[e] / 9.0
+    return w * (2.0 * density * abs(vn) - drag), w * drag
+
+
 @kernel()
 def hessians(v, s, lo, hi, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N s/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3)."""
     for e in range(lo, hi):
-        _, _, _, vn = _relative(v, s, e, n, wind)
-        w = area[e] / 9.0
-        along = w * (2.0 * density * abs(vn) - drag)
+        along, across = _slopes(v, s, e, area, n, wind, density, drag)
         for i in range(3):
             for j in range(3):
                 value = along * n[e, i] * n[e, j]
                 if i == j:
-                    value += w * drag
+                    value += across
                 for a in range(3):
                     for b in range(3):
                         out[e - lo, a, b, i, j] = value
@@ -100,13 +106,11 @@ def add_hessians(v, s, area, n, wind, density, drag, offsets, values):  # type: 
     """Add the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values)
-        _, _, _, vn = _relative(v, s, e, n, wind)
-        w = area[e] / 9.0
-        along = w * (2.0 * density * abs(vn) - drag)
+        along, across = _slopes(v, s, e, area, n, wind, density, drag)
         right = n[e, 0], n[e, 1], n[e, 2]
         left = along * right[0], along * right[1], along * right[2]
         for pair in range(6):
-            add_outer(values, offsets[e, pair], w * drag, (left,), (right,))
+            add_outer(values, offsets[e, pair], across, (left,), (right,))
 
 
 class Wind(Viscous):
