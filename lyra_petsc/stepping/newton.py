@@ -9,6 +9,7 @@ from petsc4py import PETSc
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.profiling import JACOBIAN, JACOBIAN_AGAIN, logged
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.solvers import failed_factors
 from lyra_petsc.solvers.inertia import negative_pivots, shows_negative_curvature
 from lyra_petsc.solvers.options import is_set
 from lyra_petsc.solvers.reasons import NOT_A_NUMBER
@@ -173,7 +174,9 @@ class Newton:
         if self._snes.getIterationNumber() == 0:
             self._began_convex = self._convex
         while useless:
-            if self._kept or self._same or self.shift.raise_():
+            if failed_factors.forget(self._ksp):
+                pass
+            elif self._kept or self._same or self.shift.raise_():
                 self._precondition_again(x)
             elif self._blend.raise_():
                 self._assemble_again(x)

@@ -16,7 +16,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.parallel import all_here
 from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers import reasons
+from lyra_petsc.solvers import failed_factors, reasons
 from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
@@ -291,7 +291,7 @@ class Stepper:
         self.ts.setTimeStep(t1 - t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        if not self._iterates and self._newton.shift.raise_():
+        if not self._iterates and (failed_factors.forget(self.ksp) or self._newton.shift.raise_()):
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, self._newton.norm, words=words, stuck=stuck)
 

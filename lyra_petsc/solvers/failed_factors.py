@@ -1,0 +1,49 @@
+"""A factorisation that failed is forgotten, as PETSc would report its failure ever after.
+
+So it does for incomplete factors, block Jacobi and MUMPS, whatever the matrix becomes. MUMPS estimates its
+workspace before it factors; on several ranks the order of events decides what it needs, and its margin of
+20 % is not always enough (MUMPS users' guide, ICNTL(14) and INFOG(1) = -8, -9, -17, -20).
+"""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+LACKS_ROOM = (-8, -9, -17, -20)
+"""INFOG(1) where a larger ICNTL(14) helps."""
+
+MARGIN, MORE, LARGEST = 20, 4, 2000
+"""ICNTL(14) that MUMPS begins with [%], the factor by which it grows, and where that ends."""
+
+
+def forget(ksp: PETSc.KSP) -> bool:
+    """Begin anew with a solver whose preconditioner could not be set up; operators must be set again.
+
+    Returns whether another solve may succeed with the same matrix, since MUMPS has more workspace now;
+    collective.
+    """
+    if ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
+        return False
+    old = ksp.getPC()
+    larger = _enlarge_workspace(old)
+    new = PETSc.PC().create(ksp.comm)
+    new.setOptionsPrefix(ksp.getOptionsPrefix())
+    new.setType(old.getType())
+    new.setFromOptions()
+    ksp.reset()
+    ksp.setPC(new)
+    return larger
+
+
+def _enlarge_workspace(pc: PETSc.PC) -> bool:
+    if pc.getType() not in ("lu", "cholesky") or pc.getFactorSolverType() != "mumps":
+        return False
+    factors = pc.getFactorMatrix()
+    if factors.getMumpsInfog(1) not in LACKS_ROOM:
+        return False
+    margin = factors.getMumpsIcntl(14)
+    if margin >= LARGEST:
+        return False
+    name = f"{factors.getOptionsPrefix() or ''}mat_mumps_icntl_14"
+    PETSc.Options().setValue(name, max(MARGIN, MORE * margin))
+    return True
