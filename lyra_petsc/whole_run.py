@@ -14,6 +14,7 @@ from petsc4py import PETSc
 from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.output.claim import Claim
 from lyra_petsc.output.folder import RunFolder
+from lyra_petsc.output.h5py_loader import import_ahead
 from lyra_petsc.output.phases import Phases
 from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
@@ -65,6 +66,7 @@ def carry_out(
         It was asked to stop; the last step is in the checkpoint.
     """
     with Claim(comm, choice) as claim:  # before the set-up, which may take long
+        import_ahead()
         simulation = Simulation(comm, scene, phases)
         try:
             recorder = Recorder(simulation)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
+from threading import Thread
 from typing import Any
 
 
@@ -16,3 +18,13 @@ def import_h5py() -> Any:
     import h5py
 
     return h5py
+
+
+def import_ahead() -> None:
+    """Let a thread import it while this one makes the mesh, which is gmsh's work and not Python's."""
+
+    def work() -> None:
+        with suppress(ImportError):  # told where it is needed
+            import_h5py()
+
+    Thread(target=work, name="lyra-petsc h5py").start()

@@ -14,7 +14,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,6 +23,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.output import layout
 from lyra_petsc.output.agreement import HDF5_ERRORS, on_each, raise_together, reason
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
@@ -33,13 +34,6 @@ if TYPE_CHECKING:
     from lyra_petsc.output.ordering import FileOrder
 
 Result = TypeVar("Result")
-Attributes = Mapping[str, Mapping[str, int | float | str]]
-
-# bytes that a file with a few dozen datasets needs beyond their data and attributes
-LARGEST_OVERHEAD = 1 << 16
-
-# bytes of data up to which a file is laid out in memory, a copy of the data's places included
-MOST_IN_MEMORY = 1 << 22
 
 
 def _nothing() -> None:
@@ -66,7 +60,7 @@ class NewFile:
 
     path: Path
     datasets: Mapping[str, NDArray[Any]]
-    attributes: Attributes
+    attributes: layout.Attributes
     publish: Callable[[], None] = _nothing
 
     @property
@@ -106,7 +100,7 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
 
     def lay_out(number: int) -> list[int]:
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
-        return _guarded(file.path, lambda: _lay_out(file.part, slabs[number], rows, file.attributes))
+        return _guarded(file.path, lambda: layout.lay_out(file.part, slabs[number], rows, file.attributes))
 
     try:
         known = comm.allgather(on_each(comm, lambda: {number: lay_out(number) for number in mine}))
@@ -187,83 +181,6 @@ def _guarded(path: Path, work: Callable[[], Result]) -> Result:
         return work()
     except HDF5_ERRORS as error:
         raise cannot_write(path, error) from error
-
-
-def _lay_out(
-    part: Path, slabs: Mapping[str, NDArray[Any]], rows: Sequence[int], attributes: Attributes
-) -> list[int]:
-    """Create the file, its whole size reserved on disk; where each dataset is to be written [bytes].
-
-    By the library's own calls: h5py's objects over them take twice as long, which small states feel. So does
-    a file that HDF5 opens beside one that is made in memory.
-    """
-    h5py = import_h5py()
-    texts = sum(len(str(value)) for values in attributes.values() for value in values.values())
-    shapes = [(count, *slab.shape[1:]) for count, slab in zip(rows, slabs.values(), strict=True)]
-    data = sum(slab.itemsize * math.prod(shape) for shape, slab in zip(shapes, slabs.values(), strict=True))
-    in_memory = data <= MOST_IN_MEMORY
-    if not in_memory:
-        with open(part, "wb") as raw:
-            os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD)
-    early, links = _of_datasets()
-    file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=_of_files(in_memory))
-    try:
-        owners = {"/": file}
-        for (name, slab), shape in zip(slabs.items(), shapes, strict=True):
-            space = h5py.h5s.create_simple(shape)
-            kind = h5py.h5t.py_create(slab.dtype, logical=True)
-            owners[name] = h5py.h5d.create(file, name.encode(), kind, space, early, links)
-        # a dataset without rows has no place
-        places = [owners[name].get_offset() or 0 for name in slabs]
-        for name, values in attributes.items():
-            if name not in owners:
-                made = name in file
-                owners[name] = (h5py.h5g.open if made else h5py.h5g.create)(file, name.encode())
-            owner = owners[name]
-            for key, value in values.items():
-                _write_attribute(owner, key, value)
-        image = b""
-        if in_memory:
-            h5py.h5f.flush(file)
-            image = file.get_file_image()
-    finally:
-        file.close()
-    with open(part, "wb" if in_memory else "r+b") as raw:
-        os.posix_fallocate(raw.fileno(), 0, len(image) or part.stat().st_size)
-        raw.write(image)
-    return places
-
-
-@cache
-def _of_datasets() -> tuple[Any, Any]:
-    """How datasets, and the groups they are in, are made."""
-    h5py = import_h5py()
-    early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    early.set_layout(h5py.h5d.CONTIGUOUS)
-    early.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    early.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    links = h5py.h5p.create(h5py.h5p.LINK_CREATE)
-    links.set_create_intermediate_group(True)
-    return early, links
-
-
-@cache
-def _of_files(in_memory: bool) -> Any:
-    """How files are made."""
-    h5py = import_h5py()
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-    if in_memory:
-        access.set_fapl_core(LARGEST_OVERHEAD, False)
-    return access
-
-
-def _write_attribute(owner: Any, key: str, value: int | float | str) -> None:
-    h5py = import_h5py()
-    text = isinstance(value, str)
-    stored = np.array(value, dtype=h5py.string_dtype() if text else None)
-    kind = h5py.h5t.py_create(stored.dtype, logical=True)
-    h5py.h5a.create(owner, key.encode(), kind, h5py.h5s.create(h5py.h5s.SCALAR)).write(stored)
 
 
 def _sync(part: Path) -> None:
