@@ -17,7 +17,9 @@ Result = TypeVar("Result")
 
 # registered here, as PETSc adds up the stages of all ranks by number: the order must not depend on the way
 # a rank takes
-STAGES = {name: PETSc.Log.Stage(name) for name in ("mesh", "partition", "assembly", "solve", "output")}
+STAGES = {
+    name: PETSc.Log.Stage(name) for name in ("mesh", "partition", "assembly", "solve", "balance", "output")
+}
 
 RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
 """Events, the latter once a Newton iteration; PETSc's table has room for names of 16 letters."""

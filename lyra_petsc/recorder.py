@@ -187,16 +187,16 @@ class Recorder:
 
     def record(self, report: StepReport) -> None:
         """Everything that the step just accepted has to leave on disk, be it during the next ones."""
-        self._write_row(report)
         self._steps_since += 1
+        due = self._write_row(report)
         control = self._simulation.control
         if control.writes_at(report.time) or self._simulation.finished:
             self.write_state()
-        elif self._due():
+        elif due:
             self.write_checkpoint()
 
     def _due(self) -> bool:
-        """Whether a checkpoint is due, by steps or by wall time: rank 0's clock decides.
+        """Whether a checkpoint is due, by steps or by wall time (rank 0).
 
         Also where it costs next to nothing beside the steps since the last one: a step of minutes is
         then not lost to a launcher that leaves a second to finish.
@@ -205,35 +205,41 @@ class Recorder:
         if asked.steps is not None and self._steps_since >= asked.steps:
             return True
         elapsed = clock.monotonic() - self._last_checkpoint
-        due = elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
-        return bool(self._simulation.comm.bcast(due, root=0))
+        return elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
 
-    def _write_row(self, report: StepReport) -> None:
+    def _write_row(self, report: StepReport) -> bool:
+        """A row of each table; whether a checkpoint is due, by rank 0's clock."""
         budget = self._simulation.budget
-        self._history.append(
-            {
-                "step": report.step,
-                "time": report.time,
-                "dt": report.dt,
-                "newton_iterations": report.newton_iterations,
-                "linear_iterations": report.linear_iterations,
-                "rejected": report.rejected,
-                "kinetic_energy": budget.kinetic,
-                "membrane_energy": budget.membrane,
-                "bending_energy": budget.bending,
-                "potential_energy": budget.potential,
-                "external_work": budget.external_work,
-                "dissipation": budget.dissipation,
-                "residual": report.residual,
-                "wall_seconds": report.wall_seconds,
-            }
-        )
+        history = {
+            "step": report.step,
+            "time": report.time,
+            "dt": report.dt,
+            "newton_iterations": report.newton_iterations,
+            "linear_iterations": report.linear_iterations,
+            "rejected": report.rejected,
+            "kinetic_energy": budget.kinetic,
+            "membrane_energy": budget.membrane,
+            "bending_energy": budget.bending,
+            "potential_energy": budget.potential,
+            "external_work": budget.external_work,
+            "dissipation": budget.dissipation,
+            "residual": report.residual,
+            "wall_seconds": report.wall_seconds,
+        }
+        rows = [(self._history, history)]
         if self._probes is not None:
-            self._probes.append(self._vectors(report, self._probe_means()))
+            rows.append((self._probes, self._vectors(report, self._probe_means())))
         if self._reactions is not None:
             pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
             forces = {f"handle{n}": force for n, force in enumerate(pulls)}
-            self._reactions.append(self._vectors(report, forces))
+            rows.append((self._reactions, self._vectors(report, forces)))
+
+        def work() -> bool:
+            for table, row in rows:
+                table.append_here(row)
+            return self._due()
+
+        return bool(on_root(self._comm, work))
 
     @staticmethod
     def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float]:

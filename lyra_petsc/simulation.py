@@ -192,7 +192,7 @@ class Simulation:
         self.control.succeeded(newton)
         dt, self.time = end - self.time, end
         self.step_number += 1
-        with self.phases("output"):
+        with self.phases("balance"):
             self.ledger.record(x_before[:n])
             note = self.compression.look(f"step {self.step_number} ({self._now()})")
         if note:

@@ -6,8 +6,8 @@ import csv
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from io import FileIO, StringIO
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from mpi4py import MPI
@@ -73,8 +73,9 @@ class History:
             raise ValueError("the first column is step")
         self.path = Path(path)
         self.columns = tuple(columns)
+        self._names = frozenset(columns)
         self.comm = comm
-        self._file: TextIO | None = None
+        self._file: FileIO | None = None
         self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
         self.kept_until = comm.bcast(self.kept_until, root=0)
@@ -87,7 +88,7 @@ class History:
         values : mapping
             A number for each column and nothing else; read on rank 0 only.
         """
-        on_root(self.comm, lambda: self._append(values))
+        on_root(self.comm, lambda: self.append_here(values))
 
     def close(self) -> None:
         """Close the file; nothing can be appended afterwards. Not collective.
@@ -104,25 +105,29 @@ class History:
             go_on = resume_after is not None and self.path.exists()
             if resume_after is not None and go_on:
                 self._cut(resume_after)
-            self._file = self.path.open("a" if go_on else "w", encoding="utf-8", newline="")
+            self._file = self.path.open("ab" if go_on else "wb", buffering=0)
             if not go_on:
-                self._write(self.columns)
+                header = StringIO()
+                csv.writer(header, lineterminator="\n").writerow(self.columns)
+                self._write(header.getvalue())
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
-    def _append(self, values: Mapping[str, float]) -> None:
-        if set(values) != set(self.columns):
+    def append_here(self, values: Mapping[str, float]) -> None:
+        """The same on rank 0 alone, for several tables at once."""
+        if values.keys() != self._names:
             raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
         try:
-            self._write([_text(values[name]) for name in self.columns])
+            self._write(",".join([_text(values[name]) for name in self.columns]) + "\n")
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
-    def _write(self, cells: Sequence[str]) -> None:
+    def _write(self, line: str) -> None:
         if self._file is None:
             raise ValueError(f"{self.path} is closed")
-        csv.writer(self._file, lineterminator="\n").writerow(cells)
-        self._file.flush()
+        left = line.encode()
+        while left:  # a disk that is nearly full takes a part of it
+            left = left[self._file.write(left) :]
 
     def _cut(self, last_step: int) -> None:
         """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""

@@ -17,7 +17,7 @@ from lyra_petsc.study.plan import Plan
 from lyra_petsc.study.reference import Physics
 from lyra_petsc.study.work import Known
 
-PHASES = ("mesh", "partition", "assembly", "solve", "output", "other")
+PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
 """Phases of a run; ``output`` is the bookkeeping of energies, the writing of files is not timed."""
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from launch import SCENE, done, environment, write_scene
 
-STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|output): +\S+ +[\d.]+%", re.M)
+STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|balance|output): +\S+ +[\d.]+%", re.M)
 
 
 def counts(log: str, name: str) -> list[int]:
@@ -29,7 +29,7 @@ def column(folder: Path, name: str) -> list[int]:
 def test_stages_and_events(tmp_path: Path, integrator: str, ranks: int) -> None:
     scene = write_scene(tmp_path, SCENE.replace("step: 0.01}", f"step: 0.01, integrator: {integrator}}}"))
     left = done(["run", scene, "--out", "out", "-log_view"], tmp_path, ranks)
-    assert STAGE.findall(left.out) == ["mesh", "partition", "assembly", "solve", "output"]
+    assert STAGE.findall(left.out) == ["mesh", "partition", "assembly", "solve", "balance", "output"]
     newton, rejected = column(tmp_path / "out", "newton_iterations"), column(tmp_path / "out", "rejected")
     steps = len(newton) - 1
     assert steps == 5
@@ -72,6 +72,6 @@ print(list(STAGES))
     )
     # once outside of all stages, once each in those that were innermost
     assert told.stdout.splitlines() == [
-        "[1, 1, 0, 0, 0, 1, 1]",
-        "['mesh', 'partition', 'assembly', 'solve', 'output', 'a further one']",
+        "[1, 1, 0, 0, 0, 0, 1, 1]",
+        "['mesh', 'partition', 'assembly', 'solve', 'balance', 'output', 'a further one']",
     ], told.stderr

@@ -133,7 +133,7 @@ def test_the_summary_says_how_it_went(full: Path) -> None:
     assert summary["outcome"] == "done"
     assert summary["sizes"] == {"vertices": 25, "triangles": 32, "unknowns": 75}
     assert summary["terms"] == ["membrane", "bending", "gravity"]
-    assert {"mesh", "partition", "assembly", "solve", "output"} <= set(summary["wall_seconds"])
+    assert {"mesh", "partition", "assembly", "solve", "balance", "output"} <= set(summary["wall_seconds"])
     assert {"petsc", "mpi", "numpy", "lyra_petsc"} <= set(summary["versions"])
     rows = table(full / "history.csv")
     assert summary["newton_iterations"] == sum(int(row["newton_iterations"]) for row in rows)
