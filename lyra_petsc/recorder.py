@@ -236,7 +236,7 @@ class Recorder:
 
         def work() -> bool:
             for table, row in rows:
-                table.append_here(row)
+                table.append(row)
             return self._due()
 
         return bool(on_root(self._comm, work))

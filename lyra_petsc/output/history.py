@@ -39,7 +39,7 @@ def vector_columns(names: Sequence[str]) -> tuple[str, ...]:
 
 
 class History:
-    """A CSV table on disk, written row by row by rank 0. Every method is collective.
+    """A CSV table on disk, written row by row by rank 0. Construction is collective.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class History:
     columns : sequence of str
         The header; the first column is ``step``.
     comm : MPI.Comm
-        All ranks of the run; what fails on rank 0 is raised on all.
+        All ranks of the run; what opening it on rank 0 raises is raised on all.
     resume_after : int, optional
         Keep the rows up to and including this step, cut what follows (also a row that a kill
         left half written) and go on behind them. A file that is missing is begun anew.
@@ -74,24 +74,33 @@ class History:
         self.path = Path(path)
         self.columns = tuple(columns)
         self._names = frozenset(columns)
-        self.comm = comm
         self._file: FileIO | None = None
         self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
         self.kept_until = comm.bcast(self.kept_until, root=0)
 
     def append(self, values: Mapping[str, float]) -> None:
-        """Write one row and flush it.
+        """Write one row; for rank 0, which may write several tables before the others hear of it.
 
         Parameters
         ----------
         values : mapping
-            A number for each column and nothing else; read on rank 0 only.
+            A number for each column and nothing else.
+
+        Raises
+        ------
+        OutputError
+            On rank 0.
         """
-        on_root(self.comm, lambda: self.append_here(values))
+        if values.keys() != self._names:
+            raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
+        try:
+            self._write(",".join([_text(values[name]) for name in self.columns]) + "\n")
+        except OSError as error:
+            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Close the file; nothing can be appended afterwards. Not collective.
+        """Close the file; nothing can be appended afterwards.
 
         Every row is on its way when ``append`` returns: what a failed one left behind is dropped.
         """
@@ -110,15 +119,6 @@ class History:
                 header = StringIO()
                 csv.writer(header, lineterminator="\n").writerow(self.columns)
                 self._write(header.getvalue())
-        except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
-
-    def append_here(self, values: Mapping[str, float]) -> None:
-        """The same on rank 0 alone, for several tables at once."""
-        if values.keys() != self._names:
-            raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
-        try:
-            self._write(",".join([_text(values[name]) for name in self.columns]) + "\n")
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 

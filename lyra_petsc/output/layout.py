@@ -138,6 +138,7 @@ def _in_memory(shapes: Shapes, attributes: Attributes, *, keep: bool) -> tuple[l
     """Places and bytes of a file."""
     group = _common_group(shapes, attributes)
     kind = (
+        posixpath.dirname(group),  # where it stays when it gets another name
         tuple((name.removeprefix(group), *shape) for name, shape in shapes.items()),
         tuple(
             (path.removeprefix(group), key, type(value))

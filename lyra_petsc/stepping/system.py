@@ -15,7 +15,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 
 import numpy as np
 from mpi4py import MPI
@@ -273,7 +273,7 @@ class ReducedSystem:
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
         parts = self._parts(*self._evaluate_at(v), vdot)
-        out[:] = sum(parts.values())
+        reduce(lambda total, part: np.add(total, part, out=out), parts.values())
         if self.held:
             held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed.velocity)
             np.copyto(out, held, where=~self._prescribed.free)

@@ -59,6 +59,11 @@ def test_states_one_after_the_other(tmp_path: Path) -> None:
     assert max(sizes) <= min(sizes) + layout.MOST_LOST
 
 
+def test_a_group_elsewhere(tmp_path: Path) -> None:
+    for group in ("a/x", "b/x", "a/y", "c", "a/x/deep"):
+        check(tmp_path / "a.h5", {f"{group}/p": 5, f"{group}/q": 5}, {group: {"time": 1.0}})
+
+
 def test_texts_that_change_do_not_make_files_grow(tmp_path: Path) -> None:
     sizes = []
     for number in range(60):

@@ -53,7 +53,7 @@ PLACES = {
     "residual": ("stepping.system", "ReducedSystem.residual", 25),
     "jacobian": ("stepping.system", "ReducedSystem.jacobian", 9),
     "writing a state": ("output.hdf5", "write_slabs", 3),
-    "a row of the history": ("output.history", "History.append", 4),
+    "a row of the history": ("recorder", "Recorder._write_row", 4),
 }
 
 
