@@ -6,8 +6,9 @@ import csv
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from io import FileIO, StringIO
+from io import StringIO
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from mpi4py import MPI
@@ -74,7 +75,7 @@ class History:
         self.path = Path(path)
         self.columns = tuple(columns)
         self._names = frozenset(columns)
-        self._file: FileIO | None = None
+        self._file: BinaryIO | None = None
         self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
         self.kept_until = comm.bcast(self.kept_until, root=0)
@@ -114,7 +115,7 @@ class History:
             go_on = resume_after is not None and self.path.exists()
             if resume_after is not None and go_on:
                 self._cut(resume_after)
-            self._file = self.path.open("ab" if go_on else "wb", buffering=0)
+            self._file = self.path.open("ab" if go_on else "wb")
             if not go_on:
                 header = StringIO()
                 csv.writer(header, lineterminator="\n").writerow(self.columns)
@@ -125,9 +126,8 @@ class History:
     def _write(self, line: str) -> None:
         if self._file is None:
             raise ValueError(f"{self.path} is closed")
-        left = line.encode()
-        while left:  # a disk that is nearly full takes a part of it
-            left = left[self._file.write(left) :]
+        self._file.write(line.encode())
+        self._file.flush()
 
     def _cut(self, last_step: int) -> None:
         """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""

@@ -11,6 +11,7 @@ import math
 import os
 import posixpath
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -123,11 +124,13 @@ class _Content:
         self.file.close()
 
 
+@dataclass
 class _Kept:
     """A file in memory that others are made of."""
 
-    def __init__(self, group: str, content: _Content, size: int) -> None:
-        self.group, self.content, self.size = group, content, size
+    group: str
+    content: _Content
+    size: int
 
 
 _kept: dict[Any, _Kept] = {}

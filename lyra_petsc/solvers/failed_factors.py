@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+MADE_OF_FACTORS = frozenset({"lu", "cholesky", "ilu", "icc", "bjacobi", "asm"})
+"""Preconditioners that options alone make again; multigrid would lose its levels."""
+
 LACKS_ROOM = (-8, -9, -17, -20)
 """INFOG(1) where a larger ICNTL(14) helps."""
 
@@ -22,9 +25,10 @@ def forget(ksp: PETSc.KSP) -> bool:
     Returns whether another solve may succeed with the same matrix, since MUMPS has more workspace now;
     collective.
     """
-    if ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-        return False
     old = ksp.getPC()
+    failed = ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+    if not failed or old.getType() not in MADE_OF_FACTORS:
+        return False
     larger = _enlarge_workspace(old)
     new = PETSc.PC().create(ksp.comm)
     new.setOptionsPrefix(ksp.getOptionsPrefix())

@@ -48,6 +48,28 @@ def test_a_better_matrix_has_factors_again(kind: str) -> None:
     assert ksp.getPC() == pc
 
 
+def test_multigrid_keeps_its_levels() -> None:
+    mat = PETSc.Mat().createAIJ((4, 4), nnz=1, comm=PETSc.COMM_SELF)
+    for i in range(4):
+        mat.setValue(i, i, 1.0 if i else 0.0)
+    mat.assemble()
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setType("cg")
+    pc = ksp.getPC()
+    pc.setType("mg")
+    pc.setMGLevels(1)
+    pc.getMGCoarseSolve().setType("preonly")
+    pc.getMGCoarseSolve().getPC().setType("cholesky")
+    ksp.setOperators(mat)
+    b, x = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() == FAILED
+    assert not forget(ksp)
+    assert ksp.getPC() == pc
+    assert pc.getMGLevels() == 1
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
