@@ -206,11 +206,10 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     }
     points = part.points
     scheme = scheme_of(scene.time.scheme, _spectral_radius(scene))
-    coupling = {
-        name: term.stencil
-        for name, term in terms.items()
-        if isinstance(term, Elastic) or (isinstance(term, Viscous) and not scheme.explicit)
-    }
+    coupling: dict[str, NDArray[np.int32]] = {}
+    for term in terms.values():
+        if isinstance(term, Elastic) or (isinstance(term, Viscous) and not scheme.explicit):
+            coupling |= term.couplings
     pattern = BlockPattern(coupling, points.n_owned, points.n_local)
     _check_indices(points, pattern.n_couplings)
     held = Held(
@@ -232,7 +231,8 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     data = part.vertex_data
     system.x[: points.n_owned] = data["position"]
     points.update_ghosts(system.x)
-    surface = Surface(system.x.copy(), terms["membrane"].stencil)
+    membrane = terms["membrane"]
+    surface = Surface(system.x.copy(), membrane.stencil, membrane.n_owned)
     # handles set out from the undisturbed shape
     system.begin(0.0)
     system.x[: points.n_owned] = data.get("start", data["position"])

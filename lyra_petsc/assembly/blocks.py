@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.pattern import BlockPattern, Offsets
 from lyra_petsc.assembly.product import HalfStored
 from lyra_petsc.block_rows.scatter import add_elements
 from lyra_petsc.kernel_cache import cached
@@ -77,19 +77,18 @@ class BlockRows:
         """A new array of values (n_blocks, 3, 3), all zero."""
         return np.zeros((self.pattern.n_blocks, 3, 3))
 
-    def add(self, name: str, fill: Fill, weight: Array | float, values: Array) -> None:
-        """Add weight × element blocks of the term ``name``.
+    def add(self, offsets: Offsets, fill: Fill, weight: Array | float, values: Array) -> None:
+        """Add weight × element blocks.
 
         Parameters
         ----------
-        name : str
-            A name among the pattern's stencils.
+        offsets : (E, n (n + 1) / 2)
+            Where they go, as in the pattern.
         fill : callable (lo, hi, out)
             Computes the blocks of elements lo..hi into ``out`` (hi − lo, n, n, 3, 3).
         weight : float or (E,)
         values : (n_blocks, 3, 3)
         """
-        offsets = self.pattern.offsets[name]
         n_elements = len(offsets)
         n = (math.isqrt(8 * offsets.shape[1] + 1) - 1) // 2
         chunk = max(1, CHUNK_VALUES // (9 * n * n))
@@ -106,13 +105,17 @@ class BlockRows:
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
-        if not term.add_hessians(x, blend, weights, self.pattern.offsets[term.name], values):
-            self.add(term.name, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weights, values)
+        offsets = self.pattern.offsets
+        if not term.add_hessians(x, blend, weights, offsets, values):
+            rows = term.offsets_of_elements(offsets)
+            self.add(rows, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weights, values)
 
     def add_viscosity(self, term: Viscous, v: Array, values: Array) -> None:
         """Add the Hessians of a viscous term at velocities v (n_local, 3)."""
-        if not term.add_hessians(v, self.pattern.offsets[term.name], values):
-            self.add(term.name, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
+        offsets = self.pattern.offsets
+        if not term.add_hessians(v, offsets, values):
+            rows = term.offsets_of_elements(offsets)
+            self.add(rows, lambda lo, hi, out: term.hessians(v, lo, hi, out), 1.0, values)
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""

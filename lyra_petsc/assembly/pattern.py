@@ -28,6 +28,7 @@ class BlockPattern:
     ----------
     stencils : mapping of name → (E, n) int
         Local numbering; only these couplings get an entry, and the diagonal.
+        Of pairs of points (E, 2) the coupling of the two alone.
     n_owned, n_local : int
 
     Attributes
@@ -40,13 +41,13 @@ class BlockPattern:
     offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
         Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
         index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
-        both rows.
+        both rows. Of pairs (E,).
     """
 
     def __init__(self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int) -> None:
         keys = diagonal_keys(n_owned, n_local)
         for stencil in stencils.values():
-            for a in range(stencil.shape[1]):  # one after the other: all couplings at once take much memory
+            for a in sorted({a for a, _ in couplings(stencil)}):  # one after the other: all couplings at once take much memory
                 keys = union(keys, *_row_keys(stencil, a, n_owned, n_local))
         self._set(keys, n_owned, n_local)
         self.offsets: dict[str, Offsets] = {
@@ -101,6 +102,12 @@ def index_type(largest: int) -> np.dtype[Any]:
     return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
 
 
+def couplings(stencil: NDArray[np.int32]) -> list[tuple[int, int]]:
+    """Which points (a, b), b ≥ a, of elements (E, n) are coupled."""
+    n = stencil.shape[1]
+    return [(0, 1)] if n == 2 else [(a, b) for a in range(n) for b in range(a, n)]
+
+
 def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Ints:
     key: Ints = np.minimum(one, other).astype(np.int64) * n_local + np.maximum(one, other)
     return key
@@ -108,7 +115,7 @@ def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Int
 
 def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int) -> Iterator[Ints]:
     """Keys row · n_local + column of the couplings of each element's vertices a and b ≥ a."""
-    for b in range(a, stencil.shape[1]):
+    for b in (b for one, b in couplings(stencil) if one == a):
         keys = _keys(stencil[:, a], stencil[:, b], n_local)
         yield keys[keys < n_owned * n_local]
 
@@ -121,10 +128,10 @@ def union(*parts: Ints) -> Ints:
 
 
 def _offsets(stencil: NDArray[np.int32], keys: Ints, n_owned: int, n_local: int) -> Offsets:
-    pairs = list(zip(*np.triu_indices(stencil.shape[1]), strict=True))
+    pairs = couplings(stencil)
     out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
     for pair, (a, b) in enumerate(pairs):
         one, other = stencil[:, a], stencil[:, b]
         found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one < other)
         out[:, pair] = np.where(np.minimum(one, other) < n_owned, found, -1)
-    return out
+    return out[:, 0] if stencil.shape[1] == 2 else out

@@ -14,10 +14,10 @@ AHEAD = 8
 
 
 @cached(forceinline=True)
-def fetch_ahead(element, offsets, values):  # type: ignore[no-untyped-def]
-    """Let the blocks of a later element with offsets (E, n (n + 1) / 2) come into the caches."""
+def fetch_ahead(element, offsets, values, n_pairs):  # type: ignore[no-untyped-def]
+    """Let the blocks of a later element with offsets (E, n_pairs) come into the caches."""
     later = min(element + AHEAD, offsets.shape[0] - 1)
-    for pair in range(offsets.shape[1]):
+    for pair in range(n_pairs):  # which compilers know where it is written down
         fetch(values, offsets[later, pair] >> 1)
 
 
@@ -40,5 +40,5 @@ def add_element(weight, blocks, offsets, values):  # type: ignore[no-untyped-def
 def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks (E, n, n, 3, 3) of elements with offsets (E, n (n + 1) / 2)."""
     for e in range(offsets.shape[0]):
-        fetch_ahead(e, offsets, values)
+        fetch_ahead(e, offsets, values, offsets.shape[1])
         add_element(weight[e], blocks[e], offsets[e], values)

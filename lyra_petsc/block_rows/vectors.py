@@ -8,7 +8,7 @@ the blocks it is always one of the same block. And what will soon be needed is f
 
 from __future__ import annotations
 
-from functools import partial
+from functools import reduce
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -80,10 +80,30 @@ class _Code:
     def nothing(self) -> Value:
         return ir.Constant(self.vector, ir.Undefined)
 
-    def vectors(self, name: str) -> list[tuple[Value, list[Value]]]:
-        """Of a tuple of tuples of three numbers: each as a vector, and number by number."""
-        unpack = partial(cgutils.unpack_tuple, self.builder)
-        return [(self.filled(numbers), numbers) for numbers in map(unpack, unpack(self.given[name]))]
+    def vectors(self, name: str) -> list[Value]:
+        """Of a tuple of sums: each as a vector. A sum is three numbers, or pairs of a factor and three numbers."""
+        return self._sums(self.given[name], self._types[name])
+
+    def pairs(self, name: str) -> list[list[list[Value]]]:
+        """Of a tuple of pairs of such tuples."""
+        of_pairs = zip(self._unpacked(self.given[name]), self._types[name], strict=True)
+        return [
+            [self._sums(one, kind) for one, kind in zip(self._unpacked(pair), kinds, strict=True)]
+            for pair, kinds in of_pairs
+        ]
+
+    def _sums(self, given: Value, kinds: Any) -> list[Value]:
+        return [self._sum(one, kind) for one, kind in zip(self._unpacked(given), kinds, strict=True)]
+
+    def _sum(self, given: Value, kind: Any) -> Value:
+        if not isinstance(kind[0], types.BaseTuple):
+            return self.filled(self._unpacked(given))
+        pairs = map(self._unpacked, self._unpacked(given))
+        parts = [self.times(self.repeat(factor), self.filled(self._unpacked(of))) for factor, of in pairs]
+        return reduce(self.plus, parts)
+
+    def _unpacked(self, given: Value) -> list[Value]:
+        return cgutils.unpack_tuple(self.builder, given)  # type: ignore[no-any-return, no-untyped-call]
 
     def filled(self, numbers: list[Value]) -> Value:
         """A vector that begins with these numbers."""
@@ -107,6 +127,80 @@ class _Code:
 
     def plus(self, one: Value, other: Value) -> Value:
         return self.builder.fadd(one, other, flags=FLAGS)
+
+    def numbers(self, name: str) -> list[Value]:
+        """Of a tuple."""
+        return self._unpacked(self.given[name])
+
+    def tuples(self, name: str) -> list[list[Value]]:
+        """Of a tuple of tuples."""
+        return [self._unpacked(one) for one in self.numbers(name)]
+
+    def combined(self, factors: list[Value], two: list[Value]) -> list[Value]:
+        """Of two vectors, the sum with the first two factors and that with the last two."""
+        uu, uv, vu, vv = map(self.repeat, factors)
+        u, v = two
+        return [self.plus(self.times(p, u), self.times(q, v)) for p, q in ((uu, uv), (vu, vv))]
+
+    def outer(self, diagonal: Value, lefts: list[Value], rights: list[Value]) -> list[Value]:
+        """Rows of diagonal I + Σ left rightᵀ."""
+        rows = []
+        for i in range(3):
+            row = self.builder.insert_element(ir.Constant(self.vector, [0.0] * WIDTH), diagonal, LANE(i))
+            for left, right in zip(lefts, rights, strict=True):
+                row = self.plus(row, self.times(self.pick(left, left, i, i, i, i), right))
+            rows.append(row)
+        return rows
+
+    def minus_sum(self, one: list[Value], other: list[Value]) -> list[Value]:
+        """Of the rows of two blocks."""
+        return [self.builder.fneg(self.plus(p, q)) for p, q in zip(one, other, strict=True)]
+
+    def packed(self, rows: list[Value]) -> list[Value]:
+        """The first eight numbers of a block, row by row."""
+        one, two, three = rows
+        return [self.pick(one, two, 0, 1, 2, 4), self.pick(two, three, 1, 2, 4, 5)]
+
+    def packed_columns(self, rows: list[Value]) -> list[Value]:
+        """The first eight numbers of a block, column by column."""
+        one, two, three = rows
+        last, below = self.pick(one, two, 2, 6, 2, 6), self.pick(two, three, 1, 5, 1, 5)
+        first = self.pick(self.pick(one, two, 0, 4, 1, 5), three, 0, 1, 4, 2)
+        return [first, self.pick(below, last, 0, 1, 4, 5)]
+
+    def add_block(self, block: Value, eight: list[Value], row: Value) -> None:
+        """Add to a block in memory its first eight numbers, and the third of its last row."""
+        for i, numbers in enumerate(eight):
+            target = self.builder.gep(block, [INDEX(WIDTH * i)])
+            self.store(self.plus(self.load(target), numbers), target)
+        target = self.builder.gep(block, [INDEX(8)])
+        corner = self.builder.extract_element(row, LANE(2))
+        self.builder.store(self.plus(self.builder.load(target), corner), target)
+
+    def add_six(self, blocks: list[list[Value]]) -> None:
+        """Add the blocks of an element ``e`` of three points where ``offsets`` (E, 6) say."""
+        builder, begin = self.builder, self.begin("blocks")
+        row = self.at(self.begin("offsets"), self.integer("e"), 6)
+        offsets = [builder.load(builder.gep(row, [INDEX(pair)])) for pair in range(6)]
+        ready = [(self.packed(rows), rows[2]) for rows in blocks]
+
+        def add(pair: int) -> None:
+            at = builder.ashr(offsets[pair], offsets[pair].type(1))
+            at = at if at.type == INDEX else builder.sext(at, INDEX)
+            self.add_block(self.at(begin, at, 9), *ready[pair])
+
+        # ascending points: where the last has its row here all have
+        with builder.if_else(self.is_ours(offsets[5]), likely=True) as (all_of_them, some):
+            with all_of_them:
+                for pair in range(6):
+                    add(pair)
+            with some:
+                for pair in range(6):
+                    with builder.if_then(self.is_ours(offsets[pair])):
+                        add(pair)
+
+    def is_ours(self, offset: Value) -> Value:
+        return self.builder.icmp_signed(">=", offset, offset.type(0))
 
     def fetch(self, pointer: Value) -> None:
         """Let memory come into the caches; it need not be ours."""
@@ -180,36 +274,59 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
 def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
     """blocks[at // 2] += diagonal I + Σ left[m] right[m]ᵀ, transposed where ``at`` is odd.
 
-    Nothing where it is negative. Left and right are tuples of vectors, tuples of three numbers.
+    Nothing where it is negative. Left and right are tuples of vectors, each three numbers or a sum of some:
+    pairs of a factor and three numbers.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = _Code(context, builder, signature, arguments, "blocks at diagonal left right")
-        at, pick = code.integer("at"), code.pick
-        block = code.at(code.begin("blocks"), builder.ashr(at, INDEX(1)), 9)
+        at, begin = code.integer("at"), code.begin("blocks")
         lefts, rights = code.vectors("left"), code.vectors("right")
         with builder.if_then(builder.icmp_signed(">=", at, INDEX(0)), likely=True):
-            rows = []
-            for i in range(3):
-                zero = ir.Constant(code.vector, [0.0] * WIDTH)
-                row = builder.insert_element(zero, code.given["diagonal"], LANE(i))
-                for (_, numbers), (vector, _) in zip(lefts, rights, strict=True):
-                    row = code.plus(row, code.times(code.repeat(numbers[i]), vector))
-                rows.append(row)
-            one, two, three = rows
-            plain = pick(one, two, 0, 1, 2, 4), pick(two, three, 1, 2, 4, 5)
-            last, below = pick(one, two, 2, 6, 2, 6), pick(two, three, 1, 5, 1, 5)
-            turned = pick(pick(one, two, 0, 4, 1, 5), three, 0, 1, 4, 2), pick(below, last, 0, 1, 4, 5)
+            rows = code.outer(code.given["diagonal"], lefts, rights)
+            plain, turned = code.packed(rows), code.packed_columns(rows)
             odd = builder.trunc(at, ir.IntType(1))
-            for i in range(2):
-                target = builder.gep(block, [INDEX(WIDTH * i)])
-                code.store(code.plus(code.load(target), builder.select(odd, turned[i], plain[i])), target)
-            target = builder.gep(block, [INDEX(8)])
-            corner = builder.extract_element(three, LANE(2))
-            builder.store(code.plus(builder.load(target), corner), target)
+            chosen = [builder.select(odd, there, here) for there, here in zip(turned, plain, strict=True)]
+            code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), chosen, rows[2])
         return context.get_dummy_value()
 
     return types.void(blocks, at, diagonal, left, right), generate
+
+
+def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, six: Any) -> Any:
+    """Add the blocks of corners a ≥ b of an element e: Σ left[m] right[m]ᵀ each, given by left and right.
+
+    Offsets (E, 6) are those of ascending corners, of (0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2). Left and
+    right are as in ``add_outer``.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks offsets e six")
+        nothing = ir.Constant(code.vector.element, 0.0)
+        code.add_six([code.outer(nothing, left, right) for left, right in code.pairs("six")])
+        return context.get_dummy_value()
+
+    return types.void(blocks, offsets, e, six), generate
+
+
+def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, diagonals: Any, f: Any, factors: Any) -> Any:
+    """Like ``add_six``, where a translation does nothing: columns and rows of blocks sum to zero.
+
+    Given are those of (1, 1), (2, 1), (2, 2): diagonal I + uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ, with
+    three diagonals and three (uu, uv, vu, vv).
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = _Code(context, builder, signature, arguments, "blocks offsets e diagonals f factors")
+        f, factors = code.vectors("f"), code.tuples("factors")
+        ones, twos, threes = (code.combined(numbers, f) for numbers in factors)
+        own, between, last = code.numbers("diagonals")
+        b11, b21, b22 = code.outer(own, f, ones), code.outer(between, f, twos), code.outer(last, f, threes)
+        b10, b20 = code.minus_sum(b11, code.outer(between, twos, f)), code.minus_sum(b21, b22)
+        code.add_six([code.minus_sum(b10, b20), b10, b20, b11, b21, b22])
+        return context.get_dummy_value()
+
+    return types.void(blocks, offsets, e, diagonals, f, factors), generate
 
 
 def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
@@ -228,5 +345,7 @@ def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
 # their callers leave out ``typing``
 gather: Any = intrinsic(_gather)
 add_outer: Any = intrinsic(_add_outer)
+add_six: Any = intrinsic(_add_six)
+add_triangle: Any = intrinsic(_add_triangle)
 fetch: Any = intrinsic(_fetch)
 scatter: Any = intrinsic(_scatter)

@@ -11,6 +11,8 @@ Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,13 +27,18 @@ from lyra_petsc.terms.hinge_energy import (
     hinge_hessian,
     hinge_weight,
 )
-from lyra_petsc.terms.hinge_rows import add_exact, add_regularised
+from lyra_petsc.terms.hinge_rows import add_across, add_within, all_offsets, shapes
+from lyra_petsc.terms.hinge_triangles import triangles_of
 from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets
+from lyra_petsc.terms.term import Couplings, Elastic, Offsets
 
 Array = NDArray[np.float64]
 Stencil = NDArray[np.int32] | NDArray[np.int64]
+
+
+ACROSS = "bending across"
+"""Coupling of the two opposite vertices of a hinge."""
 
 
 @kernel()
@@ -108,6 +115,9 @@ class Bending(Elastic):
         super().__init__(elements)
         data = elements.data
         self._constants = data["k"], data["rest_angle"], data["limit"]
+        self._triangles = triangles_of(self.stencil)
+        self._limit = np.empty(len(self._triangles.corners))
+        self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
         # energy, gradient and Hessian are asked for at one place after the other
         self._angles = Remembered(lambda x: dihedral_angles(x, self.stencil))
 
@@ -136,13 +146,29 @@ class Bending(Elastic):
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
         hessians(x, self.stencil, lo, hi, self.angles(x), blend, *self._constants, out)
 
-    def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+    @property
+    def couplings(self) -> Couplings:
+        return {self.name: self._triangles.corners, ACROSS: self.stencil[:, 2:]}
+
+    def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:
+        within = offsets[self.name]
+        out: Offsets = np.empty((self.n_elements, 10), dtype=within.dtype)
+        all_offsets(self.stencil, self._triangles.sides, within, offsets[ACROSS], out)
+        return out
+
+    def add_hessians(
+        self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
+    ) -> bool:
         k, rest, limit = self._constants
-        if blend < 1.0:
-            theta = self.angles(x)
-            add_exact(x, self.stencil, theta, blend, k, rest, limit, weight, offsets, values)
-        else:
-            add_regularised(x, self.stencil, k, limit, weight, offsets, values)
+        corners, turned, sides, hinges = self._triangles
+        within, across = offsets[self.name], offsets[ACROSS]
+        shape, factors = np.empty((len(corners), 7)), np.empty((self.n_elements + 1, 2))
+        factors[-1] = 0.0
+        theta = self.angles(x) if blend < 1.0 else rest
+        shapes(x, corners, turned, self._limit, shape)
+        constants = theta, blend, k, rest, limit, weight
+        add_across(x, self.stencil, *constants, sides, shape, within, across, values, factors)
+        add_within(x, corners, hinges, sides, shape, factors, within, values)
         return True
 
     def force_scale(self, size: float) -> Array:

@@ -1,6 +1,13 @@
-"""Hessians of hinges added straight to block rows, as ``scatter`` adds blocks.
+"""Hessians of hinges added straight to block rows, triangle by triangle.
 
-Of each hinge the blocks (0, 0), (0, 1), …, (3, 3) on and above the diagonal; ``hinge_energy`` has them all.
+A hinge has ∂θ/∂x_c = ω_c n at the corners of each of its triangles, and its Hessian k' ∇θ ∇θᵀ + z ∂²θ, with
+k' = 2 k w w and z = 2 k (θ − θ̄), is made of blocks in either triangle and one across, of the two opposite
+vertices. All blocks of a triangle with normal n are of the form n Rᵀ + L nᵀ, whichever of its sides they come
+from: six blocks are added for the three hinges that have thirty. ∂²θ is that of ``hinge.triangle_turn``.
+
+With the cotangents c of the corners' angles, ℓ = c_i + c_j of the side between i and j, of length √s, and K
+opposite to it, ω is (c_j, c_i, −ℓ)/√s at (i, j, K): what the side gives is k'/s and z/√s times products of
+γ = (c_j, c_i, −ℓ).
 """
 
 from __future__ import annotations
@@ -9,103 +16,187 @@ import math
 
 import numpy as np
 
-from lyra_petsc.block_rows.scatter import add_element, fetch_ahead
-from lyra_petsc.block_rows.vectors import add_outer
-from lyra_petsc.terms.hinge import angle_slopes, combined, cross, dot, minus, point, scaled, triangle_turn
-from lyra_petsc.terms.hinge_energy import hinge_hessian, hinge_stiffness
+from lyra_petsc.block_rows.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
+from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
+from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.kernel import kernel
 
 
 @kernel()
-def add_regularised(x, s, k, limit, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight (E,) times the regularised blocks."""
-    for e in range(s.shape[0]):
-        fetch_ahead(e, offsets, values)
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        g, square1, square2 = angle_slopes(x0, x1, x2, x3)
-        w = weight[e] * hinge_stiffness(square1, square2, k[e], limit[e, 0], limit[e, 1])
-        if w == 0.0:  # where θ itself may be no number
+def shapes(x, corners, turned, limit, out):  # type: ignore[no-untyped-def]
+    """Unit normal, cotangents, ± |normal| [m²] of triangles with limits of |normal|² (T,) into out (T, 7).
+
+    Zeros for those that have no area left, or so little that their hinges fade.
+    """
+    for t in range(corners.shape[0]):
+        a, b, c = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
+        e0, e1, e2 = minus(c, b), minus(a, c), minus(b, a)
+        m = cross(e2, e0)
+        square = dot(m, m)
+        if not square > limit[t]:
+            out[t, :] = 0.0
             continue
-        pair = 0
-        for a in range(4):
-            for b in range(a, 4):
-                add_outer(values, offsets[e, pair], 0.0, (scaled(w, g[a]),), (g[b],))
-                pair += 1
+        size = math.sqrt(square)
+        inverse = 1.0 / size
+        sign = turned[t] * inverse
+        out[t, 0], out[t, 1], out[t, 2] = sign * m[0], sign * m[1], sign * m[2]
+        out[t, 3], out[t, 4], out[t, 5] = -inverse * dot(e1, e2), -inverse * dot(e2, e0), -inverse * dot(e0, e1)
+        out[t, 6] = turned[t] * size
 
 
-@kernel(forceinline=True)
-def _more(p, u, q, w, r, v):  # type: ignore[no-untyped-def]
-    """p u + q w + r v."""
-    return p * u[0] + q * w[0] + r * v[0], p * u[1] + q * w[1] + r * v[1], p * u[2] + q * w[2] + r * v[2]
+@kernel(inline="always")
+def _ends(corner):  # type: ignore[no-untyped-def]
+    """The two other corners of a triangle."""
+    return int(corner == 0), 2 - int(corner == 2)
 
 
-@kernel(forceinline=True)
-def _halves(w, turned, gb, turn, a, b):  # type: ignore[no-untyped-def]
-    """Of one triangle in the block of points a and b of the edge: … nᵀ and n …ᵀ."""
-    _, o, slopes, t = turn
-    return combined(turned, t, o[a], slopes[b]), _more(turned, t, o[b], slopes[a], w * o[a], gb)
+@kernel(inline="always")
+def _pair(a, b):  # type: ignore[no-untyped-def]
+    """Which of a triangle's couplings (0, 0), (0, 1), …, (2, 2) is that of two corners."""
+    low, high = min(a, b), max(a, b)
+    return low * (5 - low) // 2 + high
 
 
-@kernel(forceinline=True)
-def _add_edge(at, w, turned, g, one, two, a, b, values):  # type: ignore[no-untyped-def]
-    """Add the block of points a and b of the edge, both of both triangles."""
-    left1, right1 = _halves(w, turned, g[b], one, a, b)
-    left2, right2 = _halves(w, turned, g[b], two, a, b)
-    add_outer(values, at, 0.0, (one[0], left1, two[0], left2), (right1, one[0], right2, two[0]))
-
-
-@kernel(forceinline=True)
-def _add_height(at, w, ga, turn, a, values):  # type: ignore[no-untyped-def]
-    """Add the block of a point of the edge, or the opposite corner, and the opposite corner."""
-    n, o, slopes, _ = turn
-    left = combined(w * o[2], ga, o[a], slopes[2])
-    add_outer(values, at, 0.0, (n, left), (scaled(o[2], slopes[a]), n))
-
-
-@kernel(forceinline=True)
-def _times(z, turn):  # type: ignore[no-untyped-def]
-    """A triangle's turn with −z ∇b and z t."""
-    n, o, (b0, b1, b2), t = turn
-    return n, o, (scaled(-z, b0), scaled(-z, b1), scaled(-z, b2)), scaled(z, t)
+@kernel(inline="always")
+def _same_block(at, swapped):  # type: ignore[no-untyped-def]
+    """Offset of the same block, added transposed where ``swapped``."""
+    return 2 * (at >> 1) + int(swapped) if at >= 0 else at
 
 
 @kernel()
-def _add_faded(points, theta, k, rest, limits, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight times the blocks of one hinge, of triangles that have nearly no area."""
-    gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
-    x0, x1, x2, x3 = points
-    hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, gradient, blocks)
-    add_element(weight, blocks, offsets, values)
+def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
+    """Offsets of all couplings of hinge h, into out (10,)."""
+    one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3
+    (i, j), (k, m) = _ends(p), _ends(q)
+    swapped = s[h, 0] < s[h, 1]
+    if not swapped:
+        i, j, k, m = j, i, m, k
+    out[0] = within[one, _pair(i, i)]
+    out[1] = _same_block(within[one, _pair(i, j)], swapped)
+    out[2] = _same_block(within[one, _pair(i, p)], s[h, 0] < s[h, 2])
+    out[3] = _same_block(within[two, _pair(k, q)], s[h, 0] < s[h, 3])
+    out[4] = within[one, _pair(j, j)]
+    out[5] = _same_block(within[one, _pair(j, p)], s[h, 1] < s[h, 2])
+    out[6] = _same_block(within[two, _pair(m, q)], s[h, 1] < s[h, 3])
+    out[7] = within[one, _pair(p, p)]
+    out[8] = across[h]
+    out[9] = within[two, _pair(q, q)]
 
 
 @kernel()
-def add_exact(x, s, theta, blend, k, rest, limit, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight (E,) times the blocks of ``hinge_hessian``, angles theta (E,); ``blend`` 0 is exact."""
+def all_offsets(s, sides, within, across, out):  # type: ignore[no-untyped-def]
+    """``hinge_offsets`` of all hinges into out (E, 10)."""
     for h in range(s.shape[0]):
-        fetch_ahead(h, offsets, values)
-        x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-        e, o1, o2 = minus(x1, x0), minus(x2, x0), minus(x3, x0)
-        m1, m2 = cross(e, o1), cross(o2, e)
-        at = offsets[h]
-        if not (dot(m1, m1) > limit[h, 0] and dot(m2, m2) > limit[h, 1]):
-            limits = limit[h, 0], limit[h, 1]
-            _add_faded((x0, x1, x2, x3), theta[h], k[h], rest[h], limits, blend, weight[h], at, values)
+        hinge_offsets(h, s, sides, within, across, out[h])
+
+
+@kernel()
+def _add_faded(x, h, s, theta, k, rest, limit, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
+    """Add weight times the blocks of a hinge of triangles that have nearly no area."""
+    gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
+    x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
+    limits = limit[h, 0], limit[h, 1]
+    hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, gradient, blocks)
+    add_element(weight[h], blocks, offsets, values)
+
+
+@kernel()
+def add_across(  # type: ignore[no-untyped-def]
+    x, s, theta, blend, k, rest, limit, weight, sides, shape, within, across, values, factors
+):
+    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact. Factors (E, 2) of ``add_within``.
+
+    Hinges of triangles that fade are added whole, with factors 0.
+    """
+    offsets = np.empty(10, dtype=within.dtype)
+    for h in range(s.shape[0]):
+        fetch(values, across[min(h + AHEAD, s.shape[0] - 1)] >> 1)
+        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
+        areas = shape[one, 6] * shape[two, 6]
+        if areas == 0.0:
+            factors[h, 0] = factors[h, 1] = 0.0
+            hinge_offsets(h, s, sides, within, across, offsets)
+            _add_faded(x, h, s, theta, k, rest, limit, blend, weight, offsets, values)
             continue
-        length = math.sqrt(dot(e, e))
-        u = scaled(1.0 / length, e)
-        w = 2.0 * k[h] * weight[h]
-        z = (1.0 - blend) * w * (theta[h] - rest[h])
-        one = _times(z, triangle_turn(length, u, o1, m1))
-        two = _times(z, triangle_turn(length, u, o2, m2))
-        n1, n2, p, q = one[0], two[0], one[1], two[1]
-        g = combined(p[0], n1, q[0], n2), combined(p[1], n1, q[1], n2)
-        _add_edge(at[0], w, 1.0, g, one, two, 0, 0, values)
-        _add_edge(at[1], w, -1.0, g, one, two, 0, 1, values)
-        _add_height(at[2], w, g[0], one, 0, values)
-        _add_height(at[3], w, g[0], two, 0, values)
-        _add_edge(at[4], w, 1.0, g, one, two, 1, 1, values)
-        _add_height(at[5], w, g[1], one, 1, values)
-        _add_height(at[6], w, g[1], two, 1, values)
-        _add_height(at[7], w, scaled(p[2], n1), one, 2, values)
-        add_outer(values, at[8], 0.0, (scaled(w * p[2] * q[2], n1),), (n2,))
-        _add_height(at[9], w, scaled(q[2], n2), two, 2, values)
+        e = minus(point(x, s[h, 1]), point(x, s[h, 0]))
+        square = dot(e, e)
+        stiffness = 2.0 * k[h] * weight[h] / square
+        factors[h, 0] = stiffness
+        factors[h, 1] = (1.0 - blend) * stiffness * (theta[h] - rest[h]) * math.sqrt(square)
+        left = scaled(stiffness * square * square / abs(areas), (shape[one, 0], shape[one, 1], shape[one, 2]))
+        right = shape[two, 0], shape[two, 1], shape[two, 2]
+        add_outer(values, across[h], 0.0, (left,), (right,))
+
+
+@kernel(inline="always")
+def _beyond(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
+    """Beyond a side: its factors, the first times γ at the side's ends, ascending, and the normal."""
+    h = hinge >> 1
+    side = sides[h, 1 - (hinge & 1)]
+    t, (i, j) = side >> 2, _ends(side & 3)
+    stiff = factors[h, 0]
+    normal = shape[t, 0], shape[t, 1], shape[t, 2]
+    return stiff, factors[h, 1], stiff * shape[t, 3 + j], stiff * shape[t, 3 + i], normal
+
+
+@kernel(forceinline=True)
+def _own(n, g, corner, one, other):  # type: ignore[no-untyped-def]
+    """The block of a corner and itself; of the two sides at it ``one`` and ``other``."""
+    _, _, turn, slope, _ = corner
+    (p, n1, t1), (q, n2, t2) = one, other
+    left = (-turn, slope), (1.0, t1), (1.0, t2)
+    return (n, left), (((g, n), (p, n1), (q, n2), *left), n)
+
+
+@kernel(forceinline=True)
+def _pair_of(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
+    """The block of corners b and a, with the side between them; p are those beyond their opposite sides."""
+    ca, la, oa, slope_a, na = a
+    cb, lb, ob, slope_b, nb = b
+    pa, pb, nm, t = side
+    right = (g, n), (0.5 * cb * pb, nm), (-la * p_ab, na), (-ob, slope_a), (-1.0, t)
+    left = (0.5 * ca * pa, nm), (-lb * p_ba, nb), (-oa, slope_b), (-1.0, t)
+    return (right, n), (n, left)
+
+
+@kernel()
+def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # type: ignore[no-untyped-def]
+    """Add the blocks of triangles with ``offsets`` (T, 6); in the last row of ``factors`` (E + 1, 2) are zeros.
+
+    Of the blocks n n'ᵀ and n' nᵀ of a side's ends each of its two triangles adds a half.
+    """
+    for t in range(corners.shape[0]):
+        fetch_ahead(t, offsets, values, 6)
+        if offsets[t, 0] < 0 or shape[t, 6] == 0.0:  # others have all rows, or nothing is left
+            continue
+        x0, x1, x2 = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
+        e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
+        n = shape[t, 0], shape[t, 1], shape[t, 2]
+        c0, c1, c2 = shape[t, 3], shape[t, 4], shape[t, 5]
+        inverse = 1.0 / shape[t, 6]
+        l0, l1, l2 = abs(inverse) * dot(e0, e0), abs(inverse) * dot(e1, e1), abs(inverse) * dot(e2, e2)
+        m = scaled(inverse, n)
+        b0, b1, b2 = cross(m, e0), cross(m, e1), cross(m, e2)  # gradients of the barycentric coordinates
+        w0, z0, p01, p02, n0 = _beyond(hinges[t, 0], sides, shape, factors)
+        w1, z1, p10, p12, n1 = _beyond(hinges[t, 1], sides, shape, factors)
+        w2, z2, p20, p21, n2 = _beyond(hinges[t, 2], sides, shape, factors)
+        t0, t1, t2 = scaled(0.5 * z0 / l0, b0), scaled(0.5 * z1 / l1, b1), scaled(0.5 * z2 / l2, b2)
+        one = c0, l0, z1 * c2 + z2 * c1 - z0 * l0, b0, n0
+        two = c1, l1, z0 * c2 + z2 * c0 - z1 * l1, b1, n1
+        three = c2, l2, z0 * c1 + z1 * c0 - z2 * l2, b2, n2
+        g00 = w0 * l0 * l0 + w1 * c2 * c2 + w2 * c1 * c1
+        g10 = w2 * c0 * c1 - w0 * l0 * c2 - w1 * l1 * c2
+        g20 = w1 * c0 * c2 - w0 * l0 * c1 - w2 * l2 * c1
+        g11 = w0 * c2 * c2 + w1 * l1 * l1 + w2 * c0 * c0
+        g21 = w0 * c1 * c2 - w1 * l1 * c0 - w2 * l2 * c0
+        g22 = w0 * c1 * c1 + w1 * c0 * c0 + w2 * l2 * l2
+        blocks = (
+            _own(n, g00, one, (c2 * p10, n1, t1), (c1 * p20, n2, t2)),
+            _pair_of(n, g10, one, two, (p20, p21, n2, t2), p01, p10),
+            _pair_of(n, g20, one, three, (p10, p12, n1, t1), p02, p20),
+            _own(n, g11, two, (c2 * p01, n0, t0), (c0 * p21, n2, t2)),
+            _pair_of(n, g21, two, three, (p01, p02, n0, t0), p12, p21),
+            _own(n, g22, three, (c1 * p02, n0, t0), (c0 * p12, n1, t1)),
+        )
+        add_six(values, offsets, t, blocks)

@@ -10,11 +10,14 @@ stress in the Hessian: Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. En
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.block_rows.scatter import fetch_ahead
-from lyra_petsc.block_rows.vectors import add_outer
+from lyra_petsc.block_rows.vectors import add_triangle
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.kernel import kernel
@@ -125,13 +128,13 @@ def _prepared(x, y, s, e, blend, inverse, w, c):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _factors(stress, law, ga, gb):  # type: ignore[no-untyped-def]
-    """Of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
+    """(uu, uv, vu, vv) and geometric of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
     (au, av), (bu, bv) = ga, gb
     c11, c12, c22, c33 = law
     uu, vv = au * bu, av * bv
     uv, vu = au * bv, av * bu
     geometric = stress[0] * uu + stress[1] * vv + stress[2] * (uv + vu)
-    return c11 * uu + c33 * vv, c12 * uv + c33 * vu, c12 * vu + c33 * uv, c22 * vv + c33 * uu, geometric
+    return (c11 * uu + c33 * vv, c12 * uv + c33 * vu, c12 * vu + c33 * uv, c22 * vv + c33 * uu), geometric
 
 
 @kernel(inline="always")
@@ -153,7 +156,7 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-
         f, stress, law, g = _prepared(x, y, s, e, blend, inverse, area[e], c)
         for a in range(3):
             for b in range(3):
-                uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
+                (uu, uv, vu, vv), geometric = _factors(stress, law, g[a], g[b])
                 left, right = _sides(f, uu, uv, vu, vv)
                 for i in range(3):
                     for j in range(3):
@@ -163,17 +166,18 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-
 
 @kernel()
 def add_hessians(x, y, s, blend, inverse, area, c, weight, offsets, values):  # type: ignore[no-untyped-def]
-    """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
+    """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say.
+
+    Corners s (E, 3) ascend. A translation does nothing, so that three blocks are enough.
+    """
     for e in range(s.shape[0]):
-        fetch_ahead(e, offsets, values)
+        fetch_ahead(e, offsets, values, 6)
         f, stress, law, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c)
-        pair = 0
-        for a in range(3):
-            for b in range(a, 3):
-                uu, uv, vu, vv, geometric = _factors(stress, law, g[a], g[b])
-                left, right = _sides(f, uu, uv, vu, vv)
-                add_outer(values, offsets[e, pair], geometric, left, right)
-                pair += 1
+        one, geometric1 = _factors(stress, law, g[1], g[1])
+        two, geometric2 = _factors(stress, law, g[2], g[1])
+        three, geometric3 = _factors(stress, law, g[2], g[2])
+        sides = (f[0], f[1], f[2]), (f[3], f[4], f[5])
+        add_triangle(values, offsets, e, (geometric1, geometric2, geometric3), sides, (one, two, three))
 
 
 @kernel()
@@ -191,14 +195,14 @@ class Membrane(Elastic):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 3); data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
+        Stencil (E, 3), whose corners are put into ascending order; data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
         ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
     """
 
     name = "membrane"
 
     def __init__(self, elements: Elements) -> None:
-        super().__init__(elements)
+        super().__init__(elements := _ascending(elements))
         data = elements.data
         self._before: Array | None = None
         self._inverse, self._area, self._c = data["inverse"], data["area"], data["stiffness"]
@@ -218,10 +222,12 @@ class Membrane(Elastic):
         y = x if self._before is None else self._before
         hessians(x, y, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
 
-    def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+    def add_hessians(
+        self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
+    ) -> bool:
         y = x if self._before is None else self._before
         constants = self._inverse, self._area, self._c
-        add_hessians(x, y, self.stencil, blend, *constants, weight, offsets, values)
+        add_hessians(x, y, self.stencil, blend, *constants, weight, offsets[self.name], values)
         return True
 
     def force_scale(self, size: float) -> Array:
@@ -235,6 +241,16 @@ class Membrane(Elastic):
         strain, stress = np.empty((self.n_elements, 3)), np.empty((self.n_elements, 3))
         strain_and_stress(x, self.stencil, self._inverse, self._c, strain, stress)
         return strain, stress
+
+
+def _ascending(elements: Elements) -> Elements:
+    """The triangles with ascending corners, and their rest matrices to it."""
+    order = np.argsort(elements.stencil, axis=1, kind="stable")
+    last_two = elements.data["inverse"]
+    slopes = np.concatenate([-last_two.sum(axis=1, keepdims=True), last_two], axis=1)
+    inverse = np.take_along_axis(slopes, order[:, 1:, None], axis=1)
+    stencil = np.take_along_axis(elements.stencil, order, axis=1)
+    return replace(elements, stencil=stencil, data={**elements.data, "inverse": inverse})
 
 
 def elements(rest: RestShape) -> Elements:

@@ -8,6 +8,7 @@ element that touches a point it owns.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from lyra_petsc.partition.elements import Elements
 
 Array = NDArray[np.float64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
+Couplings = Mapping[str, NDArray[np.int32]]
 
 
 class Term(ABC):
@@ -29,6 +31,15 @@ class Term(ABC):
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
         self.n_elements = len(self.stencil)
         self.n_owned = elements.n_owned
+
+    @property
+    def couplings(self) -> Couplings:
+        """Stencils (E, n) whose points the Hessians couple, each with the name of its offsets in a pattern."""
+        return {self.name: self.stencil}
+
+    def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:
+        """Where in block rows the ``hessians`` go, (E, n (n + 1) / 2)."""
+        return offsets[self.name]
 
 
 class Elastic(Term):
@@ -52,10 +63,13 @@ class Elastic(Term):
         ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one.
         """
 
-    def add_hessians(self, x: Array, blend: float, weight: Array, offsets: Offsets, values: Array) -> bool:
+    def add_hessians(
+        self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
+    ) -> bool:
         """Add weight (E,) × Hessian blocks [N/m] to block rows (n_blocks, 3, 3) at once; whether it did.
 
-        ``offsets`` (E, n (n + 1) / 2) are the pattern's. What a term cannot add so goes by ``hessians``.
+        ``offsets`` are a pattern's, by the names of ``couplings``. What a term cannot add so goes by
+        ``hessians`` and ``offsets_of_elements``.
         """
         return False
 
@@ -106,7 +120,7 @@ class Viscous(Term):
     def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
         """Hessian blocks [N s/m] with respect to velocity into ``out`` (hi − lo, n, n, 3, 3)."""
 
-    def add_hessians(self, v: Array, offsets: Offsets, values: Array) -> bool:
+    def add_hessians(self, v: Array, offsets: Mapping[str, Offsets], values: Array) -> bool:
         """Add Hessian blocks [N s/m] to block rows as `Elastic.add_hessians` does; whether it did."""
         return False
 

@@ -12,6 +12,8 @@ implicit force is stable at any wind and step.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -105,7 +107,7 @@ def hessians(v, s, lo, hi, area, n, wind, density, drag, out):  # type: ignore[n
 def add_hessians(v, s, area, n, wind, density, drag, offsets, values):  # type: ignore[no-untyped-def]
     """Add the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
     for e in range(s.shape[0]):
-        fetch_ahead(e, offsets, values)
+        fetch_ahead(e, offsets, values, 6)
         along, across = _slopes(v, s, e, area, n, wind, density, drag)
         right = n[e, 0], n[e, 1], n[e, 2]
         left = along * right[0], along * right[1], along * right[2]
@@ -149,8 +151,8 @@ class Wind(Viscous):
     def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
         hessians(v, self.stencil, lo, hi, self._area, self._normals, *self._law, out)
 
-    def add_hessians(self, v: Array, offsets: Offsets, values: Array) -> bool:
-        add_hessians(v, self.stencil, self._area, self._normals, *self._law, offsets, values)
+    def add_hessians(self, v: Array, offsets: Mapping[str, Offsets], values: Array) -> bool:
+        add_hessians(v, self.stencil, self._area, self._normals, *self._law, offsets[self.name], values)
         return True
 
 

@@ -129,7 +129,7 @@ def stiffness(trial: Trial) -> Stiffness:
         term = model.terms.get(name)
         if isinstance(term, Elastic):
             term.prepare(0.0, 1.0, 1.0)
-            rows.add(name, _filled_by(term, system.x), 1.0, values)
+            rows.add(term.offsets_of_elements(pattern.offsets), _filled_by(term, system.x), 1.0, values)
     numbers = mesh_numbers(trial)
     row, column = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
     height = np.ascontiguousarray(values[:, 2, 2])

@@ -49,9 +49,9 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     system, points = model.system, model.points
     rows, n = BlockRows(model.pattern), points.n_owned
     values = rows.zeros()
-    for name, term in model.terms.items():
+    for term in model.terms.values():
         if isinstance(term, Elastic):
-            rows.add(name, _filled_by(term, system.x), 1.0, values)
+            rows.add(term.offsets_of_elements(model.pattern.offsets), _filled_by(term, system.x), 1.0, values)
     held = np.zeros((points.n_local, 3))
     held[:n] = system.held.mask(trial.simulation.time, trial.simulation.time, n)
     points.update_ghosts(held)

@@ -61,5 +61,5 @@ def test_fetching_changes_nothing() -> None:
     values = np.arange(18.0).reshape(2, 3, 3)
     before = values.copy()
     offsets = np.array([[-1, 2, 10**6]], dtype=np.int32)  # another rank's, ours, and nobody's
-    fetch_ahead(0, offsets, values)
+    fetch_ahead(0, offsets, values, 3)
     np.testing.assert_array_equal(values, before)
