@@ -4,29 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from typing import Generic, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Result = TypeVar("Result", Array, tuple[Array, ...])
 
 
-class Remembered:
+class Remembered(Generic[Result]):
     """``function`` of an array, computed where it was not computed last.
 
-    Its results cannot be written to: they are given out again.
+    Its results, an array or several, cannot be written to: they are given out again.
     """
 
-    def __init__(self, function: Callable[[Array], Array]) -> None:
+    def __init__(self, function: Callable[[Array], Result]) -> None:
         self._function = function
-        self._last: tuple[Array, Array] | None = None
+        self._last: tuple[Array, Result] | None = None
 
     def forget(self) -> None:
         """Let the function be another from here on."""
         self._last = None
 
-    def __call__(self, at: Array) -> Array:
+    def __call__(self, at: Array) -> Result:
         if self._last is None or not np.array_equal(at, self._last[0]):
             result = self._function(at)
-            result.flags.writeable = False
+            for array in (result,) if isinstance(result, np.ndarray) else result:
+                array.flags.writeable = False
             self._last = at.copy(), result
         return self._last[1]

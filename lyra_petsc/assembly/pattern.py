@@ -50,9 +50,13 @@ class BlockPattern:
             for a in sorted({a for a, _ in couplings(stencil)}):  # one after the other: all couplings at once take much memory
                 keys = union(keys, *_row_keys(stencil, a, n_owned, n_local))
         self._set(keys, n_owned, n_local)
-        self.offsets: dict[str, Offsets] = {
-            name: _offsets(s, keys, n_owned, n_local) for name, s in stencils.items()
-        }
+        self.offsets: dict[str, Offsets] = {}
+        for name, stencil in stencils.items():
+            # terms on the same triangles are wont to have them in the same order
+            alike = [other for other in self.offsets if np.array_equal(stencils[other], stencil)]
+            self.offsets[name] = (
+                self.offsets[alike[0]] if alike else _offsets(stencil, keys, n_owned, n_local)
+            )
 
     @classmethod
     def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:

@@ -146,6 +146,6 @@ def _by_locality(stencil: Ints, n_owned: int) -> Ints:
     """An order of the elements, counted ones first, that walks through memory."""
     if len(stencil) == 0:
         return np.empty(0, dtype=np.int64)
-    first = stencil.min(axis=1)
-    order: Ints = np.lexsort((first, np.arange(len(stencil)) >= n_owned))
+    points = np.sort(stencil, axis=1).T
+    order: Ints = np.lexsort((*points[::-1], np.arange(len(stencil)) >= n_owned))
     return order

@@ -74,6 +74,7 @@ class Level:
     free : (n_owned, 3)
         0 for coordinates that take no part in interpolation, 1 for others.
     interpolation : InterpolationRows or None
+        None again once the cycle has it in its own form.
     galerkin : Galerkin or None
         Makes the next coarser level's block rows.
     """

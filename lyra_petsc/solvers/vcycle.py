@@ -149,6 +149,8 @@ class VCycle:
         """Work on these levels, which ``renew`` brings up to date; collective."""
         *finer, coarsest = hierarchy.levels
         self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
+        for level in finer:
+            level.interpolation = None  # whoever interpolates has it in local numbers
         self._renew = renew
 
     def setUp(self, pc: PETSc.PC) -> None:

@@ -108,6 +108,7 @@ class ReducedSystem:
         self.unbalanced: Array | None = None
         self.given_loads: Array | None = None
         self._iterate: Array | None = None
+        self._last_parts: dict[str, Array] = {}
 
     def begin(self, time: float) -> None:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
@@ -252,7 +253,7 @@ class ReducedSystem:
         return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self.history))
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
-        n = self.points.n_owned
+        n, self._last_parts = self.points.n_owned, {}  # there is no room for both
         parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
         if self._springs:
             parts["springs"] = self._sum(self._springs, x)

@@ -12,6 +12,8 @@ Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy`
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +21,10 @@ from numpy.typing import NDArray
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.remembered import Remembered
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.hinge import angle_parts, point
-from lyra_petsc.terms.hinge_energy import (
-    fading_limit,
-    hinge_energy,
-    hinge_gradient,
-    hinge_hessian,
-    hinge_weight,
-)
-from lyra_petsc.terms.hinge_rows import add_across, add_within, all_offsets, shapes
+from lyra_petsc.terms import hinge_forces, hinge_shape
+from lyra_petsc.terms.hinge_energy import fading_limit
+from lyra_petsc.terms.hinge_rows import add_across, add_within, all_offsets
 from lyra_petsc.terms.hinge_triangles import triangles_of
-from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Couplings, Elastic, Offsets
 
@@ -41,61 +36,30 @@ ACROSS = "bending across"
 """Coupling of the two opposite vertices of a hinge."""
 
 
-@kernel()
-def _angle_parts(x, s, sine, cosine):  # type: ignore[no-untyped-def]
-    """Into (E,) each, up to a factor."""
-    for e in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        sine[e], cosine[e], _, _ = angle_parts(x0, x1, x2, x3)
+class Bent(NamedTuple):
+    """Triangles and hinges of a shape.
+
+    Attributes
+    ----------
+    triangles : (T, 7)
+        As by ``hinge_shape.triangles``.
+    angles : (E,)
+        Dihedral angles [rad] in [−π, π], 0 where a triangle has no normal.
+    lengths : (E,)
+        Of the edges [m].
+    """
+
+    triangles: Array
+    angles: Array
+    lengths: Array
 
 
 def dihedral_angles(x: Array, stencil: Stencil) -> Array:
     """Dihedral angles θ [rad] in [−π, π] of hinges (E, 4), (E,); 0 where a triangle has no normal."""
     sine, cosine = np.empty(len(stencil)), np.empty(len(stencil))
-    _angle_parts(x, stencil, sine, cosine)
+    hinge_shape.angle_parts_of_points(x, stencil, sine, cosine)
     # all at once: NumPy's are several at a time where the processor can
     return np.arctan2(sine, cosine, out=sine)
-
-
-@kernel()
-def weights(x, s, limit, out):  # type: ignore[no-untyped-def]
-    """Part of its energy that each hinge has left, 1 but for collapsed triangles, into out (E,)."""
-    for e in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
-        out[e] = hinge_weight(square1, square2, limit[e, 0], limit[e, 1])
-
-
-@kernel()
-def energies(x, s, theta, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Energy [J] of the first len(out) hinges."""
-    for e in range(out.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
-        out[e] = hinge_energy(theta[e], square1, square2, k[e], rest[e], (limit[e, 0], limit[e, 1]))
-
-
-@kernel()
-def add_gradient(x, s, theta, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Add the energy's gradient [N] to out (n_local, 3)."""
-    g = np.empty((4, 3))
-    for e in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        limits = limit[e, 0], limit[e, 1]
-        moment = hinge_gradient(x0, x1, x2, x3, theta[e], k[e], rest[e], limits, g)
-        for a in range(4):
-            for i in range(3):
-                out[s[e, a], i] += moment * g[a, i]
-
-
-@kernel()
-def hessians(x, s, lo, hi, theta, blend, k, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
-    g = np.empty((4, 3))
-    for e in range(lo, hi):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(x, s[e, 3])
-        limits = limit[e, 0], limit[e, 1]
-        hinge_hessian(x0, x1, x2, x3, theta[e], k[e], rest[e], limits, blend, g, out[e - lo])
 
 
 class Bending(Elastic):
@@ -112,23 +76,35 @@ class Bending(Elastic):
     name = "bending"
 
     def __init__(self, elements: Elements) -> None:
-        super().__init__(elements)
-        data = elements.data
-        self._constants = data["k"], data["rest_angle"], data["limit"]
+        data = dict(elements.data)
+        limit = data.pop("limit")
+        # the triangles keep the limits, and nobody asks for the numbers of hinges
+        super().__init__(replace(elements, data=data, index=elements.index[:0].copy()))
+        self._k, self._rest = data["k"], data["rest_angle"]
         self._triangles = triangles_of(self.stencil)
         self._limit = np.empty(len(self._triangles.corners))
-        self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
+        self._limit[self._triangles.sides[:-1] >> 2] = limit
         # energy, gradient and Hessian are asked for at one place after the other
-        self._angles = Remembered(lambda x: dihedral_angles(x, self.stencil))
+        self._bent = Remembered(self._bend)
+
+    def _bend(self, x: Array) -> Bent:
+        corners, turned, sides, _ = self._triangles
+        bent = Bent(np.empty((len(corners), 7)), np.empty(self.n_elements), np.empty(self.n_elements))
+        cosine = np.empty(self.n_elements)
+        hinge_shape.triangles(x, corners, turned, self._limit, bent.triangles)
+        hinge_shape.angle_parts(x, self.stencil, sides, bent.triangles, bent.angles, cosine, bent.lengths)
+        # all at once: NumPy's are several at a time where the processor can
+        np.arctan2(bent.angles, cosine, out=bent.angles)
+        return bent
 
     def angles(self, x: Array) -> Array:
         """Dihedral angles of all hinges of this rank [rad], (E,), not to be written to."""
-        return self._angles(x)
+        return self._bent(x).angles
 
     def weights(self, x: Array) -> Array:
         """Part of its energy that each hinge of this rank has left, (E,): 1 but for collapsed triangles."""
         out = np.empty(self.n_elements)
-        weights(x, self.stencil, self.elements.data["limit"], out)
+        hinge_forces.weights(x, self.stencil, self._triangles.sides, self._limit, out)
         return out
 
     def energies(self, x: Array) -> Array:
@@ -136,15 +112,21 @@ class Bending(Elastic):
 
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
-        out = np.empty(n)
-        energies(x, self.stencil, self.angles(x), *self._constants, out)
+        out, (triangles, angles, _) = np.empty(n), self._bent(x)
+        hinges = self.stencil, self._triangles.sides
+        hinge_forces.energies(x, *hinges, triangles, self._limit, angles, self._k, self._rest, out)
         return out
 
     def add_gradient(self, x: Array, out: Array) -> None:
-        add_gradient(x, self.stencil, self.angles(x), *self._constants, out)
+        corners, _, sides, hinges = self._triangles
+        triangles, angles, lengths = self._bent(x)
+        pulls, law = np.empty(self.n_elements + 1), (self._k, self._rest)
+        hinge_forces.pulls(x, self.stencil, sides, triangles, self._limit, angles, lengths, *law, pulls, out)
+        hinge_forces.add_gradient(corners, hinges, triangles, pulls, out)
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hessians(x, self.stencil, lo, hi, self.angles(x), blend, *self._constants, out)
+        hinges, law = (self.stencil, self._triangles.sides), (self._k, self._rest)
+        hinge_forces.hessians(x, *hinges, lo, hi, self._limit, self.angles(x), blend, *law, out)
 
     @property
     def couplings(self) -> Couplings:
@@ -159,16 +141,13 @@ class Bending(Elastic):
     def add_hessians(
         self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
     ) -> bool:
-        k, rest, limit = self._constants
-        corners, turned, sides, hinges = self._triangles
-        within, across = offsets[self.name], offsets[ACROSS]
-        shape, factors = np.empty((len(corners), 7)), np.empty((self.n_elements + 1, 2))
-        factors[-1] = 0.0
-        theta = self.angles(x) if blend < 1.0 else rest
-        shapes(x, corners, turned, self._limit, shape)
-        constants = theta, blend, k, rest, limit, weight
-        add_across(x, self.stencil, *constants, sides, shape, within, across, values, factors)
-        add_within(x, corners, hinges, sides, shape, factors, within, values)
+        corners, _, sides, hinges = self._triangles
+        within, across, bent = offsets[self.name], offsets[ACROSS], self._bent(x)
+        factors = np.empty((self.n_elements + 1, 2))
+        law = self._k, self._rest, self._limit, weight
+        add_across(x, self.stencil, sides, *bent, blend, *law, within, across, values, factors)
+        add_within(x, corners, hinges, sides, bent.triangles, factors, within, values)
+        self._bent.forget()  # what comes next is a linear solve, which needs the room
         return True
 
     def force_scale(self, size: float) -> Array:

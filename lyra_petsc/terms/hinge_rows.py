@@ -12,37 +12,14 @@ opposite to it, ω is (c_j, c_i, −ℓ)/√s at (i, j, K): what the side gives 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from lyra_petsc.block_rows.scatter import AHEAD, add_element, fetch_ahead
 from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
+from lyra_petsc.terms.hinge_forces import limits_of
 from lyra_petsc.terms.kernel import kernel
-
-
-@kernel()
-def shapes(x, corners, turned, limit, out):  # type: ignore[no-untyped-def]
-    """Unit normal, cotangents, ± |normal| [m²] of triangles with limits of |normal|² (T,) into out (T, 7).
-
-    Zeros for those that have no area left, or so little that their hinges fade.
-    """
-    for t in range(corners.shape[0]):
-        a, b, c = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
-        e0, e1, e2 = minus(c, b), minus(a, c), minus(b, a)
-        m = cross(e2, e0)
-        square = dot(m, m)
-        if not square > limit[t]:
-            out[t, :] = 0.0
-            continue
-        size = math.sqrt(square)
-        inverse = 1.0 / size
-        sign = turned[t] * inverse
-        out[t, 0], out[t, 1], out[t, 2] = sign * m[0], sign * m[1], sign * m[2]
-        out[t, 3], out[t, 4], out[t, 5] = -inverse * dot(e1, e2), -inverse * dot(e2, e0), -inverse * dot(e0, e1)
-        out[t, 6] = turned[t] * size
 
 
 @kernel(inline="always")
@@ -92,24 +69,24 @@ def all_offsets(s, sides, within, across, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _add_faded(x, h, s, theta, k, rest, limit, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
+def _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight times the blocks of a hinge of triangles that have nearly no area."""
     gradient, blocks = np.empty((4, 3)), np.empty((4, 4, 3, 3))
     x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-    limits = limit[h, 0], limit[h, 1]
     hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, gradient, blocks)
     add_element(weight[h], blocks, offsets, values)
 
 
 @kernel()
 def add_across(  # type: ignore[no-untyped-def]
-    x, s, theta, blend, k, rest, limit, weight, sides, shape, within, across, values, factors
+    x, s, sides, shape, theta, length, blend, k, rest, limit, weight, within, across, values, factors
 ):
-    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact. Factors (E, 2) of ``add_within``.
+    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact. Factors (E + 1, 2) of ``add_within``.
 
     Hinges of triangles that fade are added whole, with factors 0.
     """
     offsets = np.empty(10, dtype=within.dtype)
+    factors[-1, 0] = factors[-1, 1] = 0.0
     for h in range(s.shape[0]):
         fetch(values, across[min(h + AHEAD, s.shape[0] - 1)] >> 1)
         one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
@@ -117,13 +94,12 @@ def add_across(  # type: ignore[no-untyped-def]
         if areas == 0.0:
             factors[h, 0] = factors[h, 1] = 0.0
             hinge_offsets(h, s, sides, within, across, offsets)
-            _add_faded(x, h, s, theta, k, rest, limit, blend, weight, offsets, values)
+            limits = limits_of(limit, sides, h)
+            _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values)
             continue
-        e = minus(point(x, s[h, 1]), point(x, s[h, 0]))
-        square = dot(e, e)
+        square = length[h] * length[h]
         stiffness = 2.0 * k[h] * weight[h] / square
-        factors[h, 0] = stiffness
-        factors[h, 1] = (1.0 - blend) * stiffness * (theta[h] - rest[h]) * math.sqrt(square)
+        factors[h, 0], factors[h, 1] = stiffness, (1.0 - blend) * stiffness * (theta[h] - rest[h]) * length[h]
         left = scaled(stiffness * square * square / abs(areas), (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]
         add_outer(values, across[h], 0.0, (left,), (right,))
@@ -162,7 +138,7 @@ def _pair_of(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
 
 @kernel()
 def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # type: ignore[no-untyped-def]
-    """Add the blocks of triangles with ``offsets`` (T, 6); in the last row of ``factors`` (E + 1, 2) are zeros.
+    """Add the blocks of triangles with ``offsets`` (T, 6).
 
     Of the blocks n n'ᵀ and n' nᵀ of a side's ends each of its two triangles adds a half.
     """

@@ -42,31 +42,31 @@ def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _green_and_stress(f, c, e):  # type: ignore[no-untyped-def]
+def _green_and_stress(f, c, m):  # type: ignore[no-untyped-def]
     """Green strain (E_uu, E_vv, 2 E_uv) and second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
     ux, uy, uz, vx, vy, vz = f
     e0 = 0.5 * (ux * ux + uy * uy + uz * uz - 1.0)
     e1 = 0.5 * (vx * vx + vy * vy + vz * vz - 1.0)
     e2 = ux * vx + uy * vy + uz * vz
-    c11, c12, c22, c33 = c[e, 0], c[e, 1], c[e, 2], c[e, 3]
+    c11, c12, c22, c33 = c[m, 0], c[m, 1], c[m, 2], c[m, 3]
     return e0, e1, e2, c11 * e0 + c12 * e1, c12 * e0 + c22 * e1, c33 * e2
 
 
 @kernel()
-def energies(x, s, lo, hi, inverse, area, c, out):  # type: ignore[no-untyped-def]
+def energies(x, s, lo, hi, inverse, area, c, law, out):  # type: ignore[no-untyped-def]
     """Energy [J] of triangles lo..hi into out (hi − lo,)."""
     for e in range(lo, hi):
-        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, e)
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, law[e])
         out[e - lo] = 0.5 * area[e] * (e0 * s0 + e1 * s1 + e2 * s2)
 
 
 @kernel()
-def add_gradient(x, s, inverse, area, c, out):  # type: ignore[no-untyped-def]
+def add_gradient(x, s, inverse, area, c, law, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     for e in range(s.shape[0]):
         f = _deformation(x, s, e, inverse)
         ux, uy, uz, vx, vy, vz = f
-        _, _, _, s0, s1, s2 = _green_and_stress(f, c, e)
+        _, _, _, s0, s1, s2 = _green_and_stress(f, c, law[e])
         # columns of the first Piola-Kirchhoff stress P = F S, times the area
         w = area[e]
         pux, puy, puz = w * (ux * s0 + vx * s2), w * (uy * s0 + vy * s2), w * (uz * s0 + vz * s2)
@@ -97,40 +97,40 @@ def _tensile(e0, e1, c11, c12, c22):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _linearised(f, g, c, e):  # type: ignore[no-untyped-def]
+def _linearised(f, g, c, m):  # type: ignore[no-untyped-def]
     """Strains and stress as in `_green_and_stress`, linear in the way from deformation gradient g to f."""
     ux, uy, uz, vx, vy, vz = f
     ax, ay, az, bx, by, bz = g
     px, py, pz, qx, qy, qz = ux - ax, uy - ay, uz - az, vx - bx, vy - by, vz - bz
-    e0, e1, e2, _, _, _ = _green_and_stress(f, c, e)
+    e0, e1, e2, _, _, _ = _green_and_stress(f, c, m)
     e0 -= 0.5 * (px * px + py * py + pz * pz)
     e1 -= 0.5 * (qx * qx + qy * qy + qz * qz)
     e2 -= px * qx + py * qy + pz * qz
-    c11, c12, c22, c33 = c[e, 0], c[e, 1], c[e, 2], c[e, 3]
+    c11, c12, c22, c33 = c[m, 0], c[m, 1], c[m, 2], c[m, 3]
     return e0, e1, e2, c11 * e0 + c12 * e1, c12 * e0 + c22 * e1, c33 * e2
 
 
 @kernel(inline="always")
-def _prepared(x, y, s, e, blend, inverse, w, c):  # type: ignore[no-untyped-def]
-    """What the Hessian of triangle e is made of: deformation gradient; stress and law times w; gradients.
+def _prepared(x, y, s, e, blend, inverse, w, c, m):  # type: ignore[no-untyped-def]
+    """What the Hessian of triangle e of law m is made of: deformation gradient; stress, law times w; gradients.
 
     Gradients (∂/∂u, ∂/∂v) are those of the shape functions of the three corners.
     """
     f = _deformation(x, s, e, inverse)
-    e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, e)
+    e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, m)
     if blend > 0.0:
-        p0, p1 = _tensile(e0, e1, c[e, 0], c[e, 1], c[e, 2])
+        p0, p1 = _tensile(e0, e1, c[m, 0], c[m, 1], c[m, 2])
         s0, s1, s2 = s0 + blend * (p0 - s0), s1 + blend * (p1 - s1), s2 - blend * s2
     one, two = (inverse[e, 0, 0], inverse[e, 0, 1]), (inverse[e, 1, 0], inverse[e, 1, 1])
     gradients = (-one[0] - two[0], -one[1] - two[1]), one, two
-    return f, (w * s0, w * s1, w * s2), (w * c[e, 0], w * c[e, 1], w * c[e, 2], w * c[e, 3]), gradients
+    return f, (w * s0, w * s1, w * s2), (w * c[m, 0], w * c[m, 1], w * c[m, 2], w * c[m, 3]), gradients
 
 
 @kernel(inline="always")
-def _factors(stress, law, ga, gb):  # type: ignore[no-untyped-def]
+def _factors(stress, stiff, ga, gb):  # type: ignore[no-untyped-def]
     """(uu, uv, vu, vv) and geometric of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
     (au, av), (bu, bv) = ga, gb
-    c11, c12, c22, c33 = law
+    c11, c12, c22, c33 = stiff
     uu, vv = au * bu, av * bv
     uv, vu = au * bv, av * bu
     geometric = stress[0] * uu + stress[1] * vv + stress[2] * (uv + vu)
@@ -147,16 +147,16 @@ def _sides(f, uu, uv, vu, vv):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-untyped-def]
+def hessians(x, y, s, lo, hi, blend, inverse, area, c, law, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3): [e, a, b, i, j].
 
     Their geometric part has the stress that the linearised strain predicted at x from y; y = x: exact.
     """
     for e in range(lo, hi):
-        f, stress, law, g = _prepared(x, y, s, e, blend, inverse, area[e], c)
+        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, area[e], c, law[e])
         for a in range(3):
             for b in range(3):
-                (uu, uv, vu, vv), geometric = _factors(stress, law, g[a], g[b])
+                (uu, uv, vu, vv), geometric = _factors(stress, stiff, g[a], g[b])
                 left, right = _sides(f, uu, uv, vu, vv)
                 for i in range(3):
                     for j in range(3):
@@ -165,26 +165,26 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, out):  # type: ignore[no-
 
 
 @kernel()
-def add_hessians(x, y, s, blend, inverse, area, c, weight, offsets, values):  # type: ignore[no-untyped-def]
+def add_hessians(x, y, s, blend, inverse, area, c, law, weight, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say.
 
     Corners s (E, 3) ascend. A translation does nothing, so that three blocks are enough.
     """
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values, 6)
-        f, stress, law, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c)
-        one, geometric1 = _factors(stress, law, g[1], g[1])
-        two, geometric2 = _factors(stress, law, g[2], g[1])
-        three, geometric3 = _factors(stress, law, g[2], g[2])
+        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c, law[e])
+        one, geometric1 = _factors(stress, stiff, g[1], g[1])
+        two, geometric2 = _factors(stress, stiff, g[2], g[1])
+        three, geometric3 = _factors(stress, stiff, g[2], g[2])
         sides = (f[0], f[1], f[2]), (f[3], f[4], f[5])
         add_triangle(values, offsets, e, (geometric1, geometric2, geometric3), sides, (one, two, three))
 
 
 @kernel()
-def strain_and_stress(x, s, inverse, c, strain, stress):  # type: ignore[no-untyped-def]
+def strain_and_stress(x, s, inverse, c, law, strain, stress):  # type: ignore[no-untyped-def]
     """Green strain (E_uu, E_vv, E_uv) and second Piola-Kirchhoff stress [N/m] into (E, 3) arrays."""
     for e in range(s.shape[0]):
-        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, e)
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, law[e])
         strain[e, 0], strain[e, 1], strain[e, 2] = e0, e1, 0.5 * e2
         stress[e, 0], stress[e, 1], stress[e, 2] = s0, s1, s2
 
@@ -197,41 +197,48 @@ class Membrane(Elastic):
     elements : Elements
         Stencil (E, 3), whose corners are put into ascending order; data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
         ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
+
+    Attributes
+    ----------
+    laws : (n, 4) [N/m], (E,) int32
+        The different stiffnesses, and which of them each triangle has.
     """
 
     name = "membrane"
 
     def __init__(self, elements: Elements) -> None:
+        self.laws = _distinct(elements.data["stiffness"])
         super().__init__(elements := _ascending(elements))
         data = elements.data
         self._before: Array | None = None
-        self._inverse, self._area, self._c = data["inverse"], data["area"], data["stiffness"]
+        self._inverse, self._area = data["inverse"], data["area"]
 
     def energies(self, x: Array) -> Array:
         out = np.empty(self.n_owned)
-        energies(x, self.stencil, 0, self.n_owned, self._inverse, self._area, self._c, out)
+        energies(x, self.stencil, 0, self.n_owned, self._inverse, self._area, *self.laws, out)
         return out
 
     def add_gradient(self, x: Array, out: Array) -> None:
-        add_gradient(x, self.stencil, self._inverse, self._area, self._c, out)
+        add_gradient(x, self.stencil, self._inverse, self._area, *self.laws, out)
 
     def linearise_from(self, y: Array | None) -> None:
         self._before = y
 
     def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
         y = x if self._before is None else self._before
-        hessians(x, y, self.stencil, lo, hi, blend, self._inverse, self._area, self._c, out)
+        hessians(x, y, self.stencil, lo, hi, blend, self._inverse, self._area, *self.laws, out)
 
     def add_hessians(
         self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
     ) -> bool:
         y = x if self._before is None else self._before
-        constants = self._inverse, self._area, self._c
+        constants = self._inverse, self._area, *self.laws
         add_hessians(x, y, self.stencil, blend, *constants, weight, offsets[self.name], values)
         return True
 
     def force_scale(self, size: float) -> Array:
-        stiffest: Array = np.abs(self._c).max(axis=1)
+        laws, law = self.laws
+        stiffest: Array = np.abs(laws).max(axis=1)[law]
         steepest = np.abs(self._inverse).max(axis=(1, 2))
         scale: Array = stiffest * self._area * steepest**2 * size
         return scale
@@ -239,18 +246,28 @@ class Membrane(Elastic):
     def strain_and_stress(self, x: Array) -> tuple[Array, Array]:
         """Green strain (E_uu, E_vv, E_uv) and stress (S_uu, S_vv, S_uv) [N/m], each (E, 3)."""
         strain, stress = np.empty((self.n_elements, 3)), np.empty((self.n_elements, 3))
-        strain_and_stress(x, self.stencil, self._inverse, self._c, strain, stress)
+        strain_and_stress(x, self.stencil, self._inverse, *self.laws, strain, stress)
         return strain, stress
 
 
+def _distinct(stiffness: Array) -> tuple[Array, NDArray[np.int32]]:
+    """The laws (n, 4) of triangles (E, 4), each once, and which of them each triangle has."""
+    if len(stiffness) and (stiffness == stiffness[0]).all():
+        return stiffness[:1].copy(), np.zeros(len(stiffness), dtype=np.int32)
+    laws, law = np.unique(stiffness, axis=0, return_inverse=True)
+    return laws, law.astype(np.int32)
+
+
 def _ascending(elements: Elements) -> Elements:
-    """The triangles with ascending corners, and their rest matrices to it."""
+    """The triangles with ascending corners, their rest matrices to it, and without their laws."""
     order = np.argsort(elements.stencil, axis=1, kind="stable")
     last_two = elements.data["inverse"]
     slopes = np.concatenate([-last_two.sum(axis=1, keepdims=True), last_two], axis=1)
     inverse = np.take_along_axis(slopes, order[:, 1:, None], axis=1)
     stencil = np.take_along_axis(elements.stencil, order, axis=1)
-    return replace(elements, stencil=stencil, data={**elements.data, "inverse": inverse})
+    data = {**elements.data, "inverse": inverse}
+    del data["stiffness"]
+    return replace(elements, stencil=stencil, data=data)
 
 
 def elements(rest: RestShape) -> Elements:

@@ -41,11 +41,11 @@ def hinge(*left: float) -> Array:
 REST_AREAS = areas(hinge(1.0, 1.0))
 
 
-def bending() -> Bending:
+def bending(part_of_limit: float = 1.0) -> Bending:
     data = {
         "k": np.array([0.7]),
         "rest_angle": np.array([-0.4]),
-        "limit": fading_limit(REST_AREAS)[None],
+        "limit": part_of_limit * fading_limit(REST_AREAS)[None],
         "rest_height": np.array([1.0]),
     }
     return Bending(Elements(np.array([[0, 1, 2, 3]]), data))
@@ -165,8 +165,7 @@ def test_two_derivatives_are_continuous_where_it_begins(make: Callable[[], Elast
 @pytest.mark.parametrize("left", [1.0, part(1.001)])
 def test_nothing_fades_before(left: float) -> None:
     term, x = bending(), hinge(left, 0.5)
-    full = bending()
-    full.elements.data["limit"][:] = 0.0
+    full = bending(0.0)
     assert term.weights(x)[0] == 1.0
     np.testing.assert_array_equal(term.energies(x), full.energies(x))
     np.testing.assert_array_equal(gradient(term, x), gradient(full, x))

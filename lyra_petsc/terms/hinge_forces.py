@@ -1,0 +1,90 @@
+"""Energies of hinges and their gradients; element Hessians. Triangles' shapes are those of ``hinge_shape``.
+
+The gradient is put together triangle by triangle: all forces of a triangle's hinges on its corners act along its
+normal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lyra_petsc.terms.hinge import angle_parts, point
+from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_hessian, hinge_weight
+from lyra_petsc.terms.kernel import kernel
+
+
+@kernel(inline="always")
+def limits_of(limit, sides, h):  # type: ignore[no-untyped-def]
+    """The limits of |normal|² of a hinge's triangles."""
+    return limit[sides[h, 0] >> 2], limit[sides[h, 1] >> 2]
+
+
+@kernel()
+def weights(x, s, sides, limit, out):  # type: ignore[no-untyped-def]
+    """Part of its energy that each hinge has left, 1 but for collapsed triangles, into out (E,)."""
+    for h in range(s.shape[0]):
+        x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
+        _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
+        limits = limits_of(limit, sides, h)
+        out[h] = hinge_weight(square1, square2, limits[0], limits[1])
+
+
+@kernel()
+def energies(x, s, sides, shape, limit, theta, k, rest, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of the first len(out) hinges."""
+    for h in range(out.shape[0]):
+        change = theta[h] - rest[h]
+        out[h] = k[h] * change * change
+        if shape[sides[h, 0] >> 2, 6] * shape[sides[h, 1] >> 2, 6] == 0.0:
+            x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
+            _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
+            out[h] = hinge_energy(theta[h], square1, square2, k[h], rest[h], limits_of(limit, sides, h))
+
+
+@kernel()
+def pulls(x, s, sides, shape, limit, theta, length, k, rest, pull, out):  # type: ignore[no-untyped-def]
+    """Moments over the edges' lengths [N] into pull (E + 1,), 0 of hinges that fade and in the last place.
+
+    The gradient of those that fade is added to out (n_local, 3).
+    """
+    g = np.empty((4, 3))
+    pull[-1] = 0.0
+    for h in range(s.shape[0]):
+        pull[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
+        if shape[sides[h, 0] >> 2, 6] * shape[sides[h, 1] >> 2, 6] == 0.0:
+            pull[h] = 0.0
+            x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
+            limits = limits_of(limit, sides, h)
+            moment = hinge_gradient(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, g)
+            for a in range(4):
+                for i in range(3):
+                    out[s[h, a], i] += moment * g[a, i]
+
+
+@kernel()
+def add_gradient(corners, hinges, shape, pull, out):  # type: ignore[no-untyped-def]
+    """Add the energy's gradient [N] to out (n_local, 3).
+
+    At the ends of an edge it is the pull times the cotangent at the other end.
+    """
+    for t in range(corners.shape[0]):
+        c0, c1, c2 = shape[t, 3], shape[t, 4], shape[t, 5]
+        p0, p1, p2 = pull[hinges[t, 0] >> 1], pull[hinges[t, 1] >> 1], pull[hinges[t, 2] >> 1]
+        f1 = p0 * c2 + p2 * c0 - p1 * (c0 + c2)
+        f2 = p0 * c1 + p1 * c0 - p2 * (c0 + c1)
+        i0, i1, i2 = corners[t, 0], corners[t, 1], corners[t, 2]
+        for i in range(3):
+            n = shape[t, i]
+            out[i0, i] -= (f1 + f2) * n
+            out[i1, i] += f1 * n
+            out[i2, i] += f2 * n
+
+
+@kernel()
+def hessians(x, s, sides, lo, hi, limit, theta, blend, k, rest, out):  # type: ignore[no-untyped-def]
+    """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
+    g = np.empty((4, 3))
+    for h in range(lo, hi):
+        x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
+        limits = limits_of(limit, sides, h)
+        hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, g, out[h - lo])
