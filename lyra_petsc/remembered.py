@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Result = TypeVar("Result", Array, tuple[Array, ...])
+Result = TypeVar("Result", bound="Array | tuple[Array, ...]")
 
 
 class Remembered(Generic[Result]):

@@ -47,7 +47,8 @@ class BlockPattern:
     def __init__(self, stencils: Mapping[str, NDArray[np.int32]], n_owned: int, n_local: int) -> None:
         keys = diagonal_keys(n_owned, n_local)
         for stencil in stencils.values():
-            for a in sorted({a for a, _ in couplings(stencil)}):  # one after the other: all couplings at once take much memory
+            # one after the other: all couplings at once take much memory
+            for a in sorted({a for a, _ in couplings(stencil)}):
                 keys = union(keys, *_row_keys(stencil, a, n_owned, n_local))
         self._set(keys, n_owned, n_local)
         self.offsets: dict[str, Offsets] = {}

@@ -96,11 +96,10 @@ class ReducedSystem:
         shell = partial(self._sum, self._shell)  # moving targets change the forces at one and the same place
         self._internal = Remembered(shell) if still else shell
         self._damping = Damping(points, blocks, elastic, moves=scheme.moves, once=scheme.explicit)
-        n_local, n_owned = points.n_local, points.n_owned
-        self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((n_local, 3)) for _ in range(5))
-        self._xh, self.history = self.x, self.v[:n_owned]
+        self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((points.n_local, 3)) for _ in range(5))
+        self._xh, self.history = self.x, self.v[: points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
-        self._force = np.zeros((n_local, 3))
+        self._force = np.zeros((points.n_local, 3))
         self._objectives: list[tuple[Array, tuple[float, float]]] = []
         self.dt = self.t0 = self.t1 = self.anchored = self._size = 0.0
         self.followers: list[Follower] = [scheme]
@@ -273,8 +272,8 @@ class ReducedSystem:
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
-        parts = self._parts(*self._evaluate_at(v), vdot)
-        reduce(lambda total, part: np.add(total, part, out=out), parts.values())
+        parts = self._parts(*self._evaluate_at(v), vdot).values()
+        reduce(lambda total, part: np.add(total, part, out=out), parts)
         if self.held:
             held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed.velocity)
             np.copyto(out, held, where=~self._prescribed.free)
@@ -305,8 +304,8 @@ class ReducedSystem:
         """
         x, vs = self._evaluate_at(v)
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        beside = self._prescribed.blocks
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, beside):
+        changing = self._prescribed.blocks
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, changing):
             self._damping.into(values, inertia)
             for term in self.elastic:
                 self._blocks.add_stiffness(term, x, blend, reach, values)

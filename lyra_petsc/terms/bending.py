@@ -134,7 +134,7 @@ class Bending(Elastic):
 
     def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:
         within = offsets[self.name]
-        out: Offsets = np.empty((self.n_elements, 10), dtype=within.dtype)
+        out = np.empty_like(within, shape=(self.n_elements, 10))
         all_offsets(self.stencil, self._triangles.sides, within, offsets[ACROSS], out)
         return out
 

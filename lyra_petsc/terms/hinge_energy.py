@@ -82,14 +82,6 @@ def hinge_gradient(x0, x1, x2, x3, theta, k, rest, limits, g):  # type: ignore[n
 
 
 @kernel(inline="always")
-def hinge_stiffness(square1, square2, k, limit1, limit2):  # type: ignore[no-untyped-def]
-    """What ∇θ ∇θᵀ is multiplied by in the regularised Hessian [N·m]."""
-    if square1 > limit1 and square2 > limit2:
-        return 2.0 * k
-    return 2.0 * k * hinge_weight(square1, square2, limit1, limit2)
-
-
-@kernel(inline="always")
 def hinge_hessian(x0, x1, x2, x3, theta, k, rest, limits, blend, g, out):  # type: ignore[no-untyped-def]
     """Hessian blocks [N/m] into out (4, 4, 3, 3).
 

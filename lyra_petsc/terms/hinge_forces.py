@@ -1,7 +1,6 @@
-"""Energies of hinges and their gradients; element Hessians. Triangles' shapes are those of ``hinge_shape``.
+"""Energies of hinges and their gradients; element Hessians. Shapes of triangles are those of ``hinge_shape``.
 
-The gradient is put together triangle by triangle: all forces of a triangle's hinges on its corners act along its
-normal.
+The gradient is put together triangle by triangle, along whose normal all forces of its hinges act.
 """
 
 from __future__ import annotations

@@ -81,9 +81,10 @@ def _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values):
 def add_across(  # type: ignore[no-untyped-def]
     x, s, sides, shape, theta, length, blend, k, rest, limit, weight, within, across, values, factors
 ):
-    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact. Factors (E + 1, 2) of ``add_within``.
+    """Add weight (E,) times the blocks across hinges; ``blend`` 0 is exact.
 
-    Hinges of triangles that fade are added whole, with factors 0.
+    The factors (E + 1, 2) are those that ``add_within`` takes. Hinges of triangles that fade are added whole,
+    with factors 0.
     """
     offsets = np.empty(10, dtype=within.dtype)
     factors[-1, 0] = factors[-1, 1] = 0.0

@@ -44,9 +44,8 @@ def triangles_of(stencil: Ints32) -> HingeTriangles:
     odd = (order[:, 0] > order[:, 1]) ^ (order[:, 1] > order[:, 2]) ^ (order[:, 0] > order[:, 2])
     # two hinges on one side of a triangle have a triangle each
     n_points = int(stencil.max(initial=0)) + 1
-    by = np.lexsort(
-        (8 * corners[:, 2].astype(np.int64) + 4 * odd + opposite, corners[:, 0] * np.int64(n_points) + corners[:, 1])
-    )
+    first_two = corners[:, 0] * np.int64(n_points) + corners[:, 1]
+    by = np.lexsort((8 * corners[:, 2].astype(np.int64) + 4 * odd + opposite, first_two))
     same = np.all(corners[by[1:]] == corners[by[:-1]], axis=1) & (odd[by[1:]] == odd[by[:-1]])
     again = same & (opposite[by[1:]] == opposite[by[:-1]])
     first = np.concatenate([np.ones(min(2 * n, 1), dtype=bool), ~same | again])

@@ -112,9 +112,9 @@ def _linearised(f, g, c, m):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def _prepared(x, y, s, e, blend, inverse, w, c, m):  # type: ignore[no-untyped-def]
-    """What the Hessian of triangle e of law m is made of: deformation gradient; stress, law times w; gradients.
+    """What the Hessian of triangle e with law m is made of.
 
-    Gradients (∂/∂u, ∂/∂v) are those of the shape functions of the three corners.
+    Deformation gradient; stress and law times w; gradients (∂/∂u, ∂/∂v) of the corners' shape functions.
     """
     f = _deformation(x, s, e, inverse)
     e0, e1, _, s0, s1, s2 = _linearised(f, _deformation(y, s, e, inverse), c, m)
@@ -128,7 +128,7 @@ def _prepared(x, y, s, e, blend, inverse, w, c, m):  # type: ignore[no-untyped-d
 
 @kernel(inline="always")
 def _factors(stress, stiff, ga, gb):  # type: ignore[no-untyped-def]
-    """(uu, uv, vu, vv) and geometric of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
+    """Of block (a, b) = uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + geometric I."""
     (au, av), (bu, bv) = ga, gb
     c11, c12, c22, c33 = stiff
     uu, vv = au * bu, av * bv
@@ -195,8 +195,8 @@ class Membrane(Elastic):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 3), whose corners are put into ascending order; data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
-        ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
+        Stencil (E, 3), whose corners are put into ascending order; data ``inverse`` (E, 2, 2) inverse rest
+        matrix [1/m], ``area`` (E,) [m²], ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
 
     Attributes
     ----------
@@ -264,7 +264,8 @@ def _ascending(elements: Elements) -> Elements:
     last_two = elements.data["inverse"]
     slopes = np.concatenate([-last_two.sum(axis=1, keepdims=True), last_two], axis=1)
     inverse = np.take_along_axis(slopes, order[:, 1:, None], axis=1)
-    stencil = np.take_along_axis(elements.stencil, order, axis=1)
+    stencil = elements.stencil.copy()
+    stencil.sort(axis=1)
     data = {**elements.data, "inverse": inverse}
     del data["stiffness"]
     return replace(elements, stencil=stencil, data=data)

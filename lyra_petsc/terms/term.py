@@ -34,7 +34,7 @@ class Term(ABC):
 
     @property
     def couplings(self) -> Couplings:
-        """Stencils (E, n) whose points the Hessians couple, each with the name of its offsets in a pattern."""
+        """Stencils (E, n) whose points the Hessians couple, by the names of their offsets in a pattern."""
         return {self.name: self.stencil}
 
     def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:

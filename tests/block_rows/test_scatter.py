@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 
 from lyra_petsc.block_rows.scatter import AHEAD, add_elements, fetch_ahead
-from lyra_petsc.block_rows.vectors import add_outer
+from lyra_petsc.block_rows.vectors import add_outer, add_six, add_triangle
 
 RNG = np.random.default_rng(7)
 
@@ -17,6 +17,21 @@ RNG = np.random.default_rng(7)
 @njit
 def add_one(values: Any, at: Any, diagonal: Any, left: Any, right: Any) -> None:
     add_outer(values, at, diagonal, left, right)
+
+
+@njit
+def add_sums(values: Any, at: Any, left: Any, right: Any) -> None:
+    add_outer(values, at, 0.0, left, right)
+
+
+@njit
+def add_all(values: Any, offsets: Any, e: Any, six: Any) -> None:
+    add_six(values, offsets, e, six)
+
+
+@njit
+def add_balanced(values: Any, offsets: Any, e: Any, diagonals: Any, f: Any, factors: Any) -> None:
+    add_triangle(values, offsets, e, diagonals, f, factors)
 
 
 def vectors(count: int) -> tuple[tuple[float, float, float], ...]:
@@ -43,6 +58,54 @@ def test_what_others_have_is_left_to_them() -> None:
     values = np.ones((2, 3, 3))
     add_one(values, np.int32(-1), 5.0, vectors(1), vectors(1))
     np.testing.assert_array_equal(values, 1.0)
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_vectors_may_be_sums(odd: int) -> None:
+    a, b, c, d, e = vectors(5)
+    values = np.zeros((1, 3, 3))
+    add_sums(values, np.int64(odd), (a, ((2.0, b), (-0.5, c))), (((3.0, d),), e))
+    block = 3.0 * np.outer(a, d) + np.outer(2.0 * np.array(b) - 0.5 * np.array(c), e)
+    np.testing.assert_allclose(values[0], block.T if odd else block, atol=1e-14)
+
+
+PLACES = [[0, 3, 5, 6, 9, 10], [2, -1, 4, -1, 8, -1], [-1, -1, -1, -1, -1, -1]]
+"""Of (0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2): all ours, some, none. The lowest bit says nothing."""
+
+
+def sums_at(places: list[int], blocks: np.ndarray) -> np.ndarray:
+    """Zeros (6, 3, 3) to which the blocks are added."""
+    out = np.zeros((6, 3, 3))
+    for place, block in zip(places, blocks, strict=True):
+        if place >= 0:
+            out[place // 2] += block
+    return out
+
+
+@pytest.mark.parametrize("places", PLACES)
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_six_blocks_of_a_triangle(places: list[int], kind: type) -> None:
+    six = tuple((vectors(2), vectors(2)) for _ in range(6))
+    blocks = np.array([np.array(left).T @ np.array(right) for left, right in six])
+    values = np.zeros((6, 3, 3))
+    add_all(values, np.array([PLACES[0], places], dtype=kind), 1, six)
+    np.testing.assert_allclose(values, sums_at(places, blocks), atol=1e-14)
+
+
+@pytest.mark.parametrize("places", PLACES)
+def test_three_blocks_of_a_triangle_make_the_others(places: list[int]) -> None:
+    f, diagonals = vectors(2), tuple(float(number) for number in RNG.normal(size=3))
+    factors = tuple(tuple(float(number) for number in row) for row in RNG.normal(size=(3, 4)))
+    u, v = np.array(f)
+    outers = np.array([np.outer(u, u), np.outer(u, v), np.outer(v, u), np.outer(v, v)])
+    b11, b21, b22 = (
+        own * np.eye(3) + np.tensordot(row, outers, 1) for own, row in zip(diagonals, factors, strict=True)
+    )
+    b10, b20 = -(b11 + b21.T), -(b21 + b22)
+    values = np.zeros((6, 3, 3))
+    add_balanced(values, np.array([places], dtype=np.int32), 0, diagonals, f, factors)
+    expected = sums_at(places, np.array([-(b10 + b20), b10, b20, b11, b21, b22]))
+    np.testing.assert_allclose(values, expected, atol=1e-13)
 
 
 def test_whole_elements_go_the_same_way() -> None:

@@ -1,0 +1,168 @@
+"""Triangles found from hinges: what is put together triangle by triangle is what the hinges have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.assembly.blocks import BlockRows
+from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.meshing.topology import hinges
+from lyra_petsc.partition.elements import Elements
+from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.hinge_triangles import triangles_of
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def strip(n: int, *, twisted: bool) -> Ints:
+    """A closed band of 2 n triangles about n + n vertices; a Möbius band where twisted."""
+    low, high = np.arange(n), n + np.arange(n)
+    low_next, high_next = np.roll(low, -1), np.roll(high, -1)
+    if twisted:
+        low_next[-1], high_next[-1] = high_next[-1], low_next[-1]
+    first = np.column_stack([low, low_next, high_next])
+    second = np.column_stack([low, high_next, high])
+    return np.concatenate([first, second])
+
+
+def octahedron() -> Ints:
+    """Closed, every vertex in four triangles."""
+    upper = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1)]
+    return np.array(upper + [(5, c, b) for _, b, c in upper])
+
+
+def turned(triangles: Ints) -> Ints:
+    """Every third triangle the other way round."""
+    out = triangles.copy()
+    out[::3] = out[::3, ::-1]
+    return out
+
+
+SHEETS = {
+    "octahedron": hinges(octahedron()).vertices,
+    "band": hinges(strip(7, twisted=False)).vertices,
+    "Möbius band": hinges(strip(7, twisted=True)).vertices,
+    "turned triangles": hinges(turned(strip(7, twisted=False))).vertices,
+    "one hinge": np.array([[3, 1, 0, 2]]),
+    "the same hinge twice": np.array([[3, 1, 0, 2], [3, 1, 0, 2], [1, 3, 2, 0]]),
+    "three triangles on an edge": np.array([[0, 1, 2, 3], [0, 1, 2, 4], [1, 0, 3, 4]]),
+    "none": np.empty((0, 4), dtype=np.int64),
+}
+every_sheet = pytest.mark.parametrize("name", SHEETS)
+
+
+def shape(n: int) -> Array:
+    return np.random.default_rng(n).uniform(-1.0, 1.0, (n, 3))
+
+
+def bending(stencil: NDArray[Any], limit: float = 0.0) -> Bending:
+    n = len(stencil)
+    rng = np.random.default_rng(3)
+    data = {
+        "k": rng.uniform(0.5, 2.0, n),
+        "rest_angle": rng.uniform(-0.5, 0.5, n),
+        "limit": np.full((n, 2), limit),
+        "rest_height": np.ones(n),
+        "damping": np.zeros(n),
+    }
+    return Bending(Elements(stencil.astype(np.int32), data))
+
+
+def alone(stencil: NDArray[Any], limit: float = 0.0) -> list[Bending]:
+    """A term for each hinge of ``bending``."""
+    whole = bending(stencil, limit)
+    made = []
+    for row, points in enumerate(stencil):
+        data = {key: values[row : row + 1] for key, values in whole.elements.data.items()}
+        made.append(
+            Bending(Elements(points[None].astype(np.int32), data | {"limit": np.full((1, 2), limit)}))
+        )
+    return made
+
+
+@every_sheet
+def test_sides_and_hinges_name_each_other(name: str) -> None:
+    stencil = SHEETS[name].astype(np.int32)
+    corners, _, sides, found = triangles_of(stencil)
+    assert (np.diff(corners, axis=1) > 0).all()
+    n = len(stencil)
+    assert sides.shape == (n + 1, 2)
+    assert found.shape == corners.shape
+    for hinge, (a, b, c, d) in enumerate(stencil):
+        for second, points in enumerate(((a, b, c), (a, b, d))):
+            triangle, corner = divmod(sides[hinge, second], 4)
+            assert corners[triangle].tolist() == sorted(points)
+            assert corners[triangle, corner] == points[2]
+            assert found[triangle, corner] == 2 * hinge + second
+    assert np.count_nonzero(found < 2 * n) == 2 * n
+
+
+def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> None:
+    assert len(triangles_of(SHEETS["octahedron"].astype(np.int32)).corners) == 8
+    assert len(triangles_of(SHEETS["band"].astype(np.int32)).corners) == 14
+    assert len(triangles_of(SHEETS["Möbius band"].astype(np.int32)).corners) > 14
+
+
+@every_sheet
+@pytest.mark.parametrize("limit", [0.0, 0.3, 10.0])  # none fades, some do, all do
+def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> None:
+    stencil = SHEETS[name]
+    term, x = bending(stencil, limit), shape(14)
+    singly = alone(stencil, limit)
+    np.testing.assert_allclose(
+        term.energies(x), [one.energies(x)[0] for one in singly], rtol=1e-12, atol=1e-15
+    )
+    found, expected = np.zeros_like(x), np.zeros_like(x)
+    term.add_gradient(x, found)
+    for one in singly:
+        one.add_gradient(x, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
+
+
+def test_some_hinges_fade() -> None:
+    weights = bending(SHEETS["band"], 0.3).weights(shape(14))
+    assert 0.0 <= weights.min() < 1.0 == weights.max()
+    assert bending(SHEETS["band"], 10.0).weights(shape(14)).max() < 1.0
+
+
+@every_sheet
+@pytest.mark.parametrize("limit", [0.0, 0.3, 10.0])
+@pytest.mark.parametrize("blend", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("n_owned", [14, 5])
+def test_block_rows_are_those_of_the_element_hessians(
+    name: str, limit: float, blend: float, n_owned: int
+) -> None:
+    term, x = bending(SHEETS[name], limit), shape(14)
+    blocks = BlockRows(BlockPattern(term.couplings, n_owned, 14))
+    found, expected = blocks.zeros(), blocks.zeros()
+    weight = 1.0 + np.arange(term.n_elements)
+    offsets = blocks.pattern.offsets
+    assert term.add_hessians(x, blend, weight, offsets, found)
+    rows = term.offsets_of_elements(offsets)
+    assert (rows >= 0).any() == bool(term.n_elements)
+    blocks.add(rows, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
+    # and these offsets are what the whole stencil would have been given
+    whole = BlockPattern({"hinges": term.stencil}, n_owned, 14)
+    assert whole.columns.tolist() == blocks.pattern.columns.tolist()
+    np.testing.assert_array_equal(rows, whole.offsets["hinges"])
+
+
+def test_points_without_a_place_do_no_harm() -> None:
+    """Two points in one place: an edge without a length, triangles without an area."""
+    stencil = SHEETS["band"]
+    term, x = bending(stencil), shape(14)
+    x[stencil[0, 1]] = x[stencil[0, 0]]
+    blocks = BlockRows(BlockPattern(term.couplings, 14, 14))
+    gradient, values = np.zeros_like(x), blocks.zeros()
+    term.add_gradient(x, gradient)
+    for blend in (0.0, 1.0):
+        assert term.add_hessians(x, blend, np.ones(len(stencil)), blocks.pattern.offsets, values)
+    assert np.isfinite(term.energies(x)).all()
+    assert np.isfinite(gradient).all()
+    assert np.isfinite(values).all()
