@@ -61,6 +61,7 @@ class Held:
         self._axes = {
             number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
         }
+        self._places = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
         self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
         self._windows = {number: Window.of(scene.handles[number]) for number in owned}
         self._start: dict[int, Array] = {number: np.zeros((len(v), 3)) for number, v in owned.items()}
@@ -82,20 +83,20 @@ class Held:
         """Prescribed coordinates (n_owned, 3) of the step from t0 to t1 [s]."""
         mask = np.zeros((n_owned, 3), dtype=bool)
         for number in self.active(t0, t1):
-            mask[np.ix_(self._vertices[number], self._axes[number])] = True
+            mask[self._places[number]] = True
         return mask
 
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
         """Write the positions [m] prescribed at time ``at`` of the step t0..t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
             goal = self._motions[number].carried(self._start[number], self._windows[number].start, at)
-            out[np.ix_(self._vertices[number], self._axes[number])] = goal[:, self._axes[number]]
+            out[self._places[number]] = goal[:, self._axes[number]]
 
     def velocities(self, t0: float, t1: float, at: float, out: Array) -> None:
         """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
             rate = self._motions[number].velocity(self._start[number], self._windows[number].start, at)
-            out[np.ix_(self._vertices[number], self._axes[number])] = rate[:, self._axes[number]]
+            out[self._places[number]] = rate[:, self._axes[number]]
 
     @property
     def numbers(self) -> list[int]:

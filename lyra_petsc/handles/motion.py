@@ -110,6 +110,8 @@ class Motion:
 
     def carried(self, points: Array, start: float, time: float) -> Array:
         """T(time) T(start)⁻¹ applied to ``points`` (n, 3) [m]."""
+        if len(self._times) == 1:  # most handles: nothing moves
+            return points.copy()
         a0, d0 = self.transform(start)
         a, d = self.transform(time)
         moved: Array = (points - d0) @ (a @ np.linalg.inv(a0)).T + d
