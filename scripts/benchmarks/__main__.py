@@ -148,6 +148,7 @@ class Bench:
             self._presets()
         if not asked.only_rows:
             self._weak()
+            self._apart()
             self._rest()
         for row in results["rows"]:
             results["versions"] |= row.get("versions", {})
@@ -193,6 +194,18 @@ class Bench:
         asked = self._asked
         for ranks in asked.ranks if asked.weak else []:
             self._add("weak", self._row(ranks * asked.weak, measures.METHODS[0], ranks))
+
+    def _apart(self) -> None:
+        asked = self._asked
+        vertices = max(asked.vertices)
+        for ranks in (ranks for ranks in asked.ranks if ranks > 1):
+            self._add(
+                "apart",
+                self._attempt(
+                    f"{ranks} sheets of {vertices // ranks} vertices at once",
+                    lambda ranks=ranks: measures.apart(vertices, ranks, self._petsc, asked.limits),
+                ),
+            )
 
     def _presets(self) -> None:
         for name in self._asked.presets:

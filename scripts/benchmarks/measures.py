@@ -68,6 +68,20 @@ def row(
     return found | {"who": method}
 
 
+def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
+    """Steps of sheets of a rank's share of the vertices, one on each rank at the same time."""
+    return measure(
+        "apart",
+        ranks,
+        petsc,
+        limits.process,
+        scene=hanging_square(vertices // ranks),
+        warm_up=WARM_UP,
+        steps=limits.steps,
+        seconds=limits.seconds,
+    ) | {"whole_vertices": square_number(vertices)}
+
+
 def first_method(rows: Sequence[Result]) -> list[Result]:
     """The rows of the first method on one rank."""
     return [found for found in rows if found["who"] == METHODS[0] and found["ranks"] == 1]

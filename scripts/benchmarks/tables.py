@@ -176,6 +176,41 @@ def weak_table(rows: Sequence[Result]) -> list[str]:
     return table(head, map(cells, rows))
 
 
+def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
+    """What ranks bring, beside what they could bring if they had nothing to tell each other."""
+
+    def cells(found: Result) -> list[str]:
+        same = [
+            row for row in rows if row["who"] == METHODS[0] and row["vertices"] == found["whole_vertices"]
+        ]
+        alone, together = (
+            next((median_of(row, "seconds") for row in same if row["ranks"] == ranks), math.nan)
+            for ranks in (1, found["ranks"])
+        )
+        best = statistics.median(found["step_seconds"])
+        return [
+            str(found["whole_vertices"]),
+            str(found["ranks"]),
+            *(number(1e3 * seconds) for seconds in (alone, together)),
+            number(alone / together),
+            f"{found['ranks']} × {found['vertices']}",
+            spread(found["step_seconds"], 1e3),
+            number(alone / best),
+        ]
+
+    head = (
+        "vertices",
+        "ranks",
+        "ms a step, one rank",
+        "all ranks",
+        "times as fast",
+        "sheets apart",
+        "ms a step",
+        "times as fast, at best",
+    )
+    return table(head, map(cells, apart))
+
+
 def presets_table(rows: Sequence[Result]) -> list[str]:
     """CG iterations of one solve, and time, of each preset, cloth and Δt against size."""
     sizes = sorted({row["vertices"] for row in rows})
@@ -209,6 +244,8 @@ def document(results: Result) -> str:
         lines += [*growth_words(results["growth"]), ""]
     if results.get("weak"):
         lines += ["## Weak scaling", "", *weak_table(results["weak"]), ""]
+    if results.get("apart"):
+        lines += ["## What ranks bring", "", *apart_table(results["rows"], results["apart"]), ""]
     if results.get("presets"):
         lines += ["## CG iterations a solve, and time per step", "", *presets_table(results["presets"]), ""]
     single = list(_single_numbers(results))

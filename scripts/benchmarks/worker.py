@@ -156,6 +156,14 @@ def steps(comm: Comm, job: Result) -> Result:
     }
 
 
+def apart(comm: Comm, job: Result) -> Result:
+    """Each rank has a sheet of its own, at the same time: the steps of all, in seconds."""
+    own = steps(MPI.COMM_SELF, job)
+    gathered = comm.gather([row["seconds"] for row in own["steps"]])
+    seconds = [each for of_rank in gathered or [] for each in of_rank]
+    return {"vertices": own["vertices"], "preset": own["preset"], "step_seconds": seconds}
+
+
 def overhead(comm: Comm, job: Result) -> Result:
     """Steps a second in ``blocks`` blocks of ``steps``, nothing logged."""
     simulation = Simulation(comm, Scene.model_validate(job["scene"]))
@@ -211,7 +219,7 @@ def _write_plain(path: Path, block: bytes) -> None:
         os.fsync(file.fileno())
 
 
-KINDS = {"steps": steps, "overhead": overhead, "output": output}
+KINDS = {"steps": steps, "apart": apart, "overhead": overhead, "output": output}
 
 
 def main() -> None:

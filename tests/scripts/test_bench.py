@@ -111,6 +111,9 @@ def test_json_holds_every_measurement(measured):
     assert 0.0 < results["default_scene"]["output_share"] < 1.0
     assert len(results["start_up"]["seconds"]) == 3
     assert [row["vertices"] for row in results["weak"]] == [square_number(50), square_number(100)]
+    (apart,) = results["apart"]
+    assert 2 * 2 <= len(apart["step_seconds"]) <= 2 * 3
+    assert apart["vertices"] == square_number(18)
     assert len(results["presets"]) == 3
     assert not (folder / "scratch").exists()
 
@@ -123,11 +126,14 @@ def test_markdown_shows_them(measured):
     for lines in tables_of(text):
         assert {len(line) for line in lines} == {len(lines[0])}
         assert all(cell for line in lines for cell in line)
-    rows, weak, presets, single = tables_of(text)
+    rows, weak, apart, presets, single = tables_of(text)
     assert tuple(rows[0]) == COLUMNS
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
     assert rows[1][5] == "1.00"
     assert len(weak) == 3
+    assert [line[:2] for line in apart[1:]] == [["36", "2"]]
+    assert apart[1][5] == "2 × 16"
+    assert float(apart[1][4]) == pytest.approx(float(apart[1][2]) / float(apart[1][3]), rel=0.02)
     assert len(presets) == 4
     assert {line[0] for line in presets[1:]} == {"block-jacobi"}
     assert len(single) == 9
