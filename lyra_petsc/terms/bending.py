@@ -78,10 +78,10 @@ class Bending(Elastic):
     def __init__(self, elements: Elements) -> None:
         data = dict(elements.data)
         limit = data.pop("limit")
-        # the triangles keep the limits, and nobody asks for the numbers of hinges
-        super().__init__(replace(elements, data=data, index=elements.index[:0].copy()))
+        super().__init__(replace(elements, data=data))
         self._k, self._rest = data["k"], data["rest_angle"]
         self._triangles = triangles_of(self.stencil)
+        # those of a triangle are the same in all of its hinges
         self._limit = np.empty(len(self._triangles.corners))
         self._limit[self._triangles.sides[:-1] >> 2] = limit
         # energy, gradient and Hessian are asked for at one place after the other
