@@ -73,13 +73,10 @@ class Code:
         """Of a tuple of sums: each as a vector. A sum: three numbers, or pairs of a factor and three."""
         return self._sums(self.given[name], self._types[name])
 
-    def pairs(self, name: str) -> list[list[list[Value]]]:
-        """Of a tuple of pairs of such tuples."""
+    def pairs(self, name: str) -> list[list[Value]]:
+        """Of a tuple of pairs of sums."""
         of_pairs = zip(self._unpacked(self.given[name]), self._types[name], strict=True)
-        return [
-            [self._sums(one, kind) for one, kind in zip(self._unpacked(pair), kinds, strict=True)]
-            for pair, kinds in of_pairs
-        ]
+        return [self._sums(pair, kinds) for pair, kinds in of_pairs]
 
     def _sums(self, given: Value, kinds: Any) -> list[Value]:
         return [self._sum(one, kind) for one, kind in zip(self._unpacked(given), kinds, strict=True)]
@@ -166,11 +163,25 @@ class Code:
         corner = self.builder.extract_element(row, LANE(2))
         self.builder.store(self.plus(self.builder.load(target), corner), target)
 
-    def add_six(self, blocks: list[list[Value]]) -> None:
-        """Add the blocks of an element ``e`` of three points where ``offsets`` (E, 6) say."""
-        builder, begin = self.builder, self.begin("blocks")
+    def six_offsets(self) -> list[Value]:
+        """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, 6)."""
         row = self.at(self.begin("offsets"), self.integer("e"), 6)
-        offsets = [builder.load(builder.gep(row, [INDEX(pair)])) for pair in range(6)]
+        return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in range(6)]
+
+    def is_odd(self, offset: Value) -> Value:
+        """In all lanes, as processors choose between vectors without a jump."""
+        odd = self.builder.trunc(offset, ir.IntType(1))
+        one = self.builder.insert_element(
+            ir.Constant(ir.VectorType(odd.type, WIDTH), ir.Undefined), odd, LANE(0)
+        )
+        return self.pick(one, one, 0, 0, 0, 0)
+
+    def select(self, lanes: Value, one: Value, other: Value) -> Value:
+        return self.builder.select(lanes, one, other)
+
+    def add_six(self, offsets: list[Value], blocks: list[list[Value]]) -> None:
+        """Add the rows of six blocks of an element as they are, where offsets say."""
+        builder, begin = self.builder, self.begin("blocks")
         ready = [(self.packed(rows), rows[2]) for rows in blocks]
 
         def add(pair: int) -> None:
@@ -178,8 +189,9 @@ class Code:
             at = at if at.type == INDEX else builder.sext(at, INDEX)
             self.add_block(self.at(begin, at, 9), *ready[pair])
 
-        # ascending points: where the last has its row here all have
-        with builder.if_else(self.is_ours(offsets[5]), likely=True) as (all_of_them, some):
+        # whoever has the rows of all three points has all blocks
+        own = builder.or_(builder.or_(offsets[0], offsets[3]), offsets[5])
+        with builder.if_else(self.is_ours(own), likely=True) as (all_of_them, some):
             with all_of_them:
                 for pair in range(6):
                     add(pair)

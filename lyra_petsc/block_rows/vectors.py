@@ -98,29 +98,33 @@ def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, righ
     return types.void(blocks, at, diagonal, left, right), generate
 
 
-def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, six: Any) -> Any:
-    """Add the blocks of corners a ≥ b of an element e: Σ left[m] right[m]ᵀ each, given by left and right.
+def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
+    """Add the blocks n Rᵀ + L nᵀ of the couplings (0, 0), (0, 1), …, (2, 2) of an element e.
 
-    Offsets (E, 6) are those of ascending corners, of (0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2). Left and
-    right are as in ``add_outer``.
+    They are given by R and L, sums as in ``add_outer``; n is three numbers. Offsets (E, 6) are a pattern's.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks offsets e six")
-        nothing = ir.Constant(code.vector.element, 0.0)
-        code.add_six([code.outer(nothing, left, right) for left, right in code.pairs("six")])
+        code = Code(context, builder, signature, arguments, "blocks offsets e n six")
+        nothing, n = ir.Constant(code.vector.element, 0.0), code.filled(code.numbers("n"))
+        offsets, blocks = code.six_offsets(), []
+        for offset, (right, left) in zip(offsets, code.pairs("six"), strict=True):
+            odd = code.is_odd(offset)  # transposed: n Lᵀ + R nᵀ
+            right, left = code.select(odd, left, right), code.select(odd, right, left)
+            blocks.append(code.outer(nothing, [n, left], [right, n]))
+        code.add_six(offsets, blocks)
         return context.get_dummy_value()
 
-    return types.void(blocks, offsets, e, six), generate
+    return types.void(blocks, offsets, e, n, six), generate
 
 
 def _add_triangle(
     typing: Any, blocks: Any, offsets: Any, e: Any, diagonals: Any, f: Any, factors: Any
 ) -> Any:
-    """Like ``add_six``, where a translation does nothing: columns and rows of blocks sum to zero.
+    """Add the blocks of the couplings of an element e whose columns and rows of blocks sum to zero.
 
-    Given are those of (1, 1), (2, 1), (2, 2): diagonal I + uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ,
-    with three diagonals and three (uu, uv, vu, vv).
+    Given are those of (1, 1), (1, 2), (2, 2): diagonal I + uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ,
+    with three diagonals and three (uu, uv, vu, vv). Offsets (E, 6) are those of a pattern.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -128,9 +132,19 @@ def _add_triangle(
         f, factors = code.vectors("f"), code.tuples("factors")
         ones, twos, threes = (code.combined(numbers, f) for numbers in factors)
         own, between, last = code.numbers("diagonals")
-        b11, b21, b22 = code.outer(own, f, ones), code.outer(between, f, twos), code.outer(last, f, threes)
-        b10, b20 = code.minus_sum(b11, code.outer(between, twos, f)), code.minus_sum(b21, b22)
-        code.add_six([code.minus_sum(b10, b20), b10, b20, b11, b21, b22])
+        b11, b12, b22 = code.outer(own, f, ones), code.outer(between, f, twos), code.outer(last, f, threes)
+        b21 = code.outer(between, twos, f)
+        b01, b02 = code.minus_sum(b11, b21), code.minus_sum(b12, b22)
+        b10, b20 = code.minus_sum(b11, b12), code.minus_sum(b21, b22)
+        offsets = code.six_offsets()
+
+        def stored(offset: Any, plain: Any, transposed: Any) -> Any:
+            odd = code.is_odd(offset)
+            return [code.select(odd, there, here) for there, here in zip(transposed, plain, strict=True)]
+
+        blocks = [code.minus_sum(b01, b02), stored(offsets[1], b01, b10), stored(offsets[2], b02, b20)]
+        blocks += [b11, stored(offsets[4], b12, b21), b22]
+        code.add_six(offsets, blocks)
         return context.get_dummy_value()
 
     return types.void(blocks, offsets, e, diagonals, f, factors), generate

@@ -236,7 +236,7 @@ def _triangle(points: Points, membrane: Membrane, stuck: Stuck, residual: Array)
         corners = position[stencil[row]]
         return Triangle(
             number=int(membrane.elements.index[row]),
-            vertices=tuple(sorted(int(number) for number in known[stencil[row], 1])),
+            vertices=tuple(int(number) for number in known[stencil[row], 1]),
             centre=_numbers(corners.mean(axis=0)),
             residual=float(sizes[row]),
             aspect=_aspect(inverse[row]),

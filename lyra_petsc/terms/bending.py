@@ -70,17 +70,18 @@ class Bending(Elastic):
     elements : Elements
         Stencil (E, 4) as in ``hinge``; data ``k`` (E,) [N·m], ``rest_angle`` (E,) [rad],
         ``rest_height`` (E,) sum of the two heights on the edge [m], ``length`` (E,) of the rest edge [m],
-        ``limit`` (E, 2) of |n|² of both triangles [m⁴], ``damping`` (E,) [s].
+        ``limit`` (E, 2) of |n|² of both triangles [m⁴], ``damping`` (E,) [s], and the ``places`` (E, 2) that
+        the opposite vertices have among the corners of their triangles (0, 1, 2).
     """
 
     name = "bending"
 
     def __init__(self, elements: Elements) -> None:
         data = dict(elements.data)
-        limit = data.pop("limit")
+        limit, places = data.pop("limit"), data.pop("places")
         super().__init__(replace(elements, data=data))
         self._k, self._rest = data["k"], data["rest_angle"]
-        self._triangles = triangles_of(self.stencil)
+        self._triangles = triangles_of(self.stencil, places.astype(np.int64))
         # those of a triangle are the same in all of its hinges
         self._limit = np.empty(len(self._triangles.corners))
         self._limit[self._triangles.sides[:-1] >> 2] = limit
@@ -88,10 +89,10 @@ class Bending(Elastic):
         self._bent = Remembered(self._bend)
 
     def _bend(self, x: Array) -> Bent:
-        corners, turned, sides, _ = self._triangles
+        corners, sides, _ = self._triangles
         bent = Bent(np.empty((len(corners), 7)), np.empty(self.n_elements), np.empty(self.n_elements))
         cosine = np.empty(self.n_elements)
-        hinge_shape.triangles(x, corners, turned, self._limit, bent.triangles)
+        hinge_shape.triangles(x, corners, self._limit, bent.triangles)
         hinge_shape.angle_parts(x, self.stencil, sides, bent.triangles, bent.angles, cosine, bent.lengths)
         # all at once: NumPy's are several at a time where the processor can
         np.arctan2(bent.angles, cosine, out=bent.angles)
@@ -118,7 +119,7 @@ class Bending(Elastic):
         return out
 
     def add_gradient(self, x: Array, out: Array) -> None:
-        corners, _, sides, hinges = self._triangles
+        corners, sides, hinges = self._triangles
         triangles, angles, lengths = self._bent(x)
         pulls, law = np.empty(self.n_elements + 1), (self._k, self._rest)
         hinge_forces.pulls(x, self.stencil, sides, triangles, self._limit, angles, lengths, *law, pulls, out)
@@ -141,7 +142,7 @@ class Bending(Elastic):
     def add_hessians(
         self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
     ) -> bool:
-        corners, _, sides, hinges = self._triangles
+        corners, sides, hinges = self._triangles
         within, across, bent = offsets[self.name], offsets[ACROSS], self._bent(x)
         factors = np.empty((self.n_elements + 1, 2))
         law = self._k, self._rest, self._limit, weight
@@ -267,6 +268,9 @@ def elements(rest: RestShape) -> Elements:
         "rest_height": 2.0 * areas / length,
         "length": length,
         "limit": fading_limit(rest.area[faces]),
+        "places": np.stack(
+            [_corners_of(rest.mesh.triangles[faces[:, i]], quad[:, 2 + i]) for i in (0, 1)], 1
+        ),
         "damping": damping,
     }
     return Elements(quad[bends], {name: values[bends] for name, values in data.items()})

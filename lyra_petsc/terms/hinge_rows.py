@@ -24,8 +24,8 @@ from lyra_petsc.terms.kernel import kernel
 
 @kernel(inline="always")
 def _ends(corner):  # type: ignore[no-untyped-def]
-    """The two other corners of a triangle."""
-    return int(corner == 0), 2 - int(corner == 2)
+    """The two other corners of a triangle, in its sense."""
+    return (corner + 1 if corner < 2 else 0), (corner - 1 if corner > 0 else 2)
 
 
 @kernel(inline="always")
@@ -45,12 +45,9 @@ def _same_block(at, swapped):  # type: ignore[no-untyped-def]
 def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-def]
     """Offsets of all couplings of hinge h, into out (10,)."""
     one, two, p, q = sides[h, 0] >> 2, sides[h, 1] >> 2, sides[h, 0] & 3, sides[h, 1] & 3
-    (i, j), (k, m) = _ends(p), _ends(q)
-    swapped = s[h, 0] < s[h, 1]
-    if not swapped:
-        i, j, k, m = j, i, m, k
+    (i, j), (m, k) = _ends(p), _ends(q)  # the second triangle runs along the edge the other way
     out[0] = within[one, _pair(i, i)]
-    out[1] = _same_block(within[one, _pair(i, j)], swapped)
+    out[1] = _same_block(within[one, _pair(i, j)], s[h, 0] < s[h, 1])
     out[2] = _same_block(within[one, _pair(i, p)], s[h, 0] < s[h, 2])
     out[3] = _same_block(within[two, _pair(k, q)], s[h, 0] < s[h, 3])
     out[4] = within[one, _pair(j, j)]
@@ -101,40 +98,40 @@ def add_across(  # type: ignore[no-untyped-def]
         square = length[h] * length[h]
         stiffness = 2.0 * k[h] * weight[h] / square
         factors[h, 0], factors[h, 1] = stiffness, (1.0 - blend) * stiffness * (theta[h] - rest[h]) * length[h]
-        left = scaled(stiffness * square * square / abs(areas), (shape[one, 0], shape[one, 1], shape[one, 2]))
+        left = scaled(stiffness * square * square / areas, (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]
         add_outer(values, across[h], 0.0, (left,), (right,))
 
 
 @kernel(inline="always")
 def _beyond(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
-    """Beyond a side: its factors, the first times γ at the side's ends, ascending, and the normal."""
+    """Beyond a side: its factors, the first times γ at the side's ends in our sense, and the normal."""
     h = hinge >> 1
     side = sides[h, 1 - (hinge & 1)]
     t, (i, j) = side >> 2, _ends(side & 3)
     stiff = factors[h, 0]
     normal = shape[t, 0], shape[t, 1], shape[t, 2]
-    return stiff, factors[h, 1], stiff * shape[t, 3 + j], stiff * shape[t, 3 + i], normal
+    return stiff, factors[h, 1], stiff * shape[t, 3 + i], stiff * shape[t, 3 + j], normal
 
 
 @kernel(forceinline=True)
 def _own(n, g, corner, one, other):  # type: ignore[no-untyped-def]
-    """The block of a corner and itself; of the two sides at it ``one`` and ``other``."""
+    """R and L of a corner and itself; of the two sides at it ``one`` and ``other``."""
     _, _, turn, slope, _ = corner
     (p, n1, t1), (q, n2, t2) = one, other
     left = (-turn, slope), (1.0, t1), (1.0, t2)
-    return (n, left), (((g, n), (p, n1), (q, n2), *left), n)
+    return ((g, n), (p, n1), (q, n2), *left), left
 
 
 @kernel(forceinline=True)
 def _pair_of(n, g, a, b, side, p_ab, p_ba):  # type: ignore[no-untyped-def]
-    """The block of corners b and a, with the side between them; p are those beyond their opposite sides."""
+    """R and L of corners a and b, with the side between them; p are those beyond their opposite sides."""
     ca, la, oa, slope_a, na = a
     cb, lb, ob, slope_b, nb = b
     pa, pb, nm, t = side
     right = (g, n), (0.5 * cb * pb, nm), (-la * p_ab, na), (-ob, slope_a), (-1.0, t)
     left = (0.5 * ca * pa, nm), (-lb * p_ba, nb), (-oa, slope_b), (-1.0, t)
-    return (right, n), (n, left)
+    return right, left
 
 
 @kernel()
@@ -145,35 +142,35 @@ def add_within(x, corners, hinges, sides, shape, factors, offsets, values):  # t
     """
     for t in range(corners.shape[0]):
         fetch_ahead(t, offsets, values, 6)
-        if offsets[t, 0] < 0 or shape[t, 6] == 0.0:  # others have all rows, or nothing is left
+        if shape[t, 6] == 0.0:
             continue
         x0, x1, x2 = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
         e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
         n = shape[t, 0], shape[t, 1], shape[t, 2]
         c0, c1, c2 = shape[t, 3], shape[t, 4], shape[t, 5]
         inverse = 1.0 / shape[t, 6]
-        l0, l1, l2 = abs(inverse) * dot(e0, e0), abs(inverse) * dot(e1, e1), abs(inverse) * dot(e2, e2)
+        l0, l1, l2 = inverse * dot(e0, e0), inverse * dot(e1, e1), inverse * dot(e2, e2)
         m = scaled(inverse, n)
         b0, b1, b2 = cross(m, e0), cross(m, e1), cross(m, e2)  # gradients of the barycentric coordinates
         w0, z0, p01, p02, n0 = _beyond(hinges[t, 0], sides, shape, factors)
-        w1, z1, p10, p12, n1 = _beyond(hinges[t, 1], sides, shape, factors)
+        w1, z1, p12, p10, n1 = _beyond(hinges[t, 1], sides, shape, factors)
         w2, z2, p20, p21, n2 = _beyond(hinges[t, 2], sides, shape, factors)
         t0, t1, t2 = scaled(0.5 * z0 / l0, b0), scaled(0.5 * z1 / l1, b1), scaled(0.5 * z2 / l2, b2)
         one = c0, l0, z1 * c2 + z2 * c1 - z0 * l0, b0, n0
         two = c1, l1, z0 * c2 + z2 * c0 - z1 * l1, b1, n1
         three = c2, l2, z0 * c1 + z1 * c0 - z2 * l2, b2, n2
         g00 = w0 * l0 * l0 + w1 * c2 * c2 + w2 * c1 * c1
-        g10 = w2 * c0 * c1 - w0 * l0 * c2 - w1 * l1 * c2
-        g20 = w1 * c0 * c2 - w0 * l0 * c1 - w2 * l2 * c1
+        g01 = w2 * c0 * c1 - w0 * l0 * c2 - w1 * l1 * c2
+        g02 = w1 * c0 * c2 - w0 * l0 * c1 - w2 * l2 * c1
         g11 = w0 * c2 * c2 + w1 * l1 * l1 + w2 * c0 * c0
-        g21 = w0 * c1 * c2 - w1 * l1 * c0 - w2 * l2 * c0
+        g12 = w0 * c1 * c2 - w1 * l1 * c0 - w2 * l2 * c0
         g22 = w0 * c1 * c1 + w1 * c0 * c0 + w2 * l2 * l2
         blocks = (
             _own(n, g00, one, (c2 * p10, n1, t1), (c1 * p20, n2, t2)),
-            _pair_of(n, g10, one, two, (p20, p21, n2, t2), p01, p10),
-            _pair_of(n, g20, one, three, (p10, p12, n1, t1), p02, p20),
+            _pair_of(n, g01, one, two, (p20, p21, n2, t2), p01, p10),
+            _pair_of(n, g02, one, three, (p10, p12, n1, t1), p02, p20),
             _own(n, g11, two, (c2 * p01, n0, t0), (c0 * p21, n2, t2)),
-            _pair_of(n, g21, two, three, (p01, p02, n0, t0), p12, p21),
+            _pair_of(n, g12, two, three, (p01, p02, n0, t0), p12, p21),
             _own(n, g22, three, (c1 * p02, n0, t0), (c0 * p12, n1, t1)),
         )
-        add_six(values, offsets, t, blocks)
+        add_six(values, offsets, t, n, blocks)

@@ -10,11 +10,11 @@ from lyra_petsc.terms.kernel import kernel
 
 
 @kernel()
-def triangles(x, corners, turned, limit, out):  # type: ignore[no-untyped-def]
+def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
     """Of triangles with limits of |normal|² (T,) what their hinges' derivatives are made of, into out (T, 7).
 
-    Unit normal, cotangents of the corners' angles, ± |normal| [m²], twice the area, negative where the
-    corners are ``turned``. Zeros for those that have no area left, or so little that their hinges fade.
+    Unit normal, cotangents of the corners' angles, |normal| [m²], which is twice the area. Zeros for those
+    that have no area left, or so little that their hinges fade.
     """
     for t in range(corners.shape[0]):
         a, b, c = point(x, corners[t, 0]), point(x, corners[t, 1]), point(x, corners[t, 2])
@@ -26,12 +26,11 @@ def triangles(x, corners, turned, limit, out):  # type: ignore[no-untyped-def]
             continue
         size = math.sqrt(square)
         inverse = 1.0 / size
-        sign = turned[t] * inverse
-        out[t, 0], out[t, 1], out[t, 2] = sign * m[0], sign * m[1], sign * m[2]
+        out[t, 0], out[t, 1], out[t, 2] = inverse * m[0], inverse * m[1], inverse * m[2]
         out[t, 3] = -inverse * dot(e1, e2)
         out[t, 4] = -inverse * dot(e2, e0)
         out[t, 5] = -inverse * dot(e0, e1)
-        out[t, 6] = turned[t] * size
+        out[t, 6] = size
 
 
 @kernel()

@@ -168,13 +168,13 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, law, out):  # type: ignor
 def add_hessians(x, y, s, blend, inverse, area, c, law, weight, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the blocks of ``hessians`` to the block rows, where ``offsets`` say.
 
-    Corners s (E, 3) ascend. A translation does nothing, so that three blocks are enough.
+    A translation does nothing, so that three blocks are enough.
     """
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values, 6)
         f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c, law[e])
         one, geometric1 = _factors(stress, stiff, g[1], g[1])
-        two, geometric2 = _factors(stress, stiff, g[2], g[1])
+        two, geometric2 = _factors(stress, stiff, g[1], g[2])
         three, geometric3 = _factors(stress, stiff, g[2], g[2])
         sides = (f[0], f[1], f[2]), (f[3], f[4], f[5])
         add_triangle(values, offsets, e, (geometric1, geometric2, geometric3), sides, (one, two, three))
@@ -195,8 +195,8 @@ class Membrane(Elastic):
     Parameters
     ----------
     elements : Elements
-        Stencil (E, 3), whose corners are put into ascending order; data ``inverse`` (E, 2, 2) inverse rest
-        matrix [1/m], ``area`` (E,) [m²], ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
+        Stencil (E, 3); data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
+        ``stiffness`` (E, 4) c11, c12, c22, c33 [N/m], ``damping`` (E,) [s].
 
     Attributes
     ----------
@@ -208,8 +208,8 @@ class Membrane(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         self.laws = _distinct(elements.data["stiffness"])
-        super().__init__(elements := _ascending(elements))
-        data = elements.data
+        data = {name: values for name, values in elements.data.items() if name != "stiffness"}
+        super().__init__(replace(elements, data=data))
         self._before: Array | None = None
         self._inverse, self._area = data["inverse"], data["area"]
 
@@ -256,19 +256,6 @@ def _distinct(stiffness: Array) -> tuple[Array, NDArray[np.int32]]:
         return stiffness[:1].copy(), np.zeros(len(stiffness), dtype=np.int32)
     laws, law = np.unique(stiffness, axis=0, return_inverse=True)
     return laws, law.astype(np.int32)
-
-
-def _ascending(elements: Elements) -> Elements:
-    """The triangles with ascending corners, their rest matrices to it, and without their laws."""
-    order = np.argsort(elements.stencil, axis=1, kind="stable")
-    last_two = elements.data["inverse"]
-    slopes = np.concatenate([-last_two.sum(axis=1, keepdims=True), last_two], axis=1)
-    inverse = np.take_along_axis(slopes, order[:, 1:, None], axis=1)
-    stencil = elements.stencil.copy()
-    stencil.sort(axis=1)
-    data = {**elements.data, "inverse": inverse}
-    del data["stiffness"]
-    return replace(elements, stencil=stencil, data=data)
 
 
 def elements(rest: RestShape) -> Elements:

@@ -25,8 +25,8 @@ def add_sums(values: Any, at: Any, left: Any, right: Any) -> None:
 
 
 @njit
-def add_all(values: Any, offsets: Any, e: Any, six: Any) -> None:
-    add_six(values, offsets, e, six)
+def add_all(values: Any, offsets: Any, e: Any, n: Any, six: Any) -> None:
+    add_six(values, offsets, e, n, six)
 
 
 @njit
@@ -69,42 +69,45 @@ def test_vectors_may_be_sums(odd: int) -> None:
     np.testing.assert_allclose(values[0], block.T if odd else block, atol=1e-14)
 
 
-PLACES = [[0, 3, 5, 6, 9, 10], [2, -1, 4, -1, 8, -1], [-1, -1, -1, -1, -1, -1]]
-"""Of (0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2): all ours, some, none. The lowest bit says nothing."""
+PLACES = [[0, 3, 4, 6, 9, 10], [2, 5, -1, -1, -1, -1], [-1, 4, 7, 0, -1, 2], [-1] * 6]
+"""Of couplings (0, 0), (0, 1), …, (2, 2): all ours, those of a point or two, none."""
 
 
 def sums_at(places: list[int], blocks: np.ndarray) -> np.ndarray:
-    """Zeros (6, 3, 3) to which the blocks are added."""
+    """Zeros (6, 3, 3) to which the blocks are added, transposed at odd places."""
     out = np.zeros((6, 3, 3))
     for place, block in zip(places, blocks, strict=True):
         if place >= 0:
-            out[place // 2] += block
+            out[place // 2] += block.T if place % 2 else block
     return out
 
 
 @pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
 def test_six_blocks_of_a_triangle(places: list[int], kind: type) -> None:
-    six = tuple((vectors(2), vectors(2)) for _ in range(6))
-    blocks = np.array([np.array(left).T @ np.array(right) for left, right in six])
+    (n,), six = vectors(1), tuple(vectors(2) for _ in range(6))
+    blocks = np.array([np.outer(n, right) + np.outer(left, n) for right, left in six])
     values = np.zeros((6, 3, 3))
-    add_all(values, np.array([PLACES[0], places], dtype=kind), 1, six)
+    add_all(values, np.array([PLACES[0], places], dtype=kind), 1, n, six)
     np.testing.assert_allclose(values, sums_at(places, blocks), atol=1e-14)
 
 
 @pytest.mark.parametrize("places", PLACES)
-def test_three_blocks_of_a_triangle_make_the_others(places: list[int]) -> None:
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_three_blocks_of_a_triangle_make_the_others(places: list[int], kind: type) -> None:
     f, diagonals = vectors(2), tuple(float(number) for number in RNG.normal(size=3))
-    factors = tuple(tuple(float(number) for number in row) for row in RNG.normal(size=(3, 4)))
+    rows = RNG.normal(size=(3, 4))
+    rows[::2, 2] = rows[::2, 1]  # (1, 1) and (2, 2) are symmetric
+    factors = tuple(tuple(float(number) for number in row) for row in rows)
     u, v = np.array(f)
     outers = np.array([np.outer(u, u), np.outer(u, v), np.outer(v, u), np.outer(v, v)])
-    b11, b21, b22 = (
+    b11, b12, b22 = (
         own * np.eye(3) + np.tensordot(row, outers, 1) for own, row in zip(diagonals, factors, strict=True)
     )
-    b10, b20 = -(b11 + b21.T), -(b21 + b22)
+    b01, b02 = -(b11 + b12.T), -(b12 + b22)
     values = np.zeros((6, 3, 3))
-    add_balanced(values, np.array([places], dtype=np.int32), 0, diagonals, f, factors)
-    expected = sums_at(places, np.array([-(b10 + b20), b10, b20, b11, b21, b22]))
+    add_balanced(values, np.array([places], dtype=kind), 0, diagonals, f, factors)
+    expected = sums_at(places, np.array([-(b01 + b02), b01, b02, b11, b12, b22]))
     np.testing.assert_allclose(values, expected, atol=1e-13)
 
 

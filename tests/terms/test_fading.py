@@ -47,6 +47,7 @@ def bending(part_of_limit: float = 1.0) -> Bending:
         "rest_angle": np.array([-0.4]),
         "limit": part_of_limit * fading_limit(REST_AREAS)[None],
         "rest_height": np.array([1.0]),
+        "places": np.array([[2.0, 2.0]]),
     }
     return Bending(Elements(np.array([[0, 1, 2, 3]]), data))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -43,15 +41,26 @@ def turned(triangles: Ints) -> Ints:
     return out
 
 
+def hinges_of(triangles: Ints) -> tuple[Ints, Ints]:
+    """Hinges (E, 4) and the places (E, 2) of their opposite vertices."""
+    vertices, faces = hinges(triangles)
+    places = [np.argmax(triangles[faces[:, i]] == vertices[:, 2 + i, None], axis=1) for i in (0, 1)]
+    return vertices, np.stack(places, axis=1)
+
+
+def given(rows: list[list[int]], places: list[list[int]]) -> tuple[Ints, Ints]:
+    return np.array(rows, dtype=np.int64).reshape(-1, 4), np.array(places, dtype=np.int64).reshape(-1, 2)
+
+
 SHEETS = {
-    "octahedron": hinges(octahedron()).vertices,
-    "band": hinges(strip(7, twisted=False)).vertices,
-    "Möbius band": hinges(strip(7, twisted=True)).vertices,
-    "turned triangles": hinges(turned(strip(7, twisted=False))).vertices,
-    "one hinge": np.array([[3, 1, 0, 2]]),
-    "the same hinge twice": np.array([[3, 1, 0, 2], [3, 1, 0, 2], [1, 3, 2, 0]]),
-    "three triangles on an edge": np.array([[0, 1, 2, 3], [0, 1, 2, 4], [1, 0, 3, 4]]),
-    "none": np.empty((0, 4), dtype=np.int64),
+    "octahedron": hinges_of(octahedron()),
+    "band": hinges_of(strip(7, twisted=False)),
+    "Möbius band": hinges_of(strip(7, twisted=True)),
+    "turned triangles": hinges_of(turned(strip(7, twisted=False))),
+    "one hinge": given([[3, 1, 0, 2]], [[2, 0]]),
+    "the same hinge twice": given([[3, 1, 0, 2], [3, 1, 0, 2], [1, 3, 2, 0]], [[2, 1], [2, 1], [1, 2]]),
+    "three triangles on an edge": given([[0, 1, 2, 3], [0, 1, 2, 4], [1, 0, 3, 4]], [[2, 2], [2, 0], [2, 0]]),
+    "none": given([], []),
 }
 every_sheet = pytest.mark.parametrize("name", SHEETS)
 
@@ -60,7 +69,8 @@ def shape(n: int) -> Array:
     return np.random.default_rng(n).uniform(-1.0, 1.0, (n, 3))
 
 
-def bending(stencil: NDArray[Any], limit: float = 0.0) -> Bending:
+def bending(name: str, limit: float = 0.0) -> Bending:
+    stencil, places = SHEETS[name]
     n = len(stencil)
     rng = np.random.default_rng(3)
     data = {
@@ -68,52 +78,67 @@ def bending(stencil: NDArray[Any], limit: float = 0.0) -> Bending:
         "rest_angle": rng.uniform(-0.5, 0.5, n),
         "limit": np.full((n, 2), limit),
         "rest_height": np.ones(n),
+        "places": places.astype(np.float64),
         "damping": np.zeros(n),
     }
     return Bending(Elements(stencil.astype(np.int32), data))
 
 
-def alone(stencil: NDArray[Any], limit: float = 0.0) -> list[Bending]:
+def alone(name: str, limit: float = 0.0) -> list[Bending]:
     """A term for each hinge of ``bending``."""
-    whole = bending(stencil, limit)
+    (stencil, places), data = SHEETS[name], bending(name, limit).elements.data
     made = []
     for row, points in enumerate(stencil):
-        data = {key: values[row : row + 1] for key, values in whole.elements.data.items()}
-        made.append(
-            Bending(Elements(points[None].astype(np.int32), data | {"limit": np.full((1, 2), limit)}))
-        )
+        own = {key: values[row : row + 1] for key, values in data.items()}
+        own |= {"limit": np.full((1, 2), limit), "places": places[row : row + 1].astype(np.float64)}
+        made.append(Bending(Elements(points[None].astype(np.int32), own)))
     return made
 
 
 @every_sheet
 def test_sides_and_hinges_name_each_other(name: str) -> None:
-    stencil = SHEETS[name].astype(np.int32)
-    corners, _, sides, found = triangles_of(stencil)
-    assert (np.diff(corners, axis=1) > 0).all()
+    stencil, places = SHEETS[name]
+    corners, sides, found = triangles_of(stencil.astype(np.int32), places)
     n = len(stencil)
     assert sides.shape == (n + 1, 2)
     assert found.shape == corners.shape
     for hinge, (a, b, c, d) in enumerate(stencil):
         for second, points in enumerate(((a, b, c), (a, b, d))):
             triangle, corner = divmod(sides[hinge, second], 4)
-            assert corners[triangle].tolist() == sorted(points)
-            assert corners[triangle, corner] == points[2]
+            assert corner == places[hinge, second]
+            around = corners[triangle, [(corner + 1) % 3, (corner + 2) % 3, corner]].tolist()
+            assert around == [points[second], points[1 - second], points[2]]
             assert found[triangle, corner] == 2 * hinge + second
     assert np.count_nonzero(found < 2 * n) == 2 * n
 
 
+def count(name: str) -> int:
+    stencil, places = SHEETS[name]
+    return len(triangles_of(stencil.astype(np.int32), places).corners)
+
+
 def test_triangles_are_found_once_where_they_agree_about_the_upper_side() -> None:
-    assert len(triangles_of(SHEETS["octahedron"].astype(np.int32)).corners) == 8
-    assert len(triangles_of(SHEETS["band"].astype(np.int32)).corners) == 14
-    assert len(triangles_of(SHEETS["Möbius band"].astype(np.int32)).corners) > 14
+    assert count("octahedron") == 8
+    assert count("band") == 14
+    assert count("Möbius band") > 14
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_triangles_are_those_of_the_mesh_whatever_their_points_are_called(seed: int) -> None:
+    names = np.random.default_rng(seed).permutation(14)
+    mesh = strip(7, twisted=False)
+    stencil, places = hinges_of(mesh)
+    corners, _, _ = triangles_of(names[stencil].astype(np.int32), places)
+    # the same corners in the same order, and in the order in which ranks have their elements
+    assert sorted(corners.tolist()) == sorted(names[mesh].tolist())
+    assert np.sort(corners, axis=1).tolist() == sorted(np.sort(corners, axis=1).tolist())
 
 
 @every_sheet
 @pytest.mark.parametrize("limit", [0.0, 0.3, 10.0])  # none fades, some do, all do
 def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> None:
-    stencil = SHEETS[name]
-    term, x = bending(stencil, limit), shape(14)
-    singly = alone(stencil, limit)
+    term, x = bending(name, limit), shape(14)
+    singly = alone(name, limit)
     np.testing.assert_allclose(
         term.energies(x), [one.energies(x)[0] for one in singly], rtol=1e-12, atol=1e-15
     )
@@ -125,9 +150,9 @@ def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> No
 
 
 def test_some_hinges_fade() -> None:
-    weights = bending(SHEETS["band"], 0.3).weights(shape(14))
+    weights = bending("band", 0.3).weights(shape(14))
     assert 0.0 <= weights.min() < 1.0 == weights.max()
-    assert bending(SHEETS["band"], 10.0).weights(shape(14)).max() < 1.0
+    assert bending("band", 10.0).weights(shape(14)).max() < 1.0
 
 
 @every_sheet
@@ -137,7 +162,7 @@ def test_some_hinges_fade() -> None:
 def test_block_rows_are_those_of_the_element_hessians(
     name: str, limit: float, blend: float, n_owned: int
 ) -> None:
-    term, x = bending(SHEETS[name], limit), shape(14)
+    term, x = bending(name, limit), shape(14)
     blocks = BlockRows(BlockPattern(term.couplings, n_owned, 14))
     found, expected = blocks.zeros(), blocks.zeros()
     weight = 1.0 + np.arange(term.n_elements)
@@ -155,8 +180,8 @@ def test_block_rows_are_those_of_the_element_hessians(
 
 def test_points_without_a_place_do_no_harm() -> None:
     """Two points in one place: an edge without a length, triangles without an area."""
-    stencil = SHEETS["band"]
-    term, x = bending(stencil), shape(14)
+    stencil, _ = SHEETS["band"]
+    term, x = bending("band", 1e-12), shape(14)
     x[stencil[0, 1]] = x[stencil[0, 0]]
     blocks = BlockRows(BlockPattern(term.couplings, 14, 14))
     gradient, values = np.zeros_like(x), blocks.zeros()
