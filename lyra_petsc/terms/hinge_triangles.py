@@ -43,7 +43,7 @@ def triangles_of(stencil: Ints32, places: NDArray[np.int64]) -> HingeTriangles:
     n_points = int(stencil.max(initial=0)) + 1
     # by their points as elements are ordered, then by what runs around the same points in the same way
     sense = 3 * np.argmax(corners == low[:, None], axis=1) + np.argmax(corners == middle[:, None], axis=1)
-    by = np.lexsort((opposite, sense, high, low * np.int64(n_points) + middle))
+    by = np.lexsort((opposite, sense, high, low.astype(np.int64) * n_points + middle))
     same = (corners[by[1:]] == corners[by[:-1]]).all(axis=1)
     again = same & (opposite[by[1:]] == opposite[by[:-1]])  # two hinges on one side have a triangle each
     first = np.concatenate([np.ones(min(2 * n, 1), dtype=bool), ~same | again])
