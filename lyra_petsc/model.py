@@ -231,8 +231,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     data = part.vertex_data
     system.x[: points.n_owned] = data["position"]
     points.update_ghosts(system.x)
-    membrane = terms["membrane"]
-    surface = Surface(system.x.copy(), membrane.stencil, membrane.n_owned)
+    surface = Surface(system.x.copy(), terms["membrane"].stencil)
     # handles set out from the undisturbed shape
     system.begin(0.0)
     system.x[: points.n_owned] = data.get("start", data["position"])

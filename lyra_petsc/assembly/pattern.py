@@ -5,8 +5,10 @@ The matrices are symmetric: of two blocks that are each other's transpose one is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -48,8 +50,8 @@ class BlockPattern:
         keys = diagonal_keys(n_owned, n_local)
         for stencil in stencils.values():
             # one after the other: all couplings at once take much memory
-            for a in sorted({a for a, _ in couplings(stencil)}):
-                keys = union(keys, *_row_keys(stencil, a, n_owned, n_local))
+            for _, pairs in groupby(couplings(stencil), key=itemgetter(0)):
+                keys = union(keys, *_row_keys(stencil, pairs, n_owned, n_local))
         self._set(keys, n_owned, n_local)
         self.offsets: dict[str, Offsets] = {}
         for name, stencil in stencils.items():
@@ -118,9 +120,11 @@ def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Int
     return key
 
 
-def _row_keys(stencil: NDArray[np.int32], a: int, n_owned: int, n_local: int) -> Iterator[Ints]:
-    """Keys row · n_local + column of the couplings of each element's vertices a and b ≥ a."""
-    for b in (b for one, b in couplings(stencil) if one == a):
+def _row_keys(
+    stencil: NDArray[np.int32], pairs: Iterable[tuple[int, int]], n_owned: int, n_local: int
+) -> Iterator[Ints]:
+    """Keys row · n_local + column of the couplings of each element's vertices (a, b)."""
+    for a, b in pairs:
         keys = _keys(stencil[:, a], stencil[:, b], n_local)
         yield keys[keys < n_owned * n_local]
 

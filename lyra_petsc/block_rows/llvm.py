@@ -176,9 +176,6 @@ class Code:
         )
         return self.pick(one, one, 0, 0, 0, 0)
 
-    def select(self, lanes: Value, one: Value, other: Value) -> Value:
-        return self.builder.select(lanes, one, other)
-
     def add_six(self, offsets: list[Value], blocks: list[list[Value]]) -> None:
         """Add the rows of six blocks of an element as they are, where offsets say."""
         builder, begin = self.builder, self.begin("blocks")

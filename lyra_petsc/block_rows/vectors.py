@@ -62,7 +62,7 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = Code(context, builder, signature, arguments, "blocks columns out lo hi factors")
         block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("out")
-        row = code.filled(cgutils.unpack_tuple(builder, code.given["factors"]))  # type: ignore[no-untyped-call]
+        row = code.filled(code.numbers("factors"))
         with code.loop() as (k, _):
             a, b, c = (code.times(column, row) for column in code.columns(code.at(block_rows, k, 9)))
             # the sums of a, b and c, whose fourth numbers mean nothing
@@ -87,10 +87,10 @@ def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, righ
         code = Code(context, builder, signature, arguments, "blocks at diagonal left right")
         at, begin = code.integer("at"), code.begin("blocks")
         lefts, rights = code.vectors("left"), code.vectors("right")
-        with builder.if_then(builder.icmp_signed(">=", at, INDEX(0)), likely=True):
+        with builder.if_then(code.is_ours(at), likely=True):
             rows = code.outer(code.given["diagonal"], lefts, rights)
             plain, turned = code.packed(rows), code.packed_columns(rows)
-            odd = builder.trunc(at, ir.IntType(1))
+            odd = code.is_odd(at)
             chosen = [builder.select(odd, there, here) for there, here in zip(turned, plain, strict=True)]
             code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), chosen, rows[2])
         return context.get_dummy_value()
@@ -110,7 +110,7 @@ def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -
         offsets, blocks = code.six_offsets(), []
         for offset, (right, left) in zip(offsets, code.pairs("six"), strict=True):
             odd = code.is_odd(offset)  # transposed: n Lᵀ + R nᵀ
-            right, left = code.select(odd, left, right), code.select(odd, right, left)
+            right, left = builder.select(odd, left, right), builder.select(odd, right, left)
             blocks.append(code.outer(nothing, [n, left], [right, n]))
         code.add_six(offsets, blocks)
         return context.get_dummy_value()
@@ -140,7 +140,7 @@ def _add_triangle(
 
         def stored(offset: Any, plain: Any, transposed: Any) -> Any:
             odd = code.is_odd(offset)
-            return [code.select(odd, there, here) for there, here in zip(transposed, plain, strict=True)]
+            return [builder.select(odd, there, here) for there, here in zip(transposed, plain, strict=True)]
 
         blocks = [code.minus_sum(b01, b02), stored(offsets[1], b01, b10), stored(offsets[2], b02, b20)]
         blocks += [b11, stored(offsets[4], b12, b21), b22]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,3 +35,7 @@ class Elements:
         if self.n_owned < 0:
             self.n_owned = len(self.stencil)
             self.index = np.arange(len(self.stencil), dtype=np.int64)
+
+    def without(self, *names: str) -> Elements:
+        """The same elements without these constants, which their term keeps in a form of its own."""
+        return replace(self, data={key: self.data[key] for key in self.data if key not in names})

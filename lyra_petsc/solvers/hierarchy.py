@@ -33,13 +33,10 @@ class Surface:
         Positions [m] that interpolation follows.
     triangles : (F, 3)
         Local numbering.
-    n_counted : int
-        The first of them, which no other rank counts.
     """
 
     x: Array
     triangles: NDArray[np.int32]
-    n_counted: int
 
 
 @dataclass(frozen=True)
@@ -135,7 +132,8 @@ class Hierarchy:
 def _interpolations(points: Points, surface: Surface, most: int) -> list[InterpolationRows]:
     """This rank's rows of all of them, finest first."""
     comm, n = points.comm, points.n_owned
-    mine = surface.x[:n], points.global_number[surface.triangles[: surface.n_counted]]
+    first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
+    mine = surface.x[:n], points.global_number[surface.triangles[first_owned]]
     parts = comm.gather(mine)
     shares: list[list[InterpolationRows]] = []
     if parts is not None:

@@ -18,7 +18,7 @@ from lyra_petsc.study.reference import Physics
 from lyra_petsc.study.work import Known
 
 PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
-"""Phases of a run; ``output`` is the bookkeeping of energies, the writing of files is not timed."""
+"""Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
 
 
 def columns(plan: Plan) -> list[str]:

@@ -12,7 +12,6 @@ Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy`
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -77,14 +76,13 @@ class Bending(Elastic):
     name = "bending"
 
     def __init__(self, elements: Elements) -> None:
-        data = dict(elements.data)
-        limit, places = data.pop("limit"), data.pop("places")
-        super().__init__(replace(elements, data=data))
+        data = elements.data
+        super().__init__(elements.without("limit", "places"))
         self._k, self._rest = data["k"], data["rest_angle"]
-        self._triangles = triangles_of(self.stencil, places.astype(np.int64))
+        self._triangles = triangles_of(self.stencil, data["places"].astype(np.int64))
         # those of a triangle are the same in all of its hinges
         self._limit = np.empty(len(self._triangles.corners))
-        self._limit[self._triangles.sides[:-1] >> 2] = limit
+        self._limit[self._triangles.sides[:-1] >> 2] = data["limit"]
         # energy, gradient and Hessian are asked for at one place after the other
         self._bent = Remembered(self._bend)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from lyra_petsc.terms.hinge import angle_parts, point
 from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_hessian, hinge_weight
+from lyra_petsc.terms.hinge_shape import fades
 from lyra_petsc.terms.kernel import kernel
 
 
@@ -34,7 +35,7 @@ def energies(x, s, sides, shape, limit, theta, k, rest, out):  # type: ignore[no
     for h in range(out.shape[0]):
         change = theta[h] - rest[h]
         out[h] = k[h] * change * change
-        if shape[sides[h, 0] >> 2, 6] * shape[sides[h, 1] >> 2, 6] == 0.0:
+        if fades(shape, sides, h):
             x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
             _, _, square1, square2 = angle_parts(x0, x1, x2, x3)
             out[h] = hinge_energy(theta[h], square1, square2, k[h], rest[h], limits_of(limit, sides, h))
@@ -49,8 +50,9 @@ def pulls(x, s, sides, shape, limit, theta, length, k, rest, pull, out):  # type
     g = np.empty((4, 3))
     pull[-1] = 0.0
     for h in range(s.shape[0]):
-        pull[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
-        if shape[sides[h, 0] >> 2, 6] * shape[sides[h, 1] >> 2, 6] == 0.0:
+        if not fades(shape, sides, h):
+            pull[h] = 2.0 * k[h] * (theta[h] - rest[h]) / length[h]
+        else:
             pull[h] = 0.0
             x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
             limits = limits_of(limit, sides, h)

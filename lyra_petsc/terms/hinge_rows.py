@@ -19,6 +19,7 @@ from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.hinge_forces import limits_of
+from lyra_petsc.terms.hinge_shape import fades
 from lyra_petsc.terms.kernel import kernel
 
 
@@ -87,17 +88,17 @@ def add_across(  # type: ignore[no-untyped-def]
     factors[-1, 0] = factors[-1, 1] = 0.0
     for h in range(s.shape[0]):
         fetch(values, across[min(h + AHEAD, s.shape[0] - 1)] >> 1)
-        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
-        areas = shape[one, 6] * shape[two, 6]
-        if areas == 0.0:
+        if fades(shape, sides, h):
             factors[h, 0] = factors[h, 1] = 0.0
             hinge_offsets(h, s, sides, within, across, offsets)
             limits = limits_of(limit, sides, h)
             _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values)
             continue
+        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
         square = length[h] * length[h]
         stiffness = 2.0 * k[h] * weight[h] / square
         factors[h, 0], factors[h, 1] = stiffness, (1.0 - blend) * stiffness * (theta[h] - rest[h]) * length[h]
+        areas = shape[one, 6] * shape[two, 6]
         left = scaled(stiffness * square * square / areas, (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]
         add_outer(values, across[h], 0.0, (left,), (right,))

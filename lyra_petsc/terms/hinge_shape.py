@@ -33,6 +33,13 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
         out[t, 6] = size
 
 
+@kernel(inline="always")
+def fades(shape, sides, h):  # type: ignore[no-untyped-def]
+    """Whether one of a hinge's triangles has hardly an area left, or none."""
+    # no ``or``: a jump would have numba count references to the arrays here, for each hinge
+    return (shape[sides[h, 0] >> 2, 6] == 0.0) | (shape[sides[h, 1] >> 2, 6] == 0.0)
+
+
 @kernel()
 def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-untyped-def]
     """Of hinges' dihedral angles, up to a factor, and lengths [m] of the edges, into (E,) each."""
@@ -40,10 +47,10 @@ def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-un
         x0, x1 = point(x, s[h, 0]), point(x, s[h, 1])
         e = minus(x1, x0)
         length[h] = math.sqrt(dot(e, e))
-        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
-        if shape[one, 6] * shape[two, 6] == 0.0:
+        if fades(shape, sides, h):
             sine[h], cosine[h], _, _ = hinge.angle_parts(x0, x1, point(x, s[h, 2]), point(x, s[h, 3]))
             continue
+        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
         n1 = shape[one, 0], shape[one, 1], shape[one, 2]
         n2 = shape[two, 0], shape[two, 1], shape[two, 2]
         sine[h], cosine[h] = dot(cross(n1, n2), e) / length[h], dot(n1, n2)

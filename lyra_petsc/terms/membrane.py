@@ -11,7 +11,6 @@ stress in the Hessian: Magisano, Leonetti & Garcea, Comput. Meth. Appl. Mech. En
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,9 +206,9 @@ class Membrane(Elastic):
     name = "membrane"
 
     def __init__(self, elements: Elements) -> None:
-        self.laws = _distinct(elements.data["stiffness"])
-        data = {name: values for name, values in elements.data.items() if name != "stiffness"}
-        super().__init__(replace(elements, data=data))
+        data = elements.data
+        super().__init__(elements.without("stiffness"))
+        self.laws = _distinct(data["stiffness"])
         self._before: Array | None = None
         self._inverse, self._area = data["inverse"], data["area"]
 

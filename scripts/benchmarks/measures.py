@@ -55,31 +55,19 @@ def row(
     vertices: int, method: str, ranks: int, petsc: Sequence[str], limits: Limits, **changes: float
 ) -> Result:
     """Set-up, steps and memory of the hanging square; ``changes`` as `hanging_square` takes them."""
-    found = measure(
-        "steps",
-        ranks,
-        petsc,
-        limits.process,
-        scene=hanging_square(vertices, method, **changes),
-        warm_up=WARM_UP,
-        steps=limits.steps,
-        seconds=limits.seconds,
-    )
-    return found | {"who": method}
+    scene = hanging_square(vertices, method, **changes)
+    return _steps("steps", scene, ranks, petsc, limits) | {"who": method}
 
 
 def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
     """Steps of sheets of a rank's share of the vertices, one on each rank at the same time."""
-    return measure(
-        "apart",
-        ranks,
-        petsc,
-        limits.process,
-        scene=hanging_square(vertices // ranks),
-        warm_up=WARM_UP,
-        steps=limits.steps,
-        seconds=limits.seconds,
-    ) | {"whole_vertices": square_number(vertices)}
+    found = _steps("apart", hanging_square(vertices // ranks), ranks, petsc, limits)
+    return found | {"whole_vertices": square_number(vertices)}
+
+
+def _steps(kind: str, scene: dict[str, Any], ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
+    few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": limits.seconds}
+    return measure(kind, ranks, petsc, limits.process, scene=scene, **few)
 
 
 def first_method(rows: Sequence[Result]) -> list[Result]:

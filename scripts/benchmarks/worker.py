@@ -161,7 +161,7 @@ def apart(comm: Comm, job: Result) -> Result:
     own = steps(MPI.COMM_SELF, job)
     gathered = comm.gather([row["seconds"] for row in own["steps"]])
     seconds = [each for of_rank in gathered or [] for each in of_rank]
-    return {"vertices": own["vertices"], "preset": own["preset"], "step_seconds": seconds}
+    return {"vertices": own["vertices"], "step_seconds": seconds}
 
 
 def overhead(comm: Comm, job: Result) -> Result:

@@ -105,6 +105,14 @@ def test_rows_times_columns_pass_32_bits() -> None:
     assert pattern.columns[pattern.offsets["pair"] // 2].tolist() == [n - 1, n - 1]
 
 
+def test_the_same_elements_have_one_table_of_offsets() -> None:
+    stencil = random_stencil(np.random.default_rng(4), 6, 3)
+    stencils = {"one": stencil, "alike": stencil.copy(), "other": stencil[::-1]}
+    offsets = BlockPattern(stencils, N_OWNED, N_LOCAL).offsets
+    assert offsets["alike"] is offsets["one"]
+    np.testing.assert_array_equal(offsets["other"], offsets["one"][::-1])
+
+
 def test_no_elements_leave_the_diagonal() -> None:
     pattern = BlockPattern({"none": np.empty((0, 3), np.int32)}, 2, 3)
     assert pattern.columns.tolist() == [0, 1]
