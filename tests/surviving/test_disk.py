@@ -15,14 +15,26 @@ LIMITED = """
 import resource, sys
 import lyra_petsc.recorder as recorder
 from lyra_petsc.cli.app import run_command_line
+from lyra_petsc.output.history import History
 
-begin = recorder.Recorder.begin
+def limit(size):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
-def begin_and_limit(self, folder):
-    begin(self, folder)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+def limit_states(recorder, folder):
+    begin(recorder, folder)
+    limit(20_000)
 
-recorder.Recorder.begin = begin_and_limit
+def limit_rows(history, values):
+    size = history.path.stat().st_size
+    if size > 68_000 and history.path.name == "history.csv":
+        limit(size + 50)
+    append(history, values)
+
+begin, append = recorder.Recorder.begin, History.append
+if {in_a_row}:
+    History.append = limit_rows
+else:
+    recorder.Recorder.begin = limit_states
 sys.exit(run_command_line(sys.argv))
 """
 
@@ -80,16 +92,16 @@ def test_a_disk_full_from_the_start(tmp_path: Path, small_disk: Path) -> None:
     assert announced(small_disk / "out") == [0.0, 0.02]
 
 
-@pytest.mark.parametrize("limit", [20_000, 68_500])
-def test_a_limit_on_the_size_of_files(tmp_path: Path, limit: int) -> None:
-    """The smaller one meets a state, the larger one the history in the middle of a row."""
+@pytest.mark.parametrize("in_a_row", [False, True])
+def test_a_limit_on_the_size_of_files(tmp_path: Path, in_a_row: bool) -> None:
+    """It meets a state, or the history in the middle of a row."""
     program = tmp_path / "limited.py"
-    program.write_text(LIMITED.format(limit=limit))
+    program.write_text(LIMITED.format(in_a_row=in_a_row))
     scene = write_scene(tmp_path, ENDLESS)
-    every = ["--set", "output.every=0.5"] if limit > 60_000 else []
+    every = ["--set", "output.every=0.5"] if in_a_row else []
     left = lyra(["run", scene, "--out", "out", *every, *DIRECT], tmp_path, program=(str(program),))
     refused(left, "cannot be written: File too large")
-    if every:
+    if in_a_row:
         assert "history.csv" in left.ours[0]
         assert not (tmp_path / "out/history.csv").read_text().endswith("\n")
         last = announced(tmp_path / "out")[-1]
