@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.assembly.pattern import BlockPattern
+from lyra_petsc.assembly.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.assembly.product import HalfStored, MatMult, Whole
 from lyra_petsc.assembly.storage import KINDS, Storage, StoredRows
 from lyra_petsc.errors import InputError
@@ -31,6 +31,8 @@ class SystemMatrix:
         Whether ``-mat_type`` and other options count.
     beside : SystemMatrix
         May share its ``rows`` with this one.
+    diagonal : bool
+        Only diagonal blocks are kept.
 
     Attributes
     ----------
@@ -52,6 +54,7 @@ class SystemMatrix:
         *,
         given: bool = True,
         beside: SystemMatrix | None = None,
+        diagonal: bool = False,
     ) -> None:
         comm, rows = points.comm, 3 * points.n_owned
         self.mat = PETSc.Mat().create(comm)
@@ -64,7 +67,12 @@ class SystemMatrix:
             given = PETSc.Options().getString("mat_type", "")
             raise InputError(f"PETSc has no matrix type '{given}'", key="-mat_type") from None
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
-        self._stored, self._diagonal = StoredRows(points, pattern, self.kind), pattern.indptr[:-1]
+        self._shape, self._beside, self._diagonal = (pattern.n_blocks, 3, 3), beside, pattern.indptr[:-1]
+        self._only_diagonal = diagonal
+        if diagonal:
+            keys = diagonal_keys(points.n_owned, points.n_local)
+            pattern = BlockPattern.of_keys(keys, points.n_owned, points.n_local)
+        self._stored = StoredRows(points, pattern, self.kind)
         self._preallocate(comm)
         # all rows are owned ones, and a block's values stand column by column
         for option, value in (("SYMMETRIC", True), ("NO_OFF_PROC_ENTRIES", True), ("ROW_ORIENTED", False)):
@@ -78,7 +86,6 @@ class SystemMatrix:
         if self.kind in KINDS and PETSc.ScalarType == np.float64:
             with suppress(AttributeError, OSError):
                 self._storage = Storage(self.mat, self.kind, pattern, self._stored)
-        self._shape, self._beside = (pattern.n_blocks, 3, 3), beside
         self._half = self.kind == "sbaij" and self._storage is not None
         with suppress(AttributeError, OSError):
             self._mult = self._faster_product(points, pattern)
@@ -88,12 +95,16 @@ class SystemMatrix:
         if self._half:
             ghosts_of = points if points.comm.size > 1 else None
             return MatMult(self.mat, HalfStored(pattern, self.rows), pattern.n_couplings, ghosts_of)
-        array = self._storage.whole if self._storage is not None else None
+        array = self._whole
         if array is None:
             return None
         # of several ranks PETSc multiplies by this part while the ghosts' values are on their way
         inside = self.mat.getDiagonalBlock()
         return MatMult(inside, Whole(inside, array), len(array))
+
+    @property
+    def _whole(self) -> NDArray[np.float64] | None:
+        return self._storage.whole if self._storage is not None else None
 
     def _preallocate(self, comm: MPI.Comm) -> None:
         inside, outside = self._stored.inside, self._stored.outside
@@ -106,7 +117,7 @@ class SystemMatrix:
         shared = self._storage.shared if self._storage is not None else None
         if shared is not None:
             return shared
-        if self._beside is None or self._half:
+        if self._beside is None or self._beside.kind == "sbaij":
             return np.zeros(self._shape)
         return self._beside.rows
 
@@ -118,6 +129,8 @@ class SystemMatrix:
         if larger > 0.0:
             values = values.copy()
             values[self._diagonal] *= 1.0 + larger
+        if self._only_diagonal:
+            values = values[self._diagonal]
         for follower in self.followers:
             follower(values)
         if not self.read:
@@ -128,6 +141,26 @@ class SystemMatrix:
             self._storage.write(self.rows if self._half else values)
         else:
             self._stored.insert(values, self.mat)
+
+    @property
+    def can_be_larger(self) -> bool:
+        """Whether ``larger_diagonal`` is there: PETSc's entries can be written to behind its back."""
+        return self._whole is not None
+
+    @contextmanager
+    def larger_diagonal(self, fraction: float) -> Iterator[None]:
+        """Diagonal blocks are larger by this fraction for as long as something is made of them.
+
+        PETSc is told of no change, so that what was made stays when they are as they were.
+        """
+        assert self._whole is not None
+        blocks, at = self._whole, self._stored.diagonal
+        kept = blocks[at]
+        blocks[at] = (1.0 + fraction) * kept
+        try:
+            yield
+        finally:
+            blocks[at] = kept
 
     def destroy(self) -> None:
         """Free the matrix; collective."""

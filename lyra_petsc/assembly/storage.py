@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.assembly.pattern import BlockPattern, begins, index_type
+from lyra_petsc.block_rows.vectors import put_plain, put_transposed
 from lyra_petsc.kernel_cache import cached
 from lyra_petsc.partition.points import Points
 
@@ -39,17 +40,18 @@ def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
 def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
     """Blocks column by column; those of owned columns apart from those of ghosts."""
     n, p, q = len(indptr) - 1, 0, 0
+    blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
     for row in range(n):
         for t in range(begin[row], begin[row + 1]):
-            _put(values[below[t]], inside, p, 1, 3)
-            p += 9
+            put_transposed(blocks, below[t], inner, p)
+            p += 1
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] < n:
-                _put(values[k], inside, p, 3, 1)
-                p += 9
+                put_plain(blocks, k, inner, p)
+                p += 1
             else:
-                _put(values[k], outside, q, 3, 1)
-                q += 9
+                put_plain(blocks, k, outer, q)
+                q += 1
 
 
 @cached()
@@ -84,12 +86,13 @@ def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ig
 def _to_sbaij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
     """Blocks of owned columns as they are; those of ghosts are another's business."""
     n, p = len(indptr) - 1, 0
+    blocks, inner = values.reshape(-1, 9), inside.reshape(-1, 9)
     for row in range(n):
         for k in range(indptr[row], indptr[row + 1]):
             if columns[k] >= n:
                 break
-            _put(values[k], inside, p, 3, 1)
-            p += 9
+            put_plain(blocks, k, inner, p)
+            p += 1
 
 
 @cached()
@@ -119,6 +122,8 @@ class StoredRows:
         Blocks of each row in owned columns, and in columns of ghosts.
     begin, below : (n_owned + 1,) int64, (n_below,) int
         Compressed rows of what stands before the diagonal: blocks of the pattern, to be transposed.
+    diagonal : (n_owned,) int
+        Which of the blocks in owned columns are those of the diagonal.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
@@ -136,6 +141,7 @@ class StoredRows:
         self._kept = own | (columns >= n + in_front)
         self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
         self.outside = _per_row(self._kept & ~own, indptr).astype(PETSc.IntType)
+        self.diagonal = begins(self.inside)[:-1] + np.diff(self.begin)
 
     def insert(self, values: Array, mat: PETSc.Mat) -> None:
         """Set all entries by ``MatSetValues``; collective."""

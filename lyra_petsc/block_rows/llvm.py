@@ -51,12 +51,15 @@ class Code:
 
     def load(self, pointer: Value) -> Value:
         """A vector of what stands in memory from there on."""
-        found = self.builder.load(self.builder.bitcast(pointer, self.vector.as_pointer()))
+        return self._load(pointer, self.vector)
+
+    def _load(self, pointer: Value, kind: Any) -> Value:
+        found = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
         found.align = self._size
         return found
 
     def store(self, vector: Value, pointer: Value) -> None:
-        self.builder.store(vector, self.builder.bitcast(pointer, self.vector.as_pointer())).align = self._size
+        self.builder.store(vector, self.builder.bitcast(pointer, vector.type.as_pointer())).align = self._size
 
     @property
     def _size(self) -> int:
@@ -64,7 +67,8 @@ class Code:
 
     def pick(self, one: Value, other: Value, *lanes: int) -> Value:
         """A vector of these numbers of two vectors; those of the other are counted on."""
-        return self.builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(LANE, WIDTH), list(lanes)))
+        kind = ir.VectorType(LANE, len(lanes))
+        return self.builder.shuffle_vector(one, other, ir.Constant(kind, list(lanes)))
 
     def nothing(self) -> Value:
         return ir.Constant(self.vector, ir.Undefined)
@@ -98,10 +102,10 @@ class Code:
             vector = self.builder.insert_element(vector, number, LANE(i))
         return vector
 
-    def repeat(self, scalar: Value) -> Value:
+    def repeat(self, scalar: Value, width: int = WIDTH) -> Value:
         """A vector of one number."""
         first = self.builder.insert_element(self.nothing(), scalar, LANE(0))
-        return self.pick(first, self.nothing(), 0, 0, 0, 0)
+        return self.pick(first, self.nothing(), *[0] * width)
 
     def columns(self, block: Value) -> list[Value]:
         """The three columns of a block; what follows the last is not read."""
@@ -122,69 +126,69 @@ class Code:
         """Of a tuple of tuples."""
         return [self._unpacked(one) for one in self.numbers(name)]
 
-    def combined(self, factors: list[Value], two: list[Value]) -> list[Value]:
-        """Of two vectors, the sum with the first two factors and that with the last two."""
-        uu, uv, vu, vv = map(self.repeat, factors)
-        u, v = two
-        return [self.plus(self.times(p, u), self.times(q, v)) for p, q in ((uu, uv), (vu, vv))]
+    def spread(self, vector: Value) -> Value:
+        """Of the first eight numbers of left rightᵀ, row by row, the factors that are left's."""
+        return self.pick(vector, vector, 0, 0, 0, 1, 1, 1, 2, 2)
 
-    def outer(self, diagonal: Value, lefts: list[Value], rights: list[Value]) -> list[Value]:
-        """Rows of diagonal I + Σ left rightᵀ."""
-        rows = []
-        for i in range(3):
-            row = self.builder.insert_element(ir.Constant(self.vector, [0.0] * WIDTH), diagonal, LANE(i))
-            for left, right in zip(lefts, rights, strict=True):
-                row = self.plus(row, self.times(self.pick(left, left, i, i, i, i), right))
-            rows.append(row)
-        return rows
+    def tiled(self, vector: Value) -> Value:
+        """Of the first eight numbers of left rightᵀ, row by row, the factors that are right's."""
+        return self.pick(vector, vector, 0, 1, 2, 0, 1, 2, 0, 1)
 
-    def minus_sum(self, one: list[Value], other: list[Value]) -> list[Value]:
-        """Of the rows of two blocks."""
-        return [self.builder.fneg(self.plus(p, q)) for p, q in zip(one, other, strict=True)]
+    def outer(self, left: Value, right: Value) -> tuple[Value, Value]:
+        """left rightᵀ: its first eight numbers, row by row, and its last."""
+        return self.times(self.spread(left), self.tiled(right)), self.third(self.times(left, right))
 
-    def packed(self, rows: list[Value]) -> list[Value]:
-        """The first eight numbers of a block, row by row."""
-        one, two, three = rows
-        return [self.pick(one, two, 0, 1, 2, 4), self.pick(two, three, 1, 2, 4, 5)]
+    def identity(self, factor: Value) -> Value:
+        """The first eight numbers of a factor times the identity."""
+        kind = ir.VectorType(self.vector.element, 8)
+        first = self.builder.insert_element(ir.Constant(kind, [0.0] * 8), factor, LANE(0))
+        return self.builder.insert_element(first, factor, LANE(4))
 
-    def packed_columns(self, rows: list[Value]) -> list[Value]:
-        """The first eight numbers of a block, column by column."""
-        one, two, three = rows
-        last, below = self.pick(one, two, 2, 6, 2, 6), self.pick(two, three, 1, 5, 1, 5)
-        first = self.pick(self.pick(one, two, 0, 4, 1, 5), three, 0, 1, 4, 2)
-        return [first, self.pick(below, last, 0, 1, 4, 5)]
+    def transposed(self, eight: Value) -> Value:
+        """Of the first eight numbers of a block, which has the same last one."""
+        return self.pick(eight, eight, 0, 3, 6, 1, 4, 7, 2, 5)
 
-    def add_block(self, block: Value, eight: list[Value], row: Value) -> None:
-        """Add to a block in memory its first eight numbers, and the third of its last row."""
-        for i, numbers in enumerate(eight):
-            target = self.builder.gep(block, [INDEX(WIDTH * i)])
-            self.store(self.plus(self.load(target), numbers), target)
-        target = self.builder.gep(block, [INDEX(8)])
-        corner = self.builder.extract_element(row, LANE(2))
-        self.builder.store(self.plus(self.builder.load(target), corner), target)
+    def minus_sum(self, one: Value, other: Value) -> Value:
+        return self.builder.fneg(self.plus(one, other))
+
+    def third(self, vector: Value) -> Value:
+        return self.builder.extract_element(vector, LANE(2))
+
+    def summed(self, *products: tuple[Value, Value]) -> Value:
+        return reduce(self.plus, [self.times(one, other) for one, other in products])
+
+    def swapped(self, offset: Value, one: Value, other: Value) -> tuple[Value, Value]:
+        """Two vectors, the other first where the offset says that a block is added transposed."""
+        odd = self.is_odd(offset, one.type.count)
+        return self.builder.select(odd, other, one), self.builder.select(odd, one, other)
+
+    def add_block(self, block: Value, eight: Value, ninth: Value) -> None:
+        """Add to a block in memory its first eight numbers and its last one."""
+        self.store(self.plus(self._load(block, eight.type), eight), block)
+        last = self.builder.gep(block, [INDEX(8)])
+        self.builder.store(self.plus(self.builder.load(last), ninth), last)
 
     def six_offsets(self) -> list[Value]:
         """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, 6)."""
         row = self.at(self.begin("offsets"), self.integer("e"), 6)
         return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in range(6)]
 
-    def is_odd(self, offset: Value) -> Value:
+    def is_odd(self, offset: Value, width: int) -> Value:
         """In all lanes, as processors choose between vectors without a jump."""
         odd = self.builder.trunc(offset, ir.IntType(1))
         one = self.builder.insert_element(
-            ir.Constant(ir.VectorType(odd.type, WIDTH), ir.Undefined), odd, LANE(0)
+            ir.Constant(ir.VectorType(odd.type, width), ir.Undefined), odd, LANE(0)
         )
-        return self.pick(one, one, 0, 0, 0, 0)
+        return self.pick(one, one, *[0] * width)
 
-    def add_six(self, offsets: list[Value], blocks: list[list[Value]]) -> None:
-        """Add the rows of six blocks of an element as they are, where offsets say."""
+    def add_six(self, offsets: list[Value], blocks: list[tuple[Value, Value]]) -> None:
+        """Add six blocks of an element as they are, as ``add_block`` takes them, where offsets say."""
         builder, begin = self.builder, self.begin("blocks")
-        ready = [(self.packed(rows), rows[2]) for rows in blocks]
 
         def add(pair: int) -> None:
             at = builder.ashr(offsets[pair], offsets[pair].type(1))
             at = at if at.type == INDEX else builder.sext(at, INDEX)
-            self.add_block(self.at(begin, at, 9), *ready[pair])
+            self.add_block(self.at(begin, at, 9), *blocks[pair])
 
         # whoever has the rows of all three points has all blocks
         own = builder.or_(builder.or_(offsets[0], offsets[3]), offsets[5])

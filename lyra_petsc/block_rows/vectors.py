@@ -8,6 +8,7 @@ the blocks it is always one of the same block. And what will soon be needed is f
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -77,22 +78,16 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
 
 
 def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
-    """blocks[at // 2] += diagonal I + Σ left[m] right[m]ᵀ, transposed where ``at`` is odd.
-
-    Nothing where it is negative. Left and right are tuples of vectors, each three numbers or a sum of some:
-    pairs of a factor and three numbers.
-    """
+    """blocks[at // 2] += diagonal I + left rightᵀ, transposed where ``at`` is odd; nothing where negative."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = Code(context, builder, signature, arguments, "blocks at diagonal left right")
         at, begin = code.integer("at"), code.begin("blocks")
-        lefts, rights = code.vectors("left"), code.vectors("right")
         with builder.if_then(code.is_ours(at), likely=True):
-            rows = code.outer(code.given["diagonal"], lefts, rights)
-            plain, turned = code.packed(rows), code.packed_columns(rows)
-            odd = code.is_odd(at)
-            chosen = [builder.select(odd, there, here) for there, here in zip(turned, plain, strict=True)]
-            code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), chosen, rows[2])
+            left, right = code.swapped(at, *(code.filled(code.numbers(name)) for name in ("left", "right")))
+            diagonal, (eight, ninth) = code.given["diagonal"], code.outer(left, right)
+            eight, ninth = code.plus(eight, code.identity(diagonal)), code.plus(ninth, diagonal)
+            code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), eight, ninth)
         return context.get_dummy_value()
 
     return types.void(blocks, at, diagonal, left, right), generate
@@ -101,53 +96,82 @@ def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, righ
 def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
     """Add the blocks n Rᵀ + L nᵀ of the couplings (0, 0), (0, 1), …, (2, 2) of an element e.
 
-    They are given by R and L, sums as in ``add_outer``; n is three numbers. Offsets (E, 6) are a pattern's.
+    They are given by R and L, tuples of three numbers or sums: of pairs of a factor and three numbers; n is
+    three numbers. Offsets (E, 6) are a pattern's.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = Code(context, builder, signature, arguments, "blocks offsets e n six")
-        nothing, n = ir.Constant(code.vector.element, 0.0), code.filled(code.numbers("n"))
-        offsets, blocks = code.six_offsets(), []
+        n = code.filled(code.numbers("n"))
+        n_left, n_right, offsets, blocks = code.spread(n), code.tiled(n), code.six_offsets(), []
         for offset, (right, left) in zip(offsets, code.pairs("six"), strict=True):
-            odd = code.is_odd(offset)  # transposed: n Lᵀ + R nᵀ
-            right, left = builder.select(odd, left, right), builder.select(odd, right, left)
-            blocks.append(code.outer(nothing, [n, left], [right, n]))
+            ninth = code.third(code.times(n, code.plus(left, right)))
+            right, left = code.swapped(offset, right, left)  # transposed: n Lᵀ + R nᵀ
+            eight = code.summed((n_left, code.tiled(right)), (code.spread(left), n_right))
+            blocks.append((eight, ninth))
         code.add_six(offsets, blocks)
         return context.get_dummy_value()
 
     return types.void(blocks, offsets, e, n, six), generate
 
 
-def _add_triangle(
-    typing: Any, blocks: Any, offsets: Any, e: Any, diagonals: Any, f: Any, factors: Any
-) -> Any:
-    """Add the blocks of the couplings of an element e whose columns and rows of blocks sum to zero.
+def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three: Any) -> Any:
+    """Add the blocks of the couplings of an element e whose rows and columns of blocks sum to zero.
 
-    Given are those of (1, 1), (1, 2), (2, 2): diagonal I + uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ,
-    with three diagonals and three (uu, uv, vu, vv). Offsets (E, 6) are those of a pattern.
+    Given are those of (1, 1), (1, 2), (2, 2) as factors (uu, uv, vu, vv, g) of two vectors: a block is
+    uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + g I. Offsets (E, 6) are those of a pattern.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        code = Code(context, builder, signature, arguments, "blocks offsets e diagonals f factors")
-        f, factors = code.vectors("f"), code.tuples("factors")
-        ones, twos, threes = (code.combined(numbers, f) for numbers in factors)
-        own, between, last = code.numbers("diagonals")
-        b11, b12, b22 = code.outer(own, f, ones), code.outer(between, f, twos), code.outer(last, f, threes)
-        b21 = code.outer(between, twos, f)
-        b01, b02 = code.minus_sum(b11, b21), code.minus_sum(b12, b22)
-        b10, b20 = code.minus_sum(b11, b12), code.minus_sum(b21, b22)
-        offsets = code.six_offsets()
-
-        def stored(offset: Any, plain: Any, transposed: Any) -> Any:
-            odd = code.is_odd(offset)
-            return [builder.select(odd, there, here) for there, here in zip(transposed, plain, strict=True)]
-
-        blocks = [code.minus_sum(b01, b02), stored(offsets[1], b01, b10), stored(offsets[2], b02, b20)]
-        blocks += [b11, stored(offsets[4], b12, b21), b22]
-        code.add_six(offsets, blocks)
+        code = Code(context, builder, signature, arguments, "blocks offsets e f three")
+        u, v = code.vectors("f")
+        (uu, uu9), (uv, uv9), (vv, vv9) = code.outer(u, u), code.outer(u, v), code.outer(v, v)
+        vu, made = code.transposed(uv), []
+        for a, b, c, d, g in code.tuples("three"):
+            ninth = code.plus(code.summed((a, uu9), (builder.fadd(b, c), uv9), (d, vv9)), g)
+            a, b, c, d = (code.repeat(factor, 8) for factor in (a, b, c, d))
+            eight = code.summed((a, uu), (b, uv), (c, vu), (d, vv))
+            made.append((code.plus(eight, code.identity(g)), ninth))
+        (b11, one), (b12, two), (b22, three) = made
+        b21, offsets = code.transposed(b12), code.six_offsets()
+        b01 = code.minus_sum(b11, code.swapped(offsets[1], b21, b12)[0]), code.minus_sum(one, two)
+        b02 = code.minus_sum(b22, code.swapped(offsets[2], b12, b21)[0]), code.minus_sum(two, three)
+        b00 = reduce(code.plus, (b11, b12, b21, b22)), reduce(code.plus, (one, two, two, three))
+        stored = code.swapped(offsets[4], b12, b21)[0], two
+        code.add_six(offsets, [b00, b01, b02, (b11, one), stored, (b22, three)])
         return context.get_dummy_value()
 
-    return types.void(blocks, offsets, e, diagonals, f, factors), generate
+    return types.void(blocks, offsets, e, f, three), generate
+
+
+def _put(transposed: bool, typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k], or this transposed."""
+    _check(blocks, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks k out at")
+        source = code.at(code.begin("blocks"), code.integer("k"), 9)
+        target = code.at(code.begin("out"), code.integer("at"), 9)
+        one, two = (code.load(builder.gep(source, [INDEX(first)])) for first in (0, WIDTH))
+        if transposed:
+            one, two = code.pick(one, two, 0, 3, 6, 1), code.pick(one, two, 4, 7, 2, 5)
+        code.store(one, target)
+        code.store(two, builder.gep(target, [INDEX(WIDTH)]))
+        last = INDEX(2 * WIDTH)
+        builder.store(builder.load(builder.gep(source, [last])), builder.gep(target, [last]))
+        return context.get_dummy_value()
+
+    return types.void(blocks, k, out, at), generate
+
+
+def _put_plain(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k]; both (n, 9)."""
+    return _put(False, typing, blocks, k, out, at)
+
+
+def _put_transposed(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k] transposed; both (n, 9)."""
+    return _put(True, typing, blocks, k, out, at)
 
 
 def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
@@ -169,4 +193,6 @@ add_outer: Any = intrinsic(_add_outer)
 add_six: Any = intrinsic(_add_six)
 add_triangle: Any = intrinsic(_add_triangle)
 fetch: Any = intrinsic(_fetch)
+put_plain: Any = intrinsic(_put_plain)
+put_transposed: Any = intrinsic(_put_transposed)
 scatter: Any = intrinsic(_scatter)

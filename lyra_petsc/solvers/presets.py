@@ -99,6 +99,8 @@ MULTIGRID_FROM = {True: 2000, False: 3000}
 BAIJ_PRECONDITIONERS = frozenset({"none", "jacobi", "pbjacobi", "sor", "ilu"})
 """What is used with block storage; every other ``-pc_type`` gets ``aij``."""
 
+READS_DIAGONAL = frozenset({"none", "jacobi", "pbjacobi"})
+"""What reads of its matrix no more than the diagonal blocks."""
 
 DIRECT_UNTIL = 30_000
 """Vertices up to which a direct factorisation is used: for equilibria, and where iterations grow too many."""

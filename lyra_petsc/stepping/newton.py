@@ -15,7 +15,7 @@ from lyra_petsc.solvers.options import is_set
 from lyra_petsc.solvers.reasons import NOT_A_NUMBER
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.forcing import Forcing
-from lyra_petsc.stepping.shift import Shift
+from lyra_petsc.stepping.shift import Shift, allows_enlarging
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.stepping.watchdog import Watchdog
 
@@ -98,7 +98,9 @@ class Newton:
         self._usual = 0.0
         self._began_convex = False
         self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol"))
-        self.shift = Shift(self._ksp, acts=preconditioner is not matrix)
+        self._alone = preconditioner is matrix
+        in_place = self._alone and not iterates and allows_enlarging(matrix)
+        self.shift = Shift(self._ksp, acts=not self._alone or in_place)
         self.begin_step()
 
     def begin_step(self) -> None:
@@ -125,15 +127,25 @@ class Newton:
             self.forcing.before_solve(self.norm)
         self._set_matrix(v, self._blend.after(self._taken(u)))
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
-        separate = self._preconditioner is not self._matrix
-        self._kept = separate and self._fell
+        if self._alone:
+            return
+        self._kept = self._fell
         convex = not self._iterates or (self._convex and shows_negative_curvature(self._ksp.getPC()))
-        self._same = separate and convex and not self._kept
+        self._same = convex and not self._kept
         if self._same:
             # as long as it is positive definite there is no better preconditioner
             self._preconditioner.set(self._matrix.rows, self.shift.value)
-        elif separate and not self._kept:
+        elif not self._kept:
             self._set_preconditioner(v)
+
+    def factor(self) -> None:
+        """Set up a preconditioner that is built from the Jacobian while that has a larger diagonal."""
+        if self._alone and self.shift.value > 0.0:
+            mat = self._matrix.mat
+            self._ksp.setOperators(mat, mat)
+            with self._matrix.larger_diagonal(self.shift.value):
+                self._ksp.setUp()
+                self._ksp.setUpOnBlocks()
 
     def _set_matrix(self, v: Array, blend: float) -> None:
         self._system.jacobian(v, blend, self._matrix.rows)

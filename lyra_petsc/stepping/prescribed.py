@@ -22,14 +22,16 @@ class Prescribed:
         Prescribed coordinates.
     free : (n_owned, 3) bool
         The others.
+    at : (m,) int
+        Which of all owned coordinates, row by row, are prescribed.
     rows : (n,) int
         Block rows that couple to prescribed coordinates.
     blocks : (n,) int
         The blocks in them.
-    goal : (n_owned, 3)
-        Positions [m] at the end of the step; those of free coordinates at its start. Empty without handles.
-    velocity : (n_owned, 3)
-        Velocities [m/s] at the stage; 0 in free coordinates. Empty without handles.
+    goal : (m,)
+        Positions [m] of the prescribed coordinates at the end of the step.
+    velocity : (m,)
+        Their velocities [m/s] at the stage.
     """
 
     def __init__(self, points: Points, held: Held, blocks: BlockRows) -> None:
@@ -38,11 +40,11 @@ class Prescribed:
         self._span = (0.0, 0.0)
         self.mask: Mask = np.zeros((points.n_local, 3), dtype=bool)
         self.free: Mask = ~self.mask[: points.n_owned]
-        self.rows = self.blocks = np.empty(0, dtype=np.int64)
-        self.goal, self.velocity = (np.zeros((points.n_owned, 3)) if held else np.empty((0, 3)) for _ in "ab")
+        self.at = self.rows = self.blocks = np.empty(0, dtype=np.int64)
+        self.goal, self.velocity = np.empty(0), np.empty(0)
 
-    def begin_step(self, t0: float, t1: float, x: Array) -> bool:
-        """Take the handles of the step t0..t1 [s] and positions x; whether they changed; collective."""
+    def begin_step(self, t0: float, t1: float) -> bool:
+        """Take the handles of the step t0..t1 [s]; whether they changed; collective."""
         if not self.held:
             return False
         n = self._points.n_owned
@@ -57,25 +59,35 @@ class Prescribed:
             self._points.update_ghosts(flags)
             self.mask = flags > 0.5
             self.free = ~self.mask[:n]
+            self.at = np.flatnonzero(self.mask[:n])
             self.rows, self.blocks = self._blocks.beside(self.mask)
-        self.goal[:] = x[:n]
-        self.held.targets(t0, t1, t1, self.goal)
+        self.goal = self._positions(t1)
         return changed
 
     def solve(self, x_h: Array, reach: float) -> None:
         """Take the velocities that lead from the history x_h (n_owned, 3) to the goal."""
-        if self.held:
-            self.velocity = np.where(self.free, 0.0, (self.goal - x_h) / reach)
+        self.velocity = (self.goal - x_h.take(self.at)) / reach
 
     def give(self, at: float, x_h: Array, reach: float) -> None:
         """Take position and velocity at time ``at`` [s], and change x_h (n_owned, 3) to agree with them."""
-        position, rate = np.zeros_like(x_h), np.zeros_like(x_h)
-        self.held.targets(*self._span, at, position)
-        self.held.velocities(*self._span, at, rate)
-        np.copyto(x_h, position - reach * rate, where=~self.free)
-        self.velocity = np.where(self.free, 0.0, rate)
+        self.velocity = self._rates(at)
+        self.put(x_h, self._positions(at) - reach * self.velocity)
+
+    def put(self, values: Array, prescribed: Array) -> None:
+        """Overwrite the prescribed coordinates of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""
+        np.put(values, self.at, prescribed)
 
     def overwrite_with_rates(self, velocity: Array) -> None:
         """Write ẋ* [m/s] at the end of the step over the prescribed coordinates of ``velocity``."""
         if self.held and self._span[1] > self._span[0]:
-            self.held.velocities(*self._span, self._span[1], velocity)
+            self.put(velocity, self._rates(self._span[1]))
+
+    def _positions(self, at: float) -> Array:
+        out = np.empty((self._points.n_owned, 3))
+        self.held.targets(*self._span, at, out)
+        return out.take(self.at)
+
+    def _rates(self, at: float) -> Array:
+        out = np.empty((self._points.n_owned, 3))
+        self.held.velocities(*self._span, at, out)
+        return out.take(self.at)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.solvers.inertia import is_incomplete
+from lyra_petsc.solvers.options import is_set
 
 LEAST, LARGEST = 0.01, 1.0
 """Fractions of the diagonal blocks."""
@@ -22,6 +24,14 @@ INDEFINITE = (
 )
 
 
+def allows_enlarging(matrix: SystemMatrix) -> bool:
+    """Whether a matrix can be given a larger diagonal for as long as its factors are made.
+
+    That must be known before SNES decides whether they are due.
+    """
+    return matrix.can_be_larger and not is_set("snes_lag_preconditioner")
+
+
 class Shift:
     """Enlarges as little as makes the factors of a KSP's preconditioner positive definite.
 
@@ -29,7 +39,7 @@ class Shift:
     ----------
     ksp : PETSc.KSP
     acts : bool
-        The preconditioner is built from a matrix of its own.
+        The preconditioner is built from a matrix of its own, or while this one has a larger diagonal.
     """
 
     def __init__(self, ksp: PETSc.KSP, *, acts: bool) -> None:

@@ -20,13 +20,14 @@ from lyra_petsc.solvers import failed_factors, reasons
 from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.solvers.presets import INCOMPLETE, candidates, linear_limit, options_of
+from lyra_petsc.solvers.presets import INCOMPLETE, READS_DIAGONAL, candidates, linear_limit, options_of
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.forcing import LOOSEST
 from lyra_petsc.stepping.guess import first_guess
 from lyra_petsc.stepping.newton import Newton
+from lyra_petsc.stepping.shift import allows_enlarging
 from lyra_petsc.stepping.system import ReducedSystem
 from lyra_petsc.stepping.trace import Stuck, Trace
 from lyra_petsc.stepping.ts_options import refuse_contradictions
@@ -126,7 +127,10 @@ class Stepper:
         self.matrix = SystemMatrix(points, self._pattern, "baij")
         self.preconditioner = self.matrix
         if self._separate():
-            self.preconditioner = SystemMatrix(points, self._pattern, "baij", beside=self.matrix)
+            diagonal = PETSc.Options().getString("pc_type", "") in READS_DIAGONAL
+            self.preconditioner = SystemMatrix(
+                points, self._pattern, "baij", given=not diagonal, beside=self.matrix, diagonal=diagonal
+            )
         self.velocity = PETSc.Vec().createMPI(
             (3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm
         )
@@ -199,7 +203,8 @@ class Stepper:
         Hessian only where there is some.
         """
         if not self._iterates:
-            return self.preset in INCOMPLETE  # their diagonal is a little larger
+            # their diagonal is a little larger
+            return self.preset in INCOMPLETE and not allows_enlarging(self.matrix)
         kind = PETSc.Options().getString("ksp_type", "cg")
         return self._scene.solver.hessian != "regularised" and kind != "preonly"
 
@@ -342,6 +347,7 @@ class Stepper:
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
     ) -> bool:
         self._newton.assemble(u)
+        self._newton.factor()
         if self._iterates:
             self._newton.remember(u)
         return True

@@ -125,7 +125,7 @@ class ReducedSystem:
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
         self.new_iterate(None)
         after = self.scheme.stage_after(self.dt)
-        changed = self._prescribed.begin_step(t0, t1, self.x)
+        changed = self._prescribed.begin_step(t0, t1)
         self._freeze(t0 + after)
         if changed or t0 in self._events:
             for follower in self.followers:
@@ -206,8 +206,7 @@ class ReducedSystem:
 
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed coordinates of v (n_owned, 3) by their velocities at the stage."""
-        if self.held:
-            np.copyto(v, self._prescribed.velocity, where=~self._prescribed.free)
+        self._prescribed.put(v, self._prescribed.velocity)
 
     def velocity_of_staying(self) -> Array:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
@@ -220,7 +219,8 @@ class ReducedSystem:
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
         moved, rate = self.scheme.end(before, rate_before, v, self.dt)
         self.scheme.accepted(before, rate_before, free, self.dt)
-        self.x[:n] = np.where(free, moved, self._prescribed.goal) if self.held else moved
+        self.x[:n] = moved
+        self._prescribed.put(self.x[:n], self._prescribed.goal)
         self.v[:n] = rate
         if given:
             self._prescribed.overwrite_with_rates(self.v[:n])
@@ -274,14 +274,14 @@ class ReducedSystem:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
         parts = self._parts(*self._evaluate_at(v), vdot).values()
         reduce(lambda total, part: np.add(total, part, out=out), parts)
-        if self.held:
-            held = (self.stage.sigma * self.mass)[:, None] * (v - self._prescribed.velocity)
-            np.copyto(out, held, where=~self._prescribed.free)
+        at = self._prescribed.at
+        too_fast = v.take(at) - self._prescribed.velocity
+        self._prescribed.put(out, self.stage.sigma * self.mass[at // 3] * too_fast)
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free coordinates; collective."""
-        squares = (np.sum(p * p, where=self._prescribed.free) for p in self._last_parts.values())
-        return float(np.sqrt(self.points.summed(*squares).max()))
+        parts = (np.where(self._prescribed.free, part, 0.0) for part in self._last_parts.values())
+        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

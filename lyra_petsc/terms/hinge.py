@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.kernel import Index, kernel
 
 
 @kernel(inline="always")
 def point(x, i):  # type: ignore[no-untyped-def]
+    i = Index(i)
     return x[i, 0], x[i, 1], x[i, 2]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from lyra_petsc.terms.hinge import angle_parts, point
 from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_hessian, hinge_weight
 from lyra_petsc.terms.hinge_shape import fades
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.kernel import Index, kernel
 
 
 @kernel(inline="always")
@@ -70,10 +70,11 @@ def add_gradient(corners, hinges, shape, pull, out):  # type: ignore[no-untyped-
     """
     for t in range(corners.shape[0]):
         c0, c1, c2 = shape[t, 3], shape[t, 4], shape[t, 5]
-        p0, p1, p2 = pull[hinges[t, 0] >> 1], pull[hinges[t, 1] >> 1], pull[hinges[t, 2] >> 1]
+        h0, h1, h2 = Index(hinges[t, 0] >> 1), Index(hinges[t, 1] >> 1), Index(hinges[t, 2] >> 1)
+        p0, p1, p2 = pull[h0], pull[h1], pull[h2]
         f1 = p0 * c2 + p2 * c0 - p1 * (c0 + c2)
         f2 = p0 * c1 + p1 * c0 - p2 * (c0 + c1)
-        i0, i1, i2 = corners[t, 0], corners[t, 1], corners[t, 2]
+        i0, i1, i2 = Index(corners[t, 0]), Index(corners[t, 1]), Index(corners[t, 2])
         for i in range(3):
             n = shape[t, i]
             out[i0, i] -= (f1 + f2) * n

@@ -19,8 +19,8 @@ from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.hinge_forces import limits_of
-from lyra_petsc.terms.hinge_shape import fades
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.hinge_shape import fades, triangles_at
+from lyra_petsc.terms.kernel import Index, kernel
 
 
 @kernel(inline="always")
@@ -94,25 +94,25 @@ def add_across(  # type: ignore[no-untyped-def]
             limits = limits_of(limit, sides, h)
             _add_faded(x, h, s, theta, k, rest, limits, blend, weight, offsets, values)
             continue
-        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
+        one, two = triangles_at(sides, h)
         square = length[h] * length[h]
         stiffness = 2.0 * k[h] * weight[h] / square
         factors[h, 0], factors[h, 1] = stiffness, (1.0 - blend) * stiffness * (theta[h] - rest[h]) * length[h]
         areas = shape[one, 6] * shape[two, 6]
         left = scaled(stiffness * square * square / areas, (shape[one, 0], shape[one, 1], shape[one, 2]))
         right = shape[two, 0], shape[two, 1], shape[two, 2]
-        add_outer(values, across[h], 0.0, (left,), (right,))
+        add_outer(values, across[h], 0.0, left, right)
 
 
 @kernel(inline="always")
 def _beyond(hinge, sides, shape, factors):  # type: ignore[no-untyped-def]
     """Beyond a side: its factors, the first times γ at the side's ends in our sense, and the normal."""
-    h = hinge >> 1
-    side = sides[h, 1 - (hinge & 1)]
-    t, (i, j) = side >> 2, _ends(side & 3)
+    h = Index(hinge >> 1)
+    side = sides[h, Index(1 - (hinge & 1))]
+    t, (i, j) = Index(side >> 2), _ends(side & 3)
     stiff = factors[h, 0]
     normal = shape[t, 0], shape[t, 1], shape[t, 2]
-    return stiff, factors[h, 1], stiff * shape[t, 3 + i], stiff * shape[t, 3 + j], normal
+    return stiff, factors[h, 1], stiff * shape[t, Index(3 + i)], stiff * shape[t, Index(3 + j)], normal
 
 
 @kernel(forceinline=True)

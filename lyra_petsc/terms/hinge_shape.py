@@ -6,7 +6,7 @@ import math
 
 from lyra_petsc.terms import hinge
 from lyra_petsc.terms.hinge import cross, dot, minus, point
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.kernel import Index, kernel
 
 
 @kernel()
@@ -34,10 +34,17 @@ def triangles(x, corners, limit, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
+def triangles_at(sides, h):  # type: ignore[no-untyped-def]
+    """Numbers of a hinge's two triangles."""
+    return Index(sides[h, 0] >> 2), Index(sides[h, 1] >> 2)
+
+
+@kernel(inline="always")
 def fades(shape, sides, h):  # type: ignore[no-untyped-def]
     """Whether one of a hinge's triangles has hardly an area left, or none."""
     # no ``or``: a jump would have numba count references to the arrays here, for each hinge
-    return (shape[sides[h, 0] >> 2, 6] == 0.0) | (shape[sides[h, 1] >> 2, 6] == 0.0)
+    one, two = triangles_at(sides, h)
+    return (shape[one, 6] == 0.0) | (shape[two, 6] == 0.0)
 
 
 @kernel()
@@ -50,7 +57,7 @@ def angle_parts(x, s, sides, shape, sine, cosine, length):  # type: ignore[no-un
         if fades(shape, sides, h):
             sine[h], cosine[h], _, _ = hinge.angle_parts(x0, x1, point(x, s[h, 2]), point(x, s[h, 3]))
             continue
-        one, two = sides[h, 0] >> 2, sides[h, 1] >> 2
+        one, two = triangles_at(sides, h)
         n1 = shape[one, 0], shape[one, 1], shape[one, 2]
         n2 = shape[two, 0], shape[two, 1], shape[two, 2]
         sine[h], cosine[h] = dot(cross(n1, n2), e) / length[h], dot(n1, n2)

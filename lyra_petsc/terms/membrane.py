@@ -19,7 +19,7 @@ from lyra_petsc.block_rows.scatter import fetch_ahead
 from lyra_petsc.block_rows.vectors import add_triangle
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.kernel import Index, kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
 
@@ -30,7 +30,7 @@ Stencil = NDArray[np.int32]
 @kernel(inline="always")
 def _deformation(x, s, e, inverse):  # type: ignore[no-untyped-def]
     """Columns fu, fv of the deformation gradient of triangle e."""
-    a, b, c = s[e, 0], s[e, 1], s[e, 2]
+    a, b, c = Index(s[e, 0]), Index(s[e, 1]), Index(s[e, 2])
     px, py, pz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
     qx, qy, qz = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
     i00, i01, i10, i11 = inverse[e, 0, 0], inverse[e, 0, 1], inverse[e, 1, 0], inverse[e, 1, 1]
@@ -55,7 +55,7 @@ def _green_and_stress(f, c, m):  # type: ignore[no-untyped-def]
 def energies(x, s, lo, hi, inverse, area, c, law, out):  # type: ignore[no-untyped-def]
     """Energy [J] of triangles lo..hi into out (hi − lo,)."""
     for e in range(lo, hi):
-        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, law[e])
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, Index(law[e]))
         out[e - lo] = 0.5 * area[e] * (e0 * s0 + e1 * s1 + e2 * s2)
 
 
@@ -65,7 +65,7 @@ def add_gradient(x, s, inverse, area, c, law, out):  # type: ignore[no-untyped-d
     for e in range(s.shape[0]):
         f = _deformation(x, s, e, inverse)
         ux, uy, uz, vx, vy, vz = f
-        _, _, _, s0, s1, s2 = _green_and_stress(f, c, law[e])
+        _, _, _, s0, s1, s2 = _green_and_stress(f, c, Index(law[e]))
         # columns of the first Piola-Kirchhoff stress P = F S, times the area
         w = area[e]
         pux, puy, puz = w * (ux * s0 + vx * s2), w * (uy * s0 + vy * s2), w * (uz * s0 + vz * s2)
@@ -73,7 +73,7 @@ def add_gradient(x, s, inverse, area, c, law, out):  # type: ignore[no-untyped-d
         i00, i01, i10, i11 = inverse[e, 0, 0], inverse[e, 0, 1], inverse[e, 1, 0], inverse[e, 1, 1]
         bx, by, bz = pux * i00 + pvx * i01, puy * i00 + pvy * i01, puz * i00 + pvz * i01
         cx, cy, cz = pux * i10 + pvx * i11, puy * i10 + pvy * i11, puz * i10 + pvz * i11
-        ia, ib, ic = s[e, 0], s[e, 1], s[e, 2]
+        ia, ib, ic = Index(s[e, 0]), Index(s[e, 1]), Index(s[e, 2])
         out[ia, 0] -= bx + cx
         out[ia, 1] -= by + cy
         out[ia, 2] -= bz + cz
@@ -133,7 +133,7 @@ def _factors(stress, stiff, ga, gb):  # type: ignore[no-untyped-def]
     uu, vv = au * bu, av * bv
     uv, vu = au * bv, av * bu
     geometric = stress[0] * uu + stress[1] * vv + stress[2] * (uv + vu)
-    return (c11 * uu + c33 * vv, c12 * uv + c33 * vu, c12 * vu + c33 * uv, c22 * vv + c33 * uu), geometric
+    return c11 * uu + c33 * vv, c12 * uv + c33 * vu, c12 * vu + c33 * uv, c22 * vv + c33 * uu, geometric
 
 
 @kernel(inline="always")
@@ -152,10 +152,10 @@ def hessians(x, y, s, lo, hi, blend, inverse, area, c, law, out):  # type: ignor
     Their geometric part has the stress that the linearised strain predicted at x from y; y = x: exact.
     """
     for e in range(lo, hi):
-        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, area[e], c, law[e])
+        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, area[e], c, Index(law[e]))
         for a in range(3):
             for b in range(3):
-                (uu, uv, vu, vv), geometric = _factors(stress, stiff, g[a], g[b])
+                uu, uv, vu, vv, geometric = _factors(stress, stiff, g[a], g[b])
                 left, right = _sides(f, uu, uv, vu, vv)
                 for i in range(3):
                     for j in range(3):
@@ -171,19 +171,17 @@ def add_hessians(x, y, s, blend, inverse, area, c, law, weight, offsets, values)
     """
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values, 6)
-        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c, law[e])
-        one, geometric1 = _factors(stress, stiff, g[1], g[1])
-        two, geometric2 = _factors(stress, stiff, g[1], g[2])
-        three, geometric3 = _factors(stress, stiff, g[2], g[2])
-        sides = (f[0], f[1], f[2]), (f[3], f[4], f[5])
-        add_triangle(values, offsets, e, (geometric1, geometric2, geometric3), sides, (one, two, three))
+        f, stress, stiff, g = _prepared(x, y, s, e, blend, inverse, weight[e] * area[e], c, Index(law[e]))
+        one, two = _factors(stress, stiff, g[1], g[1]), _factors(stress, stiff, g[1], g[2])
+        three = _factors(stress, stiff, g[2], g[2])
+        add_triangle(values, offsets, e, ((f[0], f[1], f[2]), (f[3], f[4], f[5])), (one, two, three))
 
 
 @kernel()
 def strain_and_stress(x, s, inverse, c, law, strain, stress):  # type: ignore[no-untyped-def]
     """Green strain (E_uu, E_vv, E_uv) and second Piola-Kirchhoff stress [N/m] into (E, 3) arrays."""
     for e in range(s.shape[0]):
-        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, law[e])
+        e0, e1, e2, s0, s1, s2 = _green_and_stress(_deformation(x, s, e, inverse), c, Index(law[e]))
         strain[e, 0], strain[e, 1], strain[e, 2] = e0, e1, 0.5 * e2
         stress[e, 0], stress[e, 1], stress[e, 2] = s0, s1, s2
 

@@ -112,7 +112,7 @@ def add_hessians(v, s, area, n, wind, density, drag, offsets, values):  # type: 
         right = n[e, 0], n[e, 1], n[e, 2]
         left = along * right[0], along * right[1], along * right[2]
         for pair in range(6):
-            add_outer(values, offsets[e, pair], across, (left,), (right,))
+            add_outer(values, offsets[e, pair], across, left, right)
 
 
 class Wind(Viscous):

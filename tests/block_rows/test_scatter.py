@@ -20,31 +20,25 @@ def add_one(values: Any, at: Any, diagonal: Any, left: Any, right: Any) -> None:
 
 
 @njit
-def add_sums(values: Any, at: Any, left: Any, right: Any) -> None:
-    add_outer(values, at, 0.0, left, right)
-
-
-@njit
 def add_all(values: Any, offsets: Any, e: Any, n: Any, six: Any) -> None:
     add_six(values, offsets, e, n, six)
 
 
 @njit
-def add_balanced(values: Any, offsets: Any, e: Any, diagonals: Any, f: Any, factors: Any) -> None:
-    add_triangle(values, offsets, e, diagonals, f, factors)
+def add_balanced(values: Any, offsets: Any, e: Any, f: Any, three: Any) -> None:
+    add_triangle(values, offsets, e, f, three)
 
 
 def vectors(count: int) -> tuple[tuple[float, float, float], ...]:
     return tuple((float(a), float(b), float(c)) for a, b, c in RNG.normal(size=(count, 3)))
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
 @pytest.mark.parametrize("odd", [0, 1])
-def test_outer_products_are_added_to_one_block(count: int, kind: type, odd: int) -> None:
+def test_an_outer_product_is_added_to_one_block(kind: type, odd: int) -> None:
     before = RNG.normal(size=(3, 3, 3))
-    left, right = vectors(count), vectors(count)
-    block = 0.7 * np.eye(3) + np.array(left).T @ np.array(right)
+    left, right = vectors(2)
+    block = 0.7 * np.eye(3) + np.outer(left, right)
     values = before.copy()
     add_one(values, kind(2 * 1 + odd), 0.7, left, right)
     expected = before.copy()
@@ -56,17 +50,8 @@ def test_outer_products_are_added_to_one_block(count: int, kind: type, odd: int)
 
 def test_what_others_have_is_left_to_them() -> None:
     values = np.ones((2, 3, 3))
-    add_one(values, np.int32(-1), 5.0, vectors(1), vectors(1))
+    add_one(values, np.int32(-1), 5.0, *vectors(2))
     np.testing.assert_array_equal(values, 1.0)
-
-
-@pytest.mark.parametrize("odd", [0, 1])
-def test_vectors_may_be_sums(odd: int) -> None:
-    a, b, c, d, e = vectors(5)
-    values = np.zeros((1, 3, 3))
-    add_sums(values, np.int64(odd), (a, ((2.0, b), (-0.5, c))), (((3.0, d),), e))
-    block = 3.0 * np.outer(a, d) + np.outer(2.0 * np.array(b) - 0.5 * np.array(c), e)
-    np.testing.assert_allclose(values[0], block.T if odd else block, atol=1e-14)
 
 
 PLACES = [[0, 3, 4, 6, 9, 10], [2, 5, -1, -1, -1, -1], [-1, 4, 7, 0, -1, 2], [-1] * 6]
@@ -93,20 +78,27 @@ def test_six_blocks_of_a_triangle(places: list[int], kind: type) -> None:
 
 
 @pytest.mark.parametrize("places", PLACES)
+def test_their_vectors_may_be_sums(places: list[int]) -> None:
+    n, a, b, c = vectors(4)
+    right, left = ((2.0, a), (-0.5, b)), ((3.0, c),)
+    block = np.outer(n, 2.0 * np.array(a) - 0.5 * np.array(b)) + np.outer(3.0 * np.array(c), n)
+    values = np.zeros((6, 3, 3))
+    add_all(values, np.array([places], dtype=np.int32), 0, n, ((right, left),) * 6)
+    np.testing.assert_allclose(values, sums_at(places, np.array([block] * 6)), atol=1e-14)
+
+
+@pytest.mark.parametrize("places", PLACES)
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
 def test_three_blocks_of_a_triangle_make_the_others(places: list[int], kind: type) -> None:
-    f, diagonals = vectors(2), tuple(float(number) for number in RNG.normal(size=3))
-    rows = RNG.normal(size=(3, 4))
+    f, rows = vectors(2), RNG.normal(size=(3, 5))
     rows[::2, 2] = rows[::2, 1]  # (1, 1) and (2, 2) are symmetric
     factors = tuple(tuple(float(number) for number in row) for row in rows)
     u, v = np.array(f)
-    outers = np.array([np.outer(u, u), np.outer(u, v), np.outer(v, u), np.outer(v, v)])
-    b11, b12, b22 = (
-        own * np.eye(3) + np.tensordot(row, outers, 1) for own, row in zip(diagonals, factors, strict=True)
-    )
+    parts = np.array([np.outer(u, u), np.outer(u, v), np.outer(v, u), np.outer(v, v), np.eye(3)])
+    b11, b12, b22 = (np.tensordot(row, parts, 1) for row in factors)
     b01, b02 = -(b11 + b12.T), -(b12 + b22)
     values = np.zeros((6, 3, 3))
-    add_balanced(values, np.array([places], dtype=kind), 0, diagonals, f, factors)
+    add_balanced(values, np.array([places], dtype=kind), 0, f, factors)
     expected = sums_at(places, np.array([-(b01 + b02), b01, b02, b11, b12, b22]))
     np.testing.assert_allclose(values, expected, atol=1e-13)
 
