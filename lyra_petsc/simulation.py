@@ -170,7 +170,8 @@ class Simulation:
         """
         started = clock.perf_counter()
         system, n = self.model.system, self.model.points.n_owned
-        x_before, v_before = system.x.copy(), system.v.copy()
+        x_before = system.x.copy()
+        v_before = system.v.copy() if self.local_error is not None else system.v  # else no step is undone
         newton = linear = rejected = 0
         self._tried = []
         while True:

@@ -105,6 +105,7 @@ class BlockRows:
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
+        weights = np.ascontiguousarray(weights)  # as kernels are compiled for
         offsets = self.pattern.offsets
         if not term.add_hessians(x, blend, weights, offsets, values):
             rows = term.offsets_of_elements(offsets)

@@ -199,10 +199,6 @@ class Galerkin:
         ghosts.
     pattern : BlockPattern
         Of the coarse rows.
-    values : (n_blocks, 3, 3)
-        The coarse rows.
-    free : (n_owned, 3)
-        1 for coarse coordinates that something is interpolated from, else 0.
     """
 
     def __init__(
@@ -236,9 +232,7 @@ class Galerkin:
         place[inside] = np.searchsorted(final, own)
         place[mixed] = len(final) + np.arange(len(pairs))
         self._offset, self._far = self._where(target, place)
-        self._sums = np.zeros((len(final) + len(pairs), 9))
-        self.values = self._sums[: len(final)].reshape(-1, 3, 3)
-        self.free = np.ones((n, 3))
+        self._n_sums = len(final) + len(pairs)
 
     def _where(self, target: Ints, place: Ints) -> tuple[NDArray[np.uint8], Ints]:
         """Where products go that add to these keys, whose blocks stand at ``place``."""
@@ -286,20 +280,28 @@ class Galerkin:
             q += len(new)
         return keys, target
 
-    def project(self, values: Array, free: Array) -> None:
-        """Make the coarse block rows of fine ones (n_blocks, 3, 3); collective.
+    def project(self, values: Array, free: Array) -> tuple[Array, Array]:
+        """Make coarse block rows of fine ones (n_blocks, 3, 3); collective.
 
         ``free`` (n_owned, 3) is 0 for coordinates that nothing is interpolated to, 1 for others; those are
         decoupled in ``values``.
+
+        Returns
+        -------
+        values : (n_blocks, 3, 3)
+            The coarse rows.
+        free : (n_owned, 3)
+            1 for coarse coordinates that something is interpolated from, else 0.
         """
         fine, n = self._fine, self.pattern.n_blocks
-        self._sums[:] = 0.0
+        sums, coarse_free = np.zeros((self._n_sums, 9)), np.empty((self.pattern.n_owned, 3))
         rows = fine.indptr, fine.columns, self._start, self._parents, self._weights
         into = self.pattern.indptr, self._offset, self._far
-        _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, self._sums)
-        _finish_diagonal(self.pattern.indptr, self._sums)
-        self._shared.add(self._sums[n:], self._sums[:n])
-        _fill_diagonal(self.pattern.indptr, self._sums, self.free)
+        _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, sums)
+        _finish_diagonal(self.pattern.indptr, sums)
+        self._shared.add(sums[n:], sums[:n])
+        _fill_diagonal(self.pattern.indptr, sums, coarse_free)
+        return sums[:n].reshape(-1, 3, 3), coarse_free
 
 
 def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:

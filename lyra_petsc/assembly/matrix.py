@@ -39,8 +39,6 @@ class SystemMatrix:
     mat : PETSc.Mat
     followers : list of callables
         Are given the block rows (n_blocks, 3, 3) of the pattern whenever they change.
-    read : bool
-        Whether PETSc reads the entries; if not, only the followers get new ones.
     rows : (n_blocks, 3, 3) float64
         Where to put new block rows together for ``set``: PETSc's own array if that has the same layout. As
         long as the matrix lives.
@@ -79,7 +77,7 @@ class SystemMatrix:
             self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
         self.mat.setUp()
         self.followers: list[Callable[[NDArray[np.float64]], None]] = []
-        self.read = True
+        self._read = True
         self._storage: Storage | None = None
         # zeros that nobody touches take no memory
         self._stored.insert(np.zeros((pattern.n_blocks, 3, 3)), self.mat)
@@ -133,7 +131,7 @@ class SystemMatrix:
             values = values[self._diagonal]
         for follower in self.followers:
             follower(values)
-        if not self.read:
+        if not self._read:
             self.mat.stateIncrease()
         elif self._storage is not None:
             if self._half and values is not self.rows:
@@ -141,6 +139,18 @@ class SystemMatrix:
             self._storage.write(self.rows if self._half else values)
         else:
             self._stored.insert(values, self.mat)
+
+    @property
+    def multiplies_rows(self) -> bool:
+        """Whether its products are those of ``rows``, whatever PETSc's entries are."""
+        return self._half
+
+    def unread(self) -> None:
+        """From here on PETSc reads no entries: only the followers, and ``rows``, get new ones."""
+        self._read = False
+        if self._storage is not None:
+            with suppress(AttributeError, OSError):
+                self._storage.give_back()
 
     @property
     def can_be_larger(self) -> bool:

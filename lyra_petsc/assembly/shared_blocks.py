@@ -79,18 +79,19 @@ class SharedBlocks:
         self.rows: Ints = np.concatenate([part[0] for part in came])
         self.columns: Ints = np.concatenate([part[1] for part in came])
         self._counts = 9 * out, 9 * np.array([len(part[0]) for part in came])
-        self._send, self._received = np.empty((len(source), 9)), np.empty((len(self.rows), 9))
         self._target = np.zeros(0, dtype=np.int64)
 
     def into(self, target: Ints) -> None:
-        """Say where each block that comes in is to be added."""
+        """Say where each block that comes in is to be added; ``rows`` and ``columns`` are let go."""
         self._target = target
+        self.rows = self.columns = np.empty(0, dtype=np.int64)
 
     def add(self, blocks: Array, out: Array) -> None:
         """Add what all ranks have in blocks (m, 9) to the owners' out (n_blocks, 9); collective."""
         if self._comm.size == 1:
             return
-        _pack(blocks, self._source, self._how, self._send)
+        send, received = np.empty((len(self._source), 9)), np.empty((len(self._target), 9))
+        _pack(blocks, self._source, self._how, send)
         out_counts, in_counts = self._counts
-        self._comm.Alltoallv([self._send, out_counts], [self._received, in_counts])
-        _add(self._received, self._target, out)
+        self._comm.Alltoallv([send, out_counts], [received, in_counts])
+        _add(received, self._target, out)

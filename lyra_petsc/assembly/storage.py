@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import mmap
 from functools import cached_property
 
 import numpy as np
@@ -239,6 +240,22 @@ class Storage:
         if self.shared is None:
             self._copy(values)
         self._mat.assemble()
+
+    def give_back(self) -> None:
+        """Let go of the memory of entries in owned columns, also of ``shared``; Linux only.
+
+        They are 0 afterwards, and writing them takes memory again.
+        """
+        madvise = ctypes.CDLL(None).madvise
+        madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+        diagonal = self._mat.getDiagonalBlock()
+        part = ctypes.c_void_p(diagonal.handle)
+        array = self._array(part, self._sizes[0])
+        first = -(-array.ctypes.data // mmap.PAGESIZE) * mmap.PAGESIZE
+        pages = (array.ctypes.data + array.nbytes - first) // mmap.PAGESIZE
+        if pages > 0:
+            madvise(first, pages * mmap.PAGESIZE, mmap.MADV_DONTNEED)
+        self._give_back(part, ctypes.byref(ctypes.c_void_p()))
 
     def _parts(self) -> list[ctypes.c_void_p]:
         """This rank's matrices of entries in owned columns and in ghosts'; none where PETSc tells none."""

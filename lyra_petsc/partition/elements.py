@@ -36,6 +36,13 @@ class Elements:
             self.n_owned = len(self.stencil)
             self.index = np.arange(len(self.stencil), dtype=np.int64)
 
+    def once(self, name: str) -> Elements:
+        """The same elements, where a constant that is one number for all of them takes no memory."""
+        values = self.data.get(name)
+        if values is None or len(values) == 0 or values.ndim > 1 or (values != values[0]).any():
+            return self
+        return replace(self, data={**self.data, name: np.broadcast_to(values[0].copy(), values.shape)})
+
     def without(self, *names: str) -> Elements:
         """The same elements without these constants, which their term keeps in a form of its own."""
         return replace(self, data={key: self.data[key] for key in self.data if key not in names})

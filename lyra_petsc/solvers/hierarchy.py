@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,15 +62,12 @@ class InterpolationRows:
 
 
 class Level:
-    """Block rows of one level, and, but for the coarsest, the interpolation to it from the next coarser one.
+    """Points of one level, and, but for the coarsest, the interpolation to it from the next coarser one.
 
     Attributes
     ----------
     points : Points
     pattern : BlockPattern
-    values : (n_blocks, 3, 3)
-    free : (n_owned, 3)
-        0 for coordinates that take no part in interpolation, 1 for others.
     interpolation : InterpolationRows or None
         None again once the cycle has it in its own form.
     galerkin : Galerkin or None
@@ -78,8 +76,6 @@ class Level:
 
     def __init__(self, points: Points, pattern: BlockPattern) -> None:
         self.points, self.pattern = points, pattern
-        self.values: Array = np.zeros((0, 3, 3))
-        self.free: Array = np.ones((points.n_owned, 3))
         self.interpolation: InterpolationRows | None = None
         self.galerkin: Galerkin | None = None
 
@@ -109,18 +105,32 @@ class Hierarchy:
             level.interpolation = interpolation
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
             level.galerkin = Galerkin(level.points, level.pattern, *rows)
-            made = level.galerkin
-            level = Level(made.points, made.pattern)
-            level.values, level.free = made.values, made.free
+            level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
 
-    def set(self, values: Array, held: Mask) -> None:
-        """New block rows of the finest level; ``held`` (n_local, 3) are the prescribed coordinates."""
-        finest = self.levels[0]
-        finest.values, finest.free = values, np.where(held[: finest.points.n_owned], 0.0, 1.0)
+    def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
+        """Of each level, finest first, the block rows that those of the finest make; collective.
+
+        Each is made when it is asked for, and there is room for it only if the one before is let go.
+
+        Parameters
+        ----------
+        values : (n_blocks, 3, 3)
+            Of the finest level.
+        held : (n_local, 3)
+            Its prescribed coordinates.
+
+        Yields
+        ------
+        values : (n_blocks, 3, 3)
+        free : (n_owned, 3)
+            0 for coordinates that take no part in interpolation, 1 for others.
+        """
+        free = np.where(held[: self.levels[0].points.n_owned], 0.0, 1.0)
         for level in self.levels:
+            yield values, free
             if level.galerkin is not None:
-                level.galerkin.project(level.values, level.free)
+                values, free = level.galerkin.project(values, free)
 
     def destroy(self) -> None:
         """Free the communication objects of the coarse levels; collective."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,12 @@ from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.partition.points import Points
 from lyra_petsc.solvers.hierarchy import Hierarchy, Surface
+from lyra_petsc.solvers.options import shows_no_matrix
 from lyra_petsc.solvers.pcmg import PetscCycle
-from lyra_petsc.solvers.presets import PYTHON_TYPE
+from lyra_petsc.solvers.presets import CONJUGATE_GRADIENTS, PYTHON_TYPE
 from lyra_petsc.solvers.vcycle import VCycle
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 MOST_LEVELS = 20
@@ -61,19 +63,20 @@ class Multigrid:
         least = 1 if ours else 2
         most = max(least, PETSc.Options().getInt("pc_mg_levels", MOST_LEVELS))
         self.hierarchy = Hierarchy(points, pattern, surface, most)
-        self._values: NDArray[np.float64] | None = None
+        self._values: Array | None = None
         self._cycle: VCycle | PetscCycle | None = None
         if not ours:
             self._cycle = PetscCycle(ksp.getPC(), self.hierarchy)
         matrix.followers.append(self._follow)
 
-    def after_options(self, ksp: PETSc.KSP, *, alone: bool) -> None:
-        """Give our cycle, which PETSc makes when it reads the options, its levels; collective.
-
-        ``alone`` says that the matrix is the preconditioner's only, not the operator too.
-        """
+    def after_options(self, ksp: PETSc.KSP, operator: SystemMatrix) -> None:
+        """Give our cycle, which PETSc makes when it reads the options, its levels; collective."""
         if self._cycle is None:
-            self._matrix.read = not alone
+            multiplies_only = ksp.getType() in CONJUGATE_GRADIENTS and operator.multiplies_rows
+            if multiplies_only and shows_no_matrix():
+                operator.unread()
+            if self._matrix is not operator:
+                self._matrix.unread()
             pc = ksp.getPC()
             context: VCycle = pc.getPythonContext()
             context.attach(self.hierarchy, self._renew)
@@ -81,16 +84,15 @@ class Multigrid:
             # at the end of a program that destroys nothing PETSc would call Python when that is gone
             self._detach = weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
 
-    def _follow(self, values: NDArray[np.float64]) -> None:
+    def _follow(self, values: Array) -> None:
         self._values = values
         if isinstance(self._cycle, PetscCycle):  # ours asks for them when PETSc sets it up
-            self._renew()
-            self._cycle.update()
+            self._cycle.update(self._renew())
 
-    def _renew(self) -> None:
-        """Make the coarse block rows of the matrix as it is now; collective."""
+    def _renew(self) -> Iterator[tuple[Array, Array]]:
+        """Block rows of all levels for the matrix as it is now; collective."""
         assert self._values is not None
-        self.hierarchy.set(self._values, self._held())
+        return self.hierarchy.block_rows(self._values, self._held())
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""

@@ -22,6 +22,20 @@ READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidu
 """What PETSc asks for only while it leaves."""
 
 
+BLIND = (
+    "ksp_atol", "ksp_converged_reason", "ksp_initial_guess", "ksp_max_it", "ksp_monitor", "ksp_norm_type",
+    "ksp_rtol", "ksp_type", "log_", "malloc", "mat_type", "memory_view", "mg_coarse_", "options_", "pc_mg",
+    "pc_python_type", "pc_type", "snes_atol", "snes_converged_reason", "snes_force_iteration", "snes_lag",
+    "snes_ksp_ew", "snes_linesearch", "snes_max", "snes_monitor", "snes_rtol", "snes_stol", "ts_",
+)  # fmt: skip
+"""What options begin with that let nobody but the solvers themselves look at a matrix."""
+
+
+def shows_no_matrix() -> bool:
+    """Whether no option may let PETSc look at a matrix beside what its solvers do with it."""
+    return all(name.startswith(BLIND) for name in PETSc.Options().getAll())
+
+
 def fill_gaps(options: Mapping[str, Value]) -> list[str]:
     """Set each option that nobody has set; returns the names that were set."""
     database = PETSc.Options()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -22,7 +23,7 @@ class Interpolation:
     def __init__(self, level: Level, coarser: Level) -> None:
         rows, fine, points = level.interpolation, level.points, coarser.points
         assert rows is not None
-        self._level, self._weights = level, rows.weights
+        self._comm, self._weights = fine.comm, rows.weights
         counts = np.diff(rows.start)
         row = np.repeat(np.arange(fine.n_owned), counts)
         order = np.argsort(np.concatenate([3 * row, 3 * row + 1, 3 * row + 2]), kind="stable")
@@ -37,11 +38,10 @@ class Interpolation:
         self.mat = PETSc.Mat().createAIJ(sizes, nnz=nnz if fine.comm.size > 1 else nnz[0], comm=fine.comm)
         self._free: Array | None = None
 
-    def set(self) -> None:
-        """Interpolate to the level's free coordinates only; collective."""
-        free = self._level.free
+    def set(self, free: Array) -> None:
+        """Interpolate to coordinates only that are free (n_owned, 3); collective."""
         changed = self._free is None or not np.array_equal(free, self._free)
-        if not self._level.points.comm.allreduce(int(changed)):
+        if not self._comm.allreduce(int(changed)):
             return
         self._free = free.copy()
         values = np.concatenate([self._weights * free[self._row, axis] for axis in range(3)])
@@ -54,7 +54,6 @@ class PetscCycle:
 
     def __init__(self, pc: PETSc.PC, hierarchy: Hierarchy) -> None:
         levels = hierarchy.levels
-        self._levels = levels
         self._interpolations = [Interpolation(*pair) for pair in pairwise(levels)]
         kinds = ["baij"] * (len(levels) - 2) + ["aij"]
         self._matrices = [
@@ -68,7 +67,7 @@ class PetscCycle:
             PETSc.Options().setValue("pc_mg_levels", len(levels))
         for below, interpolation in enumerate(self._interpolations):
             number = len(levels) - 1 - below
-            interpolation.set()
+            interpolation.set(np.ones((levels[below].points.n_owned, 3)))
             matrix = self._matrices[below].mat
             pc.setMGInterpolation(number, interpolation.mat)
             solver = pc.getMGSmoother(number - 1) if number > 1 else pc.getMGCoarseSolve()
@@ -81,12 +80,13 @@ class PetscCycle:
             pc.setMGRhs(number - 1, right)
             pc.setMGX(number - 1, right.duplicate())
 
-    def update(self) -> None:
+    def update(self, block_rows: Iterator[tuple[Array, Array]]) -> None:
         """Take the levels' new block rows; collective."""
-        for interpolation in self._interpolations:
-            interpolation.set()
-        for level, matrix in zip(self._levels[1:], self._matrices, strict=True):
-            matrix.set(level.values)
+        for number, (values, free) in enumerate(block_rows):
+            if number > 0:
+                self._matrices[number - 1].set(values)
+            if number < len(self._interpolations):
+                self._interpolations[number].set(free)
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""

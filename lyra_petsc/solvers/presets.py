@@ -90,6 +90,9 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
+CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
+"""Krylov methods that but multiply by their operator, and watch the true residual if they are told to."""
+
 INCOMPLETE = ("ilu", "block-ilu")
 FACTORISATIONS = ("direct", "cholesky")
 

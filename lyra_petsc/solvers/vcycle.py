@@ -9,7 +9,7 @@ cycle on the same levels, with a choice of smoothers, is ``pcmg``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 
+Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 TWICE = 3
@@ -44,7 +45,7 @@ class Smoother:
 
     def __init__(self, level: Level) -> None:
         pattern, points = level.pattern, level.points
-        self._level, self.points = level, points
+        self.points = points
         n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
@@ -61,13 +62,12 @@ class Smoother:
         self._parents = rows.start, parents, rows.weights.astype(np.float32)
         self._free = np.ones((n, 3), dtype=np.float32)
 
-    def set(self) -> None:
-        """Take the level's block rows."""
-        level = self._level
-        values = level.values.reshape(-1, 9)
-        sweeps.store(level.pattern.indptr, values, self._blocks)
-        sweeps.invert_diagonal(level.pattern.indptr, values, self._inverse)
-        self._free[:] = level.free
+    def set(self, values: Array, free: Array) -> None:
+        """Take new block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) are interpolated to."""
+        values, first = values.reshape(-1, 9), self._rows[0]
+        sweeps.store(first, values, self._blocks)
+        sweeps.invert_diagonal(first, values, self._inverse)
+        self._free[:] = free
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
@@ -106,7 +106,7 @@ class Coarsest:
     """The last level, solved by a KSP of its own (``-mg_coarse_``)."""
 
     def __init__(self, level: Level) -> None:
-        self._level, self.points = level, level.points
+        self.points = level.points
         self.matrix = SystemMatrix(level.points, level.pattern, "aij", given=False)
         self.x, self.b = (np.zeros((level.points.n_local, 3), dtype=np.float32) for _ in range(2))
         self._solution, self._rhs = self.matrix.mat.createVecs()
@@ -115,14 +115,14 @@ class Coarsest:
         self._ksp.setType(PETSc.KSP.Type.PREONLY)
         self._ksp.setFromOptions()
 
-    def set(self) -> None:
-        """Take the level's block rows; collective."""
-        self.matrix.set(self._level.values)
+    def set(self, values: Array, free: Array) -> None:
+        """Take new block rows (n_blocks, 3, 3); collective."""
+        self.matrix.set(values)
         self._ksp.setOperators(self.matrix.mat)
 
     def solve(self) -> None:
         """x of b; collective."""
-        n = self._level.points.n_owned
+        n = self.points.n_owned
         self._rhs.getArray()[:] = self.b[:n].ravel()
         self._ksp.solve(self._rhs, self._solution)
         self.x[:n] = self._solution.getArray().reshape(-1, 3)
@@ -138,15 +138,15 @@ class VCycle:
 
     def __init__(self) -> None:
         self._levels: list[Smoother | Coarsest] = []
-        self._renew: Callable[[], None] | None = None
+        self._renew: Callable[[], Iterator[tuple[Array, Array]]] | None = None
         self._twice_from = 0
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read ``-pc_mg_w_from``."""
         self._twice_from = PETSc.Options(pc.getOptionsPrefix()).getInt("pc_mg_w_from", 0)
 
-    def attach(self, hierarchy: Hierarchy, renew: Callable[[], None]) -> None:
-        """Work on these levels, which ``renew`` brings up to date; collective."""
+    def attach(self, hierarchy: Hierarchy, renew: Callable[[], Iterator[tuple[Array, Array]]]) -> None:
+        """Work on these levels, whose present block rows ``renew`` makes; collective."""
         *finer, coarsest = hierarchy.levels
         self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
         for level in finer:
@@ -164,9 +164,8 @@ class VCycle:
         if self._renew is None:
             prefix = pc.getOptionsPrefix() or ""
             raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
-        self._renew()
-        for level in self._levels:
-            level.set()
+        for level, rows in zip(self._levels, self._renew(), strict=True):
+            level.set(*rows)
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one cycle on b; collective."""

@@ -175,7 +175,7 @@ class Equilibrium:
             position=system.x[:n].copy(),
             residual=-force,
             forces={"loads": -system.loads_now, "internal": system.loads_now - force},
-            prescribed=system.mask[:n].copy(),
+            prescribed=system.prescribed.mask[:n].copy(),
             goal=goal,
             snes_reason=0,
             ksp_reason=0,

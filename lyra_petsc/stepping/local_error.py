@@ -56,7 +56,7 @@ class LocalError:
             assert self._slope is not None
             third = 2.0 * (slope - self._slope) / (dt + self._dt)
             error = system.scheme.error_constant * dt**3 * third
-        largest = float(np.abs(error).max(initial=0.0, where=~system.mask[:n]))
+        largest = float(np.abs(error).max(initial=0.0, where=~system.prescribed.mask[:n]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
     def accepted(self, v_before: Array, dt: float) -> None:

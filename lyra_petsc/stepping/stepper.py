@@ -20,7 +20,14 @@ from lyra_petsc.solvers import failed_factors, reasons
 from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.solvers.presets import INCOMPLETE, READS_DIAGONAL, candidates, linear_limit, options_of
+from lyra_petsc.solvers.presets import (
+    CONJUGATE_GRADIENTS,
+    INCOMPLETE,
+    READS_DIAGONAL,
+    candidates,
+    linear_limit,
+    options_of,
+)
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.extrapolation import Extrapolation
@@ -51,9 +58,6 @@ class Attempt:
 
 FIRST_OF_ALL = 1e-3
 """First Δt of an adaptive run over its length; the estimate corrects it at once."""
-
-TRUE_NORM = ("cg", "fcg", "pipecg", "groppcg")
-"""Krylov methods that can watch the true residual with left preconditioning."""
 
 
 class Stepper:
@@ -168,7 +172,7 @@ class Stepper:
         self._multigrid: Multigrid | None = None
         if kind_asked_for():
             rows = self.preconditioner, points, self._pattern, self._surface
-            self._multigrid = Multigrid(ksp, *rows, held=lambda: system.mask)
+            self._multigrid = Multigrid(ksp, *rows, held=lambda: system.prescribed.mask)
         self._trace = Trace(snes, system, self._linear_iterations)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
@@ -189,8 +193,8 @@ class Stepper:
         except PETSc.Error as error:
             raise refused(error) from None
         if self._multigrid is not None:
-            self._multigrid.after_options(ksp, alone=self.preconditioner is not self.matrix)
-        if ksp.getType() in TRUE_NORM and not is_set("ksp_norm_type"):
+            self._multigrid.after_options(ksp, self.matrix)
+        if ksp.getType() in CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         refuse_contradictions(ts, system.scheme.ts_type)

@@ -33,7 +33,6 @@ from lyra_petsc.stepping.schemes.scheme import Follower, Scheme, Stage
 from lyra_petsc.terms.term import Elastic, Load, Viscous
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class ReducedSystem:
@@ -59,6 +58,8 @@ class ReducedSystem:
     history : (n_owned, 3)
         The stage's v_h [m/s].
     departures : Departures
+    prescribed : Prescribed
+        Coordinates that exact handles hold in the step.
     anchored : float
         Energy [J] of this rank's clamps at the start of the step, against where they stand at its stage.
     dt, t0, t1 : float
@@ -89,13 +90,15 @@ class ReducedSystem:
         self.elastic, self.viscous, self.loads, self.held = elastic, viscous, loads, held
         self._blocks, self._events = blocks, events
         self.departures = Departures(points, held, elastic, starts)
-        self._prescribed = Prescribed(points, held, blocks)
+        self.prescribed = Prescribed(points, held, blocks)
         self._springs = [term for term in elastic if term.name == "spring"]
         self._shell = [term for term in elastic if term.name != "spring"]
         still = all(type(term).prepare is Elastic.prepare for term in self._shell)
         shell = partial(self._sum, self._shell)  # moving targets change the forces at one and the same place
         self._internal = Remembered(shell) if still else shell
         self._damping = Damping(points, blocks, elastic, moves=scheme.moves, once=scheme.explicit)
+        seen = [self._internal, *([self._damping.product] if scheme.explicit else [])]
+        self._at_iterate = [each for each in seen if isinstance(each, Remembered)]
         self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((points.n_local, 3)) for _ in range(5))
         self._xh, self.history = self.x, self.v[: points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
@@ -113,11 +116,6 @@ class ReducedSystem:
         """Let everything that starts to act by ``time`` [s] set out from the present positions."""
         self.departures.until(time, self.x)
 
-    @property
-    def mask(self) -> Mask:
-        """Prescribed coordinates (n_local, 3) of the step."""
-        return self._prescribed.mask
-
     # -- a step ------------------------------------------------------------------------------------
 
     def begin_step(self, t0: float, t1: float) -> None:
@@ -125,7 +123,7 @@ class ReducedSystem:
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
         self.new_iterate(None)
         after = self.scheme.stage_after(self.dt)
-        changed = self._prescribed.begin_step(t0, t1)
+        changed = self.prescribed.begin_step(t0, t1)
         self._freeze(t0 + after)
         if changed or t0 in self._events:
             for follower in self.followers:
@@ -179,14 +177,14 @@ class ReducedSystem:
         given = bool(self.held) and self.scheme.given
         if stage.x is None and not given:
             self._xh = self.x
-            self._prescribed.solve(self.x[:n], stage.reach)
+            self.prescribed.solve(self.x[:n], stage.reach)
             return
         self._xh = np.empty_like(self.x)
         self._xh[:n] = self.x[:n] if stage.x is None else stage.x
         if given:
-            self._prescribed.give(at, self._xh[:n], stage.reach)
+            self.prescribed.give(at, self._xh[:n], stage.reach)
         else:
-            self._prescribed.solve(self._xh[:n], stage.reach)
+            self.prescribed.solve(self._xh[:n], stage.reach)
         self.points.update_ghosts(self._xh)
 
     @property
@@ -197,7 +195,7 @@ class ReducedSystem:
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free coordinates now, norm [N] of its largest part; collective."""
         parts = self._parts(self.x, self.v, np.zeros_like(self.history))
-        return np.where(self._prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
+        return np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
 
     @property
     def stage_velocity(self) -> Array:
@@ -206,7 +204,7 @@ class ReducedSystem:
 
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed coordinates of v (n_owned, 3) by their velocities at the stage."""
-        self._prescribed.put(v, self._prescribed.velocity)
+        self.prescribed.put(v, self.prescribed.velocity)
 
     def velocity_of_staying(self) -> Array:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
@@ -214,22 +212,22 @@ class ReducedSystem:
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
-        n, given, free = self.points.n_owned, self.scheme.given, self._prescribed.free
+        n, given, free = self.points.n_owned, self.scheme.given, self.prescribed.free
         self._evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
         moved, rate = self.scheme.end(before, rate_before, v, self.dt)
         self.scheme.accepted(before, rate_before, free, self.dt)
         self.x[:n] = moved
-        self._prescribed.put(self.x[:n], self._prescribed.goal)
+        self.prescribed.put(self.x[:n], self.prescribed.goal)
         self.v[:n] = rate
         if given:
-            self._prescribed.overwrite_with_rates(self.v[:n])
+            self.prescribed.overwrite_with_rates(self.v[:n])
         for values in (self.x, self.v):
             self.points.update_ghosts(values)
 
     def written_velocity(self) -> Array:
         """Velocities (n_owned, 3) to write out: those of prescribed coordinates are ẋ*(t)."""
-        self._prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
+        self.prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
     @cached_property
@@ -248,8 +246,9 @@ class ReducedSystem:
 
     def forces_at_stage(self) -> dict[str, Array]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
-        n = self.points.n_owned
-        return self._parts(self._xs, self._vs, self.stage.sigma * (self._vs[:n] - self.history))
+        rate = self.stage.sigma * (self._vs[: self.points.n_owned] - self.history)
+        parts, self._last_parts = self._parts(self._xs, self._vs, rate), {}
+        return parts
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
         n, self._last_parts = self.points.n_owned, {}  # there is no room for both
@@ -274,13 +273,13 @@ class ReducedSystem:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
         parts = self._parts(*self._evaluate_at(v), vdot).values()
         reduce(lambda total, part: np.add(total, part, out=out), parts)
-        at = self._prescribed.at
-        too_fast = v.take(at) - self._prescribed.velocity
-        self._prescribed.put(out, self.stage.sigma * self.mass[at // 3] * too_fast)
+        at = self.prescribed.at
+        too_fast = v.take(at) - self.prescribed.velocity
+        self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * too_fast)
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free coordinates; collective."""
-        parts = (np.where(self._prescribed.free, part, 0.0) for part in self._last_parts.values())
+        parts = (np.where(self.prescribed.free, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
 
     def new_iterate(self, v: Array | None) -> None:
@@ -303,8 +302,11 @@ class ReducedSystem:
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
         x, vs = self._evaluate_at(v)
+        self._last_parts = {}  # the linear solve needs the room
+        for remembered in self._at_iterate:
+            remembered.forget()
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        changing = self._prescribed.blocks
+        changing = self.prescribed.blocks
         if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, changing):
             self._damping.into(values, inertia)
             for term in self.elastic:
@@ -312,8 +314,8 @@ class ReducedSystem:
         if not self.scheme.explicit:
             for wind in self.viscous:
                 self._blocks.add_viscosity(wind, vs, values)
-        if len(self._prescribed.rows):
-            self._blocks.constrain(values, self.mask, self._prescribed.rows)
+        if len(self.prescribed.rows):
+            self._blocks.constrain(values, self.prescribed.mask, self.prescribed.rows)
 
     def objective(self, v: Array) -> tuple[float, float]:
         """The function whose gradient F is, and what its round-off is relative to [W].

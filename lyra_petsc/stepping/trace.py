@@ -138,7 +138,7 @@ class Trace:
             position,
             residual,
             system.forces_at_stage(),
-            system.mask[:n].copy(),
+            system.prescribed.mask[:n].copy(),
             goal,
             int(self._snes.getConvergedReason()),
             int(self._ksp.getConvergedReason()),

@@ -40,17 +40,22 @@ class Ledger:
     Attributes
     ----------
     budget : Budget
-    reaction : (n_owned, 3) float64
-        Force [N] of the exact handles on the sheet in the last step; zero in free coordinates.
     """
 
     def __init__(self, system: ReducedSystem) -> None:
         self._system = system
         self.budget = Budget()
-        self.reaction: Array = np.zeros((system.points.n_owned, 3))
+        self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
         self._anchored = 0.0
-        self._pull = np.zeros_like(self.reaction)
+        self._pull: Array | float = 0.0
         self.measure()
+
+    @property
+    def reaction(self) -> Array:
+        """Force (n_owned, 3) [N] of exact handles on the sheet in the last step; 0 in free coordinates."""
+        out = np.zeros((self._system.points.n_owned, 3))
+        np.put(out, self._at, self._reactions)
+        return out
 
     def measure(self) -> Budget:
         """Energies of the present state into the budget."""
@@ -73,13 +78,10 @@ class Ledger:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
-        n, dt = system.points.n_owned, system.dt
-        x = system.x[:n]
-        parts = system.forces_at_stage()
-        self.reaction = sum(parts.values())  # type: ignore[assignment]
-        self.reaction[~system.mask[:n]] = 0.0
-        moved = x - x_before
-        external = self.reaction - parts["loads"]
+        parts, self._at = system.forces_at_stage(), system.prescribed.at
+        self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
+        external = -parts.pop("loads")
+        np.put(external, self._at, external.take(self._at) + self._reactions)
         for load in system.loads:
             if load.name == "gravity":  # it has a potential, and does no work from outside
                 weight = np.zeros_like(external)
@@ -93,9 +95,11 @@ class Ledger:
             external, self._pull = 0.5 * (external + self._pull), external
         # a clamp's plane turns with its handle, which works on the sheet through it
         turned = system.anchored - self._anchored + self._turn_to_end()
+        moved = system.x[: len(x_before)] - x_before
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         if "damping" in parts:
-            local[1] = dt * float(np.vdot(system.stage_velocity, parts["damping"]))
+            local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
+        del parts, external, moved  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)

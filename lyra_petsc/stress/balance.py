@@ -123,7 +123,7 @@ class Accountant:
         n, dt = system.points.n_owned, report.dt
         x0, v0, x1, v1 = self._x, self._v, system.x, system.v
         dx, dv = x1 - x0, v1[:n] - v0[:n]
-        free = ~system.mask[:n]
+        free = ~system.prescribed.mask[:n]
         parts = self._parts(report, dv / dt)
         total = np.asarray(sum(parts.values()))
         reaction = self._simulation.ledger.reaction
@@ -205,7 +205,7 @@ class Accountant:
     def _promise(self, parts: Mapping[str, Array], reach: float) -> tuple[float, float, float]:
         """What the solver promised for the residual, its floor of round-off, and the driving forces [N]."""
         system, simulation = self._system, self._simulation
-        free = ~system.mask[: system.points.n_owned]
+        free = ~system.prescribed.mask[: system.points.n_owned]
         squares = np.array([float(np.sum(part**2, where=free)) for part in parts.values()])
         norms = dict(zip(parts, np.sqrt(system.points.comm.allreduce(squares)).tolist(), strict=True))
         floor = residual_roundoff(system, max(reach, simulation.model.outline.reach))

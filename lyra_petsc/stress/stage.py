@@ -34,7 +34,7 @@ class StageAccountant(Accountant):
         if not any(term.name == "clamp" for term in self._shell):
             # clamps push from outside, and cannot be told from the sheet's own forces here
             gap = gap - parts["internal"] - parts.get("damping", 0.0)
-        free = ~system.mask[:n]
+        free = ~system.prescribed.mask[:n]
         sums = comm.allreduce(
             np.array(
                 [

@@ -27,7 +27,7 @@ class Term(ABC):
     name: ClassVar[str]
 
     def __init__(self, elements: Elements) -> None:
-        self.elements = elements
+        self.elements = elements.once("damping")
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
         self.n_elements = len(self.stencil)
         self.n_owned = elements.n_owned

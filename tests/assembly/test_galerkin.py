@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -38,14 +40,14 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
         model.system._blocks.constrain(values, mask, np.arange(points.n_owned))
         hierarchy = Hierarchy(points, pattern, model.surface, most=3)
         assert len(hierarchy.levels) == 3
-        hierarchy.set(np.ones_like(values), ~mask)  # what is left from before must not show
-        hierarchy.set(values, mask)
-        for level, coarser in zip(hierarchy.levels, hierarchy.levels[1:], strict=False):
+        list(hierarchy.block_rows(np.ones_like(values), ~mask))  # what is left from before must not show
+        rows = list(zip(hierarchy.levels, hierarchy.block_rows(values, mask), strict=True))
+        for (level, (of_fine, free)), (coarser, (of_coarse, coarse_free)) in pairwise(rows):
             fine, coarse = (SystemMatrix(at.points, at.pattern, "aij") for at in (level, coarser))
-            fine.set(level.values)
-            coarse.set(coarser.values)
+            fine.set(of_fine)
+            coarse.set(of_coarse)
             interpolation = Interpolation(level, coarser)
-            interpolation.set()
+            interpolation.set(free)
             product = fine.mat.ptap(interpolation.mat)
             x, _ = product.createVecs()
             x.setArray(rng.standard_normal(x.getLocalSize()))
@@ -54,7 +56,7 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
             # coordinates that nothing is interpolated from have a one on the diagonal
             product.getDiagonal(diagonal_part)
             dead = diagonal_part.getArray() == 0.0
-            assert np.array_equal(dead.reshape(-1, 3), coarser.free == 0.0)
+            assert np.array_equal(dead.reshape(-1, 3), coarse_free == 0.0)
             expected.getArray()[dead] = x.getArray()[dead]
             coarse.mat.mult(x, found)
             np.testing.assert_allclose(found.getArray(), expected.getArray(), rtol=0.0, atol=1e-11)
@@ -72,8 +74,9 @@ def test_nothing_is_interpolated_to_held_coordinates(comm: MPI.Comm) -> None:
         mask[points.global_number % 3 == 0, 1] = True
         interpolation = Interpolation(*hierarchy.levels)
         for held in (~mask, mask):
-            hierarchy.set(np.zeros((simulation.model.pattern.n_blocks, 3, 3)), held)
-            interpolation.set()
+            rows = np.zeros((simulation.model.pattern.n_blocks, 3, 3))
+            _, free = next(hierarchy.block_rows(rows, held))
+            interpolation.set(free)
             ones, out = interpolation.mat.createVecs()
             ones.set(1.0)
             interpolation.mat.mult(ones, out)

@@ -97,7 +97,7 @@ def test_matrix_is_the_derivative_of_the_residual(comm: MPI.Comm, kind: str) -> 
         assert matrix.kind == kind
         analytic = product(matrix, direction)
         # prescribed coordinates are decoupled in the matrix: move only the free ones for their rows
-        free = ~simulation.system.mask[: len(v)]
+        free = ~simulation.system.prescribed.mask[: len(v)]
         h = 1e-3
         d = np.where(free, direction, 0.0)
         numeric = (
@@ -144,7 +144,7 @@ def test_formats_agree_and_the_matrix_is_symmetric(comm: MPI.Comm, blend: float)
 def test_residual_is_the_gradient_of_the_objective(comm: MPI.Comm) -> None:
     with Simulation(EVERYTHING, comm) as simulation:
         v, direction = bent_state(simulation)
-        free = ~simulation.system.mask[: len(v)]
+        free = ~simulation.system.prescribed.mask[: len(v)]
         d = np.where(free, direction, 0.0)
         h = 1e-3
 

@@ -80,7 +80,7 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert not system.loads
         assert not system._damping.acts
         assert system._damping._values is None
-        assert len(system._prescribed.goal) == len(system._prescribed.rows) == 0
+        assert len(system.prescribed.goal) == len(system.prescribed.rows) == 0
         assert simulation.model.probes == {}
 
 

@@ -64,7 +64,7 @@ def paper_step(system: ReducedSystem, dt: float) -> Array:
         wind.add_gradient(v_old, push)
         force -= push
     b = mass * v_old.ravel() + dt * force.ravel()
-    free = ~system.mask.ravel()
+    free = ~system.prescribed.mask.ravel()
     v = np.zeros(len(b))
     v[free] = np.linalg.solve(a[np.ix_(free, free)], b[free])
     return v.reshape(x.shape)
