@@ -99,9 +99,7 @@ class Model:
     def release(self) -> None:
         """Let go of the whole mesh; from here on no rank holds a global array."""
         self.mesh = None
-        # a library of PETSc's (SuperLU_dist) tells malloc to keep all that is freed
-        with suppress(AttributeError, OSError):  # glibc only
-            ctypes.CDLL(None).malloc_trim(0)
+        _give_back_freed()
 
     @property
     def membrane(self) -> Membrane:
@@ -144,7 +142,17 @@ def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
         part = distribute(comm, whole)
         whole = None
     with phases("assembly"):
-        return _local(scene, outline, part, mesh)
+        model = _local(scene, outline, part, mesh)
+        del part
+        _give_back_freed()
+        return model
+
+
+def _give_back_freed() -> None:
+    """Let the system have the memory that was freed."""
+    # a library of PETSc's (SuperLU_dist) tells malloc to keep it
+    with suppress(AttributeError, OSError):  # glibc only
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def events(scene: Scene) -> list[float]:

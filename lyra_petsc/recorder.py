@@ -67,7 +67,7 @@ class Recorder:
         self._triangles: FileOrder | None = None
         if any(field.on == "triangle" for field in self._fields):
             elements = model.membrane.elements
-            own = elements.index[: elements.n_owned]
+            own = elements.index[: elements.n_owned].astype(np.int64)
             self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
         self._comm = points.comm
         self._background = Background(points.comm)

@@ -110,7 +110,7 @@ class Simulation:
         self.mesh: Mesh | None = model.mesh
         self.vertices: NDArray[np.int64] = model.points.original
         elements = model.membrane.elements
-        self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned]
+        self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned].astype(np.int64)
         _OPEN.add(self)
 
     # -- stepping ------------------------------------------------------------------------------------

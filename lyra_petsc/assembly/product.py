@@ -29,7 +29,7 @@ ERR_LIB = 76
 MOST_VECTORS = 64
 """Vectors whose arrays are remembered."""
 
-MOST_KEPT = 30_000
+MOST_KEPT = 20_000
 """Rows up to which scratch is kept; more of it is got quickly enough, and assembly needs the room."""
 
 _Operation = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
@@ -110,7 +110,8 @@ class MatMult:
         self._size = ctypes.c_double * mat.getLocalSize()[0]
         self._seen: dict[int | None, Array] = {None: np.empty((0, 3))}  # of no rows
         self._points = points
-        self._local = np.zeros((points.n_local, 3)) if points is not None else np.empty((0, 3))
+        n_local = points.n_local if points is not None else 0
+        self._local = np.empty((n_local, 3)) if n_local <= MOST_KEPT else None
         self._operations = 2.0 * 9.0 * couplings
         self._callback = _Operation(self._mult)
         self._handle, usual = int(mat.handle), ctypes.c_void_p()
@@ -148,6 +149,7 @@ class MatMult:
     def _with_ghosts(self, x: Array) -> Array:
         if self._points is None:
             return x
-        self._local[: len(x)] = x
-        self._points.update_ghosts(self._local)
-        return self._local
+        local = np.empty((self._points.n_local, 3)) if self._local is None else self._local
+        local[: len(x)] = x
+        self._points.update_ghosts(local)
+        return local

@@ -129,7 +129,8 @@ def _pieces(whole: Whole, numbering: Numbering, n_ranks: int):  # type: ignore[n
             order = _by_locality(stencil, n_owned)
             index = index[order]
             data = {key: np.ascontiguousarray(v[index]) for key, v in whole.elements[name].data.items()}
-            elements[name] = Elements(stencil[order].astype(np.int32), data, n_owned, index)
+            counts = np.promote_types(np.int32, np.min_scalar_type(-len(whole.elements[name].stencil)))
+            elements[name] = Elements(stencil[order].astype(np.int32), data, n_owned, index.astype(counts))
         original = by_number[lo:hi]
         vertex_data = {key: np.ascontiguousarray(v[original]) for key, v in whole.vertex_data.items()}
         yield numbering.bounds, ghosts, original, elements, vertex_data

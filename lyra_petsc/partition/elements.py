@@ -22,14 +22,14 @@ class Elements:
     n_owned : int
         The first ``n_owned`` elements are counted on this rank (energies, diagnostics); the
         rest also touch a vertex that it owns. Equal to E before distribution.
-    index : (E,) int64
+    index : (E,) int64; int32 after distribution, where that counts so far
         Number of each element before distribution.
     """
 
     stencil: NDArray[np.int32] | NDArray[np.int64]
     data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     n_owned: int = -1
-    index: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    index: NDArray[np.int32] | NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         if self.n_owned < 0:

@@ -24,7 +24,7 @@ READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidu
 
 BLIND = (
     "ksp_atol", "ksp_converged_reason", "ksp_initial_guess", "ksp_max_it", "ksp_monitor", "ksp_norm_type",
-    "ksp_rtol", "ksp_type", "log_", "malloc", "mat_type", "memory_view", "mg_coarse_", "options_", "pc_mg",
+    "ksp_rtol", "ksp_type", "log_", "malloc", "mat_type", "memory_view", "mg_", "options_", "pc_mg",
     "pc_python_type", "pc_type", "snes_atol", "snes_converged_reason", "snes_force_iteration", "snes_lag",
     "snes_ksp_ew", "snes_linesearch", "snes_max", "snes_monitor", "snes_rtol", "snes_stol", "ts_",
 )  # fmt: skip

@@ -243,7 +243,7 @@ def _triangle(points: Points, membrane: Membrane, stuck: Stuck, residual: Array)
             stretches=_stretches(corners, inverse[row]),
         )
 
-    return worst(points.comm, sizes, membrane.elements.index[:owned], describe)
+    return worst(points.comm, sizes, membrane.elements.index[:owned].astype(np.int64), describe)
 
 
 def _aspect(inverse: Array) -> float:

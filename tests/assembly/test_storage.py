@@ -87,3 +87,58 @@ def test_rows_are_put_together_where_petsc_keeps_them() -> None:
         np.testing.assert_allclose((z - y).getArray()[:3], x.getArray()[:3], rtol=0.0, atol=1e-12)
         for matrix in (half, whole, beside):
             matrix.destroy()
+
+
+@pytest.mark.parallel
+def test_a_larger_diagonal_lasts_as_long_as_it_is_used(comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        values = symmetric(points, pattern, 0.5)
+        matrix, larger = (SystemMatrix(points, pattern, "baij", given=False) for _ in range(2))
+        assert matrix.can_be_larger
+        assert not SystemMatrix(points, pattern, "aij", given=False).can_be_larger
+        matrix.set(values)
+        larger.set(values, 0.3)
+        before, state = matrix.mat.duplicate(copy=True), matrix.mat.stateGet()
+        with matrix.larger_diagonal(0.3):
+            assert matrix.mat.equal(larger.mat)
+        assert matrix.mat.equal(before)
+        assert matrix.mat.stateGet() == state  # what was made of it stays
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("kind", ["baij", "aij"])
+def test_of_a_diagonal_matrix_other_blocks_are_left_out(kind: str, comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        values = symmetric(points, pattern, 0.5)
+        whole = SystemMatrix(points, pattern, kind, given=False)
+        part = SystemMatrix(points, pattern, "baij", given=False, beside=whole, diagonal=True)
+        assert part.rows is whole.rows
+        for _ in range(2):  # through MatSetValues, and straight into the arrays
+            part.set(values)
+        found = part.mat.getDiagonalBlock().getValuesCSR()[2]
+        np.testing.assert_array_equal(found.reshape(-1, 3, 3), values[pattern.indptr[:-1]].transpose(0, 2, 1))
+        assert part.mat.getInfo()["nz_used"] == 9 * points.n_global
+
+
+@pytest.mark.parallel
+def test_entries_that_nobody_reads_are_not_written(comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        read, unread = (SystemMatrix(points, pattern, "sbaij", given=False) for _ in range(2))
+        unread.unread()
+        x, y = read.mat.createVecs()
+        z = y.duplicate()
+        x.setArray(np.random.default_rng(comm.rank).standard_normal(3 * points.n_owned))
+        for shift in (0.5, 1.5):
+            state = unread.mat.stateGet()
+            for matrix in (read, unread):
+                matrix.rows[:] = symmetric(points, pattern, shift)
+                matrix.set(matrix.rows)
+            assert unread.mat.stateGet() > state
+            read.mat.mult(x, y)
+            unread.mat.mult(x, z)
+            np.testing.assert_array_equal(y.getArray(), z.getArray())
+        entries = unread.mat.norm(PETSc.NormType.FROBENIUS)
+        assert entries == (0.0 if comm.size > 1 else read.mat.norm(PETSc.NormType.FROBENIUS))

@@ -216,3 +216,15 @@ def test_edges_are_numbered_and_exchanged_by_the_same_code(comm: MPI.Comm) -> No
     assert mine[0] == layout.bounds[comm.rank] + 3 * 8
     assert mine[-1] == layout.bounds[comm.rank + 1] - 1
     edges.destroy()
+
+
+def test_a_constant_that_is_one_number_takes_no_memory() -> None:
+    stencil = np.arange(12).reshape(4, 3)
+    data = {"same": np.full(4, 0.3), "other": np.arange(4.0), "wide": np.ones((4, 2))}
+    elements = Elements(stencil, data)
+    for name in (*data, "missing"):
+        assert elements.once(name).data.keys() == data.keys()
+    assert elements.once("other") is elements.once("wide") is elements.once("missing") is elements
+    once = elements.once("same").data["same"]
+    assert once.strides == (0,)
+    np.testing.assert_array_equal(once, data["same"])

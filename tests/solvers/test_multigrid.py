@@ -193,3 +193,29 @@ def test_sweeps_that_grow_without_bound_are_negative_curvature(comm: MPI.Comm) -
     assert simulation.stepper.preset == "multigrid-w"
     assert not simulation.notes
     simulation.destroy()
+
+
+@pytest.mark.parametrize(
+    ("options", "complete"),
+    [({"ksp_monitor": "ascii:/dev/null"}, False), ({"ksp_view_mat": "ascii:/dev/null"}, True)],
+    ids=["monitored", "viewed"],
+)
+def test_the_operator_has_entries_for_who_looks(
+    options: dict[str, str], complete: bool, comm: MPI.Comm
+) -> None:
+    """Our products need none; on one rank they are where the rows are put together."""
+    database = PETSc.Options()
+    given = options | {"pc_type": "python", "pc_python_type": PYTHON_TYPE}
+    for name, value in given.items():
+        database[name] = value
+    try:
+        simulation = Simulation(comm, Scene.model_validate(hanging(25)))
+        simulation.step()
+        rows = simulation.stepper.matrix.rows
+        size = simulation.stepper.matrix.mat.norm(PETSc.NormType.INFINITY)
+        simulation.destroy()
+    finally:
+        for name in [*given, *simulation.stepper.our_options]:
+            database.delValue(name)
+    largest = comm.allreduce(float(np.abs(rows).max()), MPI.MAX)
+    assert (size > largest) == (complete or comm.size == 1)

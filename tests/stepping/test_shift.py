@@ -10,7 +10,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
+from lyra_petsc import profiling
 from lyra_petsc.simulation import Simulation
+from lyra_petsc.solvers.presets import INCOMPLETE
 from lyra_petsc.stepping import shift
 from lyra_petsc.stepping.shift import LARGEST, LEAST, Shift
 
@@ -119,3 +121,27 @@ def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> 
         assert (notes, preset) == ([], "user")
         ends.append(x)
     np.testing.assert_allclose(*ends, atol=1e-5)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("lag", [False, True])
+def test_factors_are_made_once_a_step_of_the_jacobian_itself(comm: MPI.Comm, lag: bool) -> None:
+    scene = HANGING | {"time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"}}
+    # SNES decides after the Jacobian whether factors are due
+    options = {"snes_lag_preconditioner": "2", "snes_lag_preconditioner_persists": "true"} if lag else {}
+    PETSc.Log.begin()
+    made, stage = PETSc.Log.Event("MatLUFactorNum"), profiling.STAGES["solve"].id
+    for name, value in options.items():
+        PETSc.Options().setValue(name, value)
+    try:
+        simulation = Simulation(comm, scene_of(scene))
+        assert simulation.stepper.preset in INCOMPLETE
+        assert (simulation.stepper.preconditioner is simulation.stepper.matrix) == (not lag)
+        before = made.getPerfInfo(stage)["count"]
+        for _ in range(4):
+            simulation.step()
+        assert made.getPerfInfo(stage)["count"] - before == (2 if lag else 4)
+        simulation.destroy()
+    finally:
+        for name in [*options, *simulation.stepper.our_options]:
+            PETSc.Options().delValue(name)
