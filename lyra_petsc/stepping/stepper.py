@@ -16,18 +16,10 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.parallel import all_here
 from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers import failed_factors, reasons
+from lyra_petsc.solvers import failed_factors, presets, reasons
 from lyra_petsc.solvers.hierarchy import Surface
 from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
 from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
-from lyra_petsc.solvers.presets import (
-    CONJUGATE_GRADIENTS,
-    INCOMPLETE,
-    READS_DIAGONAL,
-    candidates,
-    linear_limit,
-    options_of,
-)
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.extrapolation import Extrapolation
@@ -110,7 +102,7 @@ class Stepper:
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
         expected = 0.0 if static else expected_iterations(system, step)
-        self.presets = candidates(
+        self.presets = presets.candidates(
             points.n_global, points.comm.size, static=static, newton=self._iterates, iterations=expected
         )
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
@@ -127,11 +119,11 @@ class Stepper:
         system, scene = self._system, self._scene
         points = system.points
         self.preset = self.presets[0]
-        self._fill(options_of(self.preset, points.comm.size))
+        self._fill(presets.options_of(self.preset, points.comm.size))
         self.matrix = SystemMatrix(points, self._pattern, "baij")
         self.preconditioner = self.matrix
         if self._separate():
-            diagonal = PETSc.Options().getString("pc_type", "") in READS_DIAGONAL
+            diagonal = PETSc.Options().getString("pc_type", "") in presets.READS_DIAGONAL
             self.preconditioner = SystemMatrix(
                 points, self._pattern, "baij", given=not diagonal, beside=self.matrix, diagonal=diagonal
             )
@@ -155,7 +147,7 @@ class Stepper:
         self.snes = snes = ts.getSNES()
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
-        limit = linear_limit(points.n_global, self.presets)
+        limit = presets.linear_limit(points.n_global, self.presets)
         self._newton = newton = Newton(
             snes,
             system,
@@ -194,7 +186,7 @@ class Stepper:
             raise refused(error) from None
         if self._multigrid is not None:
             self._multigrid.after_options(ksp, self.matrix)
-        if ksp.getType() in CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
+        if ksp.getType() in presets.CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         refuse_contradictions(ts, system.scheme.ts_type)
@@ -208,7 +200,7 @@ class Stepper:
         """
         if not self._iterates:
             # their diagonal is a little larger
-            return self.preset in INCOMPLETE and not allows_enlarging(self.matrix)
+            return self.preset in presets.INCOMPLETE and not allows_enlarging(self.matrix)
         kind = PETSc.Options().getString("ksp_type", "cg")
         return self._scene.solver.hessian != "regularised" and kind != "preonly"
 

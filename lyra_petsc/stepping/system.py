@@ -273,9 +273,8 @@ class ReducedSystem:
         """F (n_owned, 3) [N]; in prescribed coordinates σ m (v − v*); collective."""
         parts = self._parts(*self._evaluate_at(v), vdot).values()
         reduce(lambda total, part: np.add(total, part, out=out), parts)
-        at = self.prescribed.at
-        too_fast = v.take(at) - self.prescribed.velocity
-        self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * too_fast)
+        at, velocity = self.prescribed.at, self.prescribed.velocity
+        self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the free coordinates; collective."""
@@ -305,8 +304,7 @@ class ReducedSystem:
         self._last_parts = {}  # the linear solve needs the room
         for remembered in self._at_iterate:
             remembered.forget()
-        inertia, reach = self.stage.sigma * self.mass, self.stage.reach
-        changing = self.prescribed.blocks
+        inertia, reach, changing = self.stage.sigma * self.mass, self.stage.reach, self.prescribed.blocks
         if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, changing):
             self._damping.into(values, inertia)
             for term in self.elastic:

@@ -49,6 +49,8 @@ OPTIONS = {
     "ksp_max_it": "Iterations of a linear solve (5000).",
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
+    "snes_lag_preconditioner": "How often the preconditioner is set up (1: for each matrix); with another "
+    "number incomplete factors have a matrix of their own.",
     "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
     "pc_python_type": "Class of `-pc_type python`; without it the program's own multigrid.",
     "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on three are visited twice in a cycle "

@@ -45,16 +45,17 @@ def stepped(
 ) -> tuple[np.ndarray, list[int]]:
     """Positions in mesh order and linear iterations of each step."""
     options = PETSc.Options()
-    given = {"pc_type": pc_type, **petsc}
+    given, filled = {"pc_type": pc_type, **petsc}, []
     for name, value in given.items():
         options[name] = value
     try:
         simulation = Simulation(comm, Scene.model_validate(content))
+        filled = simulation.stepper.our_options
         counts = [simulation.step().linear_iterations for _ in range(steps)]
         x = gathered(simulation.model.points, simulation.model.system.x)
         simulation.destroy()
     finally:
-        for name in given:
+        for name in [*given, *filled]:
             options.delValue(name)
     return x, counts
 
