@@ -97,8 +97,8 @@ class ReducedSystem:
         shell = partial(self._sum, self._shell)  # moving targets change the forces at one and the same place
         self._internal = Remembered(shell) if still else shell
         self._damping = Damping(points, blocks, elastic, moves=scheme.moves, once=scheme.explicit)
-        seen = [self._internal, *([self._damping.product] if scheme.explicit else [])]
-        self._at_iterate = [each for each in seen if isinstance(each, Remembered)]
+        last = (self._internal, self._damping.product) if scheme.explicit else ()
+        self._asked_once = [each for each in last if isinstance(each, Remembered)]
         self.x, self.v, self._xs, self._vs, self._gradient = (np.zeros((points.n_local, 3)) for _ in range(5))
         self._xh, self.history = self.x, self.v[: points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
@@ -301,8 +301,8 @@ class ReducedSystem:
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
         x, vs = self._evaluate_at(v)
-        self._last_parts = {}  # the linear solve needs the room
-        for remembered in self._at_iterate:
+        self._last_parts = {} if self.scheme.explicit else self._last_parts
+        for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
         inertia, reach, changing = self.stage.sigma * self.mass, self.stage.reach, self.prescribed.blocks
         if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, changing):

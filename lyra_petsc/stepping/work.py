@@ -118,9 +118,9 @@ class Ledger:
     def handle_forces(self, count: int) -> list[Array]:
         """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""
         system = self._system
-        local = np.zeros((count, 3))
+        local, reaction = np.zeros((count, 3)), self.reaction
         for number in system.held.active(system.t0, system.t1):
-            local[number] = self.reaction[system.held.vertices(number)].sum(axis=0)
+            local[number] = reaction[system.held.vertices(number)].sum(axis=0)
         for term in system.elastic:
             if isinstance(term, Pulling):
                 local += term.handle_forces(system.x, count)
