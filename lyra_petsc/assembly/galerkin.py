@@ -199,6 +199,9 @@ class Galerkin:
         ghosts.
     pattern : BlockPattern
         Of the coarse rows.
+    interpolation : (n_local + 1,), (P,) int32, (P,)
+        Where the parents of each fine point begin, those of ghosts too, in the coarse points' local numbers,
+        and their weights.
     """
 
     def __init__(
@@ -219,9 +222,11 @@ class Galerkin:
         number = np.concatenate([np.arange(first, end), near])
         pairs = np.column_stack([number[one - np.where(symmetric, 0, width)], number[other]])[mixed]
         self._shared = shared = SharedBlocks(comm, bounds, pairs, symmetric[mixed])
-        needed = np.concatenate([shared.columns, everyone[: len(parents)]])
+        needed = np.concatenate([shared.columns, everyone])
         ghosts = np.unique(needed[(needed < first) | (needed >= end)])
         self.points = Points(comm, bounds, ghosts, np.arange(n))
+        local = local_numbers(everyone, ghosts, first, end).astype(np.int32)
+        self.interpolation = self._start, local, self._weights
         n_local = self.points.n_local
         own = one[inside] * n_local + other[inside]
         came = (shared.rows - first) * n_local + local_numbers(shared.columns, ghosts, first, end)

@@ -18,7 +18,6 @@ from petsc4py import PETSc
 from lyra_petsc.assembly.matrix import SystemMatrix
 from lyra_petsc.block_rows import sweeps
 from lyra_petsc.errors import InputError
-from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.solvers.hierarchy import Hierarchy, Level
 
 Array = NDArray[np.float64]
@@ -53,21 +52,19 @@ class Smoother:
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
         self.r = np.zeros((n, 4), dtype=np.float32)
-        rows = level.interpolation
-        assert rows is not None
         assert level.galerkin is not None
-        self._coarse = coarse = level.galerkin.points
-        lo, hi = coarse.start, coarse.start + coarse.n_owned
-        parents = local_numbers(rows.parents, coarse.ghosts, lo, hi).astype(np.int32)
-        self._parents = rows.start, parents, rows.weights.astype(np.float32)
-        self._free = np.ones((n, 3), dtype=np.float32)
+        self._coarse = level.galerkin.points
+        start, parents, weights = level.galerkin.interpolation
+        self._parents = start, parents, weights.astype(np.float32)
+        self._free = np.ones_like(self.x)
 
     def set(self, values: Array, free: Array) -> None:
-        """Take new block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) are interpolated to."""
+        """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
         values, first = values.reshape(-1, 9), self._rows[0]
         sweeps.store(first, values, self._blocks)
         sweeps.invert_diagonal(first, values, self._inverse)
-        self._free[:] = free
+        self._free[: len(free)] = free
+        self.points.update_ghosts(self._free)
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
@@ -82,7 +79,8 @@ class Smoother:
         seen = self.x[self.points.n_owned :].copy()
         sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
         self._subtract_ghosts(seen)
-        sweeps.restrict(*self._parents, self._free, self.r, coarse)
+        start, *parents = self._parents
+        sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
         self._coarse.add_to_owners(coarse)
 
     def _subtract_ghosts(self, seen: Floats) -> None:
@@ -95,10 +93,12 @@ class Smoother:
             ghosts += seen
 
     def after(self, coarse: Floats) -> None:
-        """Add what the coarser level found, and sweep; collective."""
+        """Add what the coarser level found, and sweep; collective.
+
+        What is interpolated to ghosts is not worth a message: ``before`` left them as their owners have them.
+        """
         self._coarse.update_ghosts(coarse)
         sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
-        self.points.update_ghosts(self.x)
         sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
 
 
@@ -150,7 +150,7 @@ class VCycle:
         *finer, coarsest = hierarchy.levels
         self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
         for level in finer:
-            level.interpolation = None  # whoever interpolates has it in local numbers
+            level.interpolation = None  # Galerkin products have it in local numbers
         self._renew = renew
 
     def setUp(self, pc: PETSc.PC) -> None:
