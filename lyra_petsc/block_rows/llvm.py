@@ -1,4 +1,4 @@
-"""Writes LLVM's language: vectors of four numbers, and blocks of 3 × 3 made of them."""
+"""Writes LLVM's language: vectors of four numbers, and of eight of the nine of a 3 × 3 block."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class Code:
         self._context, self.builder = context, builder
         self.given = dict(zip(names.split(), arguments, strict=True))
         self._types = dict(zip(names.split(), signature.args, strict=True))
-        self.vector = ir.VectorType(context.get_value_type(self._types["blocks"].dtype), WIDTH)
+        number = context.get_value_type(self._types["blocks"].dtype)
+        self.vector, self.eight = ir.VectorType(number, WIDTH), ir.VectorType(number, 8)
 
     def begin(self, name: str) -> Value:
         """Where an array begins."""
@@ -49,11 +50,9 @@ class Code:
         found = self.builder.load(self.builder.gep(begin, [position]))
         return found if found.type == INDEX else self.builder.zext(found, INDEX)
 
-    def load(self, pointer: Value) -> Value:
-        """A vector of what stands in memory from there on."""
-        return self._load(pointer, self.vector)
-
-    def _load(self, pointer: Value, kind: Any) -> Value:
+    def load(self, pointer: Value, kind: Any = None) -> Value:
+        """A vector, of four if nothing else is said, of what stands in memory from there on."""
+        kind = self.vector if kind is None else kind
         found = self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()))
         found.align = self._size
         return found
@@ -140,8 +139,7 @@ class Code:
 
     def identity(self, factor: Value) -> Value:
         """The first eight numbers of a factor times the identity."""
-        kind = ir.VectorType(self.vector.element, 8)
-        first = self.builder.insert_element(ir.Constant(kind, [0.0] * 8), factor, LANE(0))
+        first = self.builder.insert_element(ir.Constant(self.eight, [0.0] * 8), factor, LANE(0))
         return self.builder.insert_element(first, factor, LANE(4))
 
     def transposed(self, eight: Value) -> Value:
@@ -164,7 +162,7 @@ class Code:
 
     def add_block(self, block: Value, eight: Value, ninth: Value) -> None:
         """Add to a block in memory its first eight numbers and its last one."""
-        self.store(self.plus(self._load(block, eight.type), eight), block)
+        self.store(self.plus(self.load(block, self.eight), eight), block)
         last = self.builder.gep(block, [INDEX(8)])
         self.builder.store(self.plus(self.builder.load(last), ninth), last)
 

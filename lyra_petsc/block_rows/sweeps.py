@@ -101,9 +101,10 @@ def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-u
 
 
 @cached(fastmath=True)
-def subtract_ghosts(indptr, ends, columns, blocks, x, r):  # type: ignore[no-untyped-def]
-    """r −= the couplings of the owned rows to ghosts times x (n_local, 3)."""
-    for row in range(Index(len(ends))):
+def subtract_ghosts(rows, indptr, ends, columns, blocks, x, r):  # type: ignore[no-untyped-def]
+    """r −= the couplings of owned rows (n,), those that have some, to ghosts times x (n_local, 3)."""
+    for number in range(Index(len(rows))):
+        row = Index(rows[number])
         s0, s1, s2 = gather(blocks, columns, x, Index(ends[row]), Index(indptr[row + Index(1)]), AHEAD)
         r[row, 0] -= s0
         r[row, 1] -= s1

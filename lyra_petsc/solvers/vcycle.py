@@ -47,6 +47,7 @@ class Smoother:
         self.points = points
         n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
+        self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
@@ -89,7 +90,7 @@ class Smoother:
             self.points.update_ghosts(self.x)
             ghosts = self.x[self.points.n_owned :]
             ghosts -= seen
-            sweeps.subtract_ghosts(*self._rows, self._blocks, self.x, self.r)
+            sweeps.subtract_ghosts(self._edge, *self._rows, self._blocks, self.x, self.r)
             ghosts += seen
 
     def after(self, coarse: Floats) -> None:
