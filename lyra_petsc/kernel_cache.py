@@ -14,10 +14,14 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numba import njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
+
+Index = np.uintp
+"""Kernels look entries up by it: no number is negative then, which numba would count from the end."""
 
 # what the first function would load: so all ranks do it at once, none while the others wait for its mesh
 cpu_target.target_context.refresh()

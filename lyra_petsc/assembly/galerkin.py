@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 
 from lyra_petsc.assembly.pattern import BlockPattern, begins, diagonal_keys, index_type, union
 from lyra_petsc.assembly.shared_blocks import SharedBlocks
-from lyra_petsc.kernel_cache import cached
+from lyra_petsc.kernel_cache import Index, cached
 from lyra_petsc.partition.distribute import local_numbers
 from lyra_petsc.partition.points import Points
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-Index = np.uintp
 
 CHUNK_ROWS = 1 << 13
 """Fine rows whose products are looked at together while the coarse pattern is made."""

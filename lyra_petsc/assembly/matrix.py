@@ -150,7 +150,7 @@ class SystemMatrix:
         self._read = False
         if self._storage is not None:
             with suppress(AttributeError, OSError):
-                self._storage.give_back()
+                self._storage.forget()
 
     @property
     def can_be_larger(self) -> bool:

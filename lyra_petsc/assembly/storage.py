@@ -241,7 +241,7 @@ class Storage:
             self._copy(values)
         self._mat.assemble()
 
-    def give_back(self) -> None:
+    def forget(self) -> None:
         """Let go of the memory of entries in owned columns, also of ``shared``; Linux only.
 
         They are 0 afterwards, and writing them takes memory again.

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from lyra_petsc.block_rows.vectors import AHEAD, gather, scatter
-from lyra_petsc.kernel_cache import cached
-
-Index = np.uintp
+from lyra_petsc.kernel_cache import Index, cached
 
 
 @cached(fastmath={"contract", "nsz"})

@@ -13,9 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.block_rows.vectors import AHEAD, gather, scatter
-from lyra_petsc.kernel_cache import cached
-
-Index = np.uintp
+from lyra_petsc.kernel_cache import Index, cached
 
 TINY = np.float32(1e-20)
 """Velocities [m/s] below it are none."""

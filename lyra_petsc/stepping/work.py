@@ -81,7 +81,7 @@ class Ledger:
         parts, self._at = system.forces_at_stage(), system.prescribed.at
         self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
         external = -parts.pop("loads")
-        np.put(external, self._at, external.take(self._at) + self._reactions)
+        system.prescribed.put(external, external.take(self._at) + self._reactions)
         for load in system.loads:
             if load.name == "gravity":  # it has a potential, and does no work from outside
                 weight = np.zeros_like(external)

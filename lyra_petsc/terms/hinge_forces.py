@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from lyra_petsc.kernel_cache import Index
 from lyra_petsc.terms.hinge import angle_parts, point
 from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_hessian, hinge_weight
 from lyra_petsc.terms.hinge_shape import fades
-from lyra_petsc.terms.kernel import Index, kernel
+from lyra_petsc.terms.kernel import kernel
 
 
 @kernel(inline="always")

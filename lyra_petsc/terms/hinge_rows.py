@@ -16,11 +16,12 @@ import numpy as np
 
 from lyra_petsc.block_rows.scatter import AHEAD, add_element, fetch_ahead
 from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
+from lyra_petsc.kernel_cache import Index
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.hinge_forces import limits_of
 from lyra_petsc.terms.hinge_shape import fades, triangles_at
-from lyra_petsc.terms.kernel import Index, kernel
+from lyra_petsc.terms.kernel import kernel
 
 
 @kernel(inline="always")

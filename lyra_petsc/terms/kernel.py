@@ -8,11 +8,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from lyra_petsc.kernel_cache import cached
-
-Index = np.uintp
-"""Kernels look entries up by it: no number is negative then, which numba would count from the end."""
 
 kernel: Any = partial(cached, error_model="numpy", fastmath={"contract", "nsz", "arcp"})

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.block_rows.scatter import fetch_ahead
 from lyra_petsc.block_rows.vectors import add_triangle
+from lyra_petsc.kernel_cache import Index
 from lyra_petsc.partition.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.kernel import Index, kernel
+from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
 
