@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lyra_petsc.api.scenes import load
     from lyra_petsc.api.simulations import Simulation, Step
     from lyra_petsc.errors import InputError, LyraError, OutputError, SolverError
-    from lyra_petsc.results.run import Run
+    from lyra_petsc.output.read_run import Run
     from lyra_petsc.scene.schema import Scene
 
 __all__ = [
@@ -43,7 +43,7 @@ _HOMES = {
     "LyraError": "errors",
     "OutputError": "errors",
     "SolverError": "errors",
-    "Run": "results.run",
+    "Run": "output.read_run",
     "Scene": "scene.schema",
     "Simulation": "api.simulations",
     "Step": "api.simulations",

@@ -6,6 +6,9 @@ them into one line on rank 0 and the exit code.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class LyraError(Exception):
     """Base of everything a user may see as one line."""
@@ -79,3 +82,13 @@ class Interrupted(LyraError):
 
     def __reduce__(self) -> tuple[object, ...]:
         return (Interrupted, (str(self), self.signal_number))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """``did you mean 'x'?`` for the nearest of ``known``, else the list of them all."""
+    names = sorted(known)
+    by_lower = {name.lower(): name for name in names}
+    match = difflib.get_close_matches(word.lower(), list(by_lower), n=1, cutoff=0.6)
+    if match:
+        return f"did you mean {by_lower[match[0]]!r}?"
+    return f"known: {', '.join(names)}" if names else "none are known"

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Kill runs at random moments, look at what they left, resume them, and compare with one left alone.
+"""Kills runs at random moments, checks what they left, resumes them, and compares with an undisturbed run.
 
     python scripts/kill_test.py --kills 100 --ranks 2 --seed 1
 
-A run is killed again and again, each time going on with --resume, until it reaches its end; then the
-next one begins, with another integrator. Who is killed is random too: one rank, all ranks, or the
-launcher (SIGKILL), or the launcher is asked to stop and leaves its ranks a second (SIGTERM, SIGINT).
-After every kill all processes must be gone within 20 s and every state in states.xdmf must be whole;
-at the end states, history, probes and reactions must be those of an uninterrupted run.
+A run is killed several times and continued with --resume each time until it reaches its end; then the next
+one begins, with another integrator. What is killed is random too: one rank, all ranks or the launcher
+(SIGKILL); or the launcher is asked to stop and gives its ranks a second (SIGTERM, SIGINT). After every kill
+all processes must be gone within 20 s and every state in states.xdmf must be complete; at the end states,
+history, probes and reactions must be those of an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -30,6 +30,9 @@ os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
 
 import h5py
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from lyra_petsc.api.mpirun import environment, find_launcher
 
 PATIENCE = 20.0
 """Seconds within which the other ranks must be gone."""
@@ -54,10 +57,7 @@ probes: {middle: {nodes: [24]}}
 WAYS = {
     "beuler": [],
     "bdf2": ["--set", "time.integrator=bdf2"],
-    "alpha2, adaptive": [
-        "--set",
-        "time={end: 0.4, step: auto, tolerance: 0.02, integrator: alpha2}",
-    ],
+    "alpha2, adaptive": ["--set", "time={end: 0.4, step: auto, tolerance: 0.02, integrator: alpha2}"],
 }
 
 DIRECT = ["-ksp_type", "preonly", "-pc_type", "lu"]
@@ -66,30 +66,23 @@ TARGETS = ("one rank", "all ranks", "launcher", "launcher, SIGTERM", "launcher, 
 
 
 class Wrong(Exception):
-    """What a run left is not what it must leave."""
+    """A run has left something else than it must."""
 
 
 def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[bytes]:
-    """Start the program; its words go to ``words.txt``."""
+    """Start the program; its output goes to ``output.txt``."""
     words = [sys.executable, "-m", "lyra_petsc", "run", *arguments, *DIRECT]
     if ranks > 1:
-        words = ["mpirun", "-n", str(ranks), *words, "-pc_factor_mat_solver_type", "mumps"]
-    environment = os.environ | {
-        "OMPI_ALLOW_RUN_AS_ROOT": "1",
-        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-        "OMPI_MCA_rmaps_base_oversubscribe": "1",
-        "OMPI_MCA_mpi_yield_when_idle": "1",
-        "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": f"{Path(__file__).resolve().parents[1]}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
-    }
-    with open(folder / "words.txt", "ab") as said:
+        words = [*find_launcher(ranks), *words, "-pc_factor_mat_solver_type", "mumps"]
+    variables = environment() | {"OMPI_MCA_mpi_yield_when_idle": "1"}
+    with open(folder / "output.txt", "ab") as output:
         return subprocess.Popen(
             words,
             cwd=folder,
-            env=environment,
+            env=variables,
             stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
+            stdout=output,
+            stderr=output,
             start_new_session=True,
         )
 
@@ -116,10 +109,10 @@ def rows(path: Path) -> int:
         return 0
 
 
-def wait_for_a_moment(
+def wait_random_time(
     process: subprocess.Popen[bytes], history: Path, draw: random.Random, length: float
 ) -> None:
-    """A moment drawn from the whole run and its set-up, or some rows of the history further on."""
+    """Wait for a random time of the run and its set-up, or for a random number of rows of the history."""
     deadline = time.monotonic() + draw.uniform(0.0, length)
     goal = None
     if draw.random() < 0.6:
@@ -133,7 +126,7 @@ def wait_for_a_moment(
 
 
 def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: random.Random) -> bool:
-    """Kill; whether there was still something to kill."""
+    """Kill; whether anything was still running."""
     victims = ranks_of(folder)
     if process.poll() is not None:
         return False
@@ -188,7 +181,7 @@ def check_announced(out: Path) -> int:
 
 
 def check_vtkhdf(out: Path, times: list[float]) -> None:
-    """The same states, as VTK finds them; a kill may have come before the last was announced there, too."""
+    """Check that VTK finds the same states, but perhaps the last, which is announced there later."""
     path = out / "states.vtkhdf"
     found: list[float] = []
     if path.exists():
@@ -218,7 +211,7 @@ def last_state(out: Path) -> tuple[float, np.ndarray]:
 
 
 def compare(out: Path, whole: Path) -> None:
-    """The resumed run against the uninterrupted one."""
+    """Compare the resumed run with the uninterrupted one."""
     left, right = last_state(out), last_state(whole)
     if left[0] != right[0] or np.abs(left[1] - right[1]).max() > SAME:
         raise Wrong(f"ends at t = {left[0]}, {np.abs(left[1] - right[1]).max():.3g} m off")
@@ -237,8 +230,8 @@ def compare(out: Path, whole: Path) -> None:
         raise Wrong(f"clutter: {clutter}")
 
 
-def how_to_go_on(out: Path) -> list[str]:
-    """--resume once there is a checkpoint; before, the run begins again."""
+def continue_options(out: Path) -> list[str]:
+    """--resume if there is a checkpoint; else the run begins again."""
     if list(out.glob("checkpoint*.h5")):
         return ["--resume"]
     return ["--force"] if out.exists() else []
@@ -248,7 +241,7 @@ def run_to_end(arguments: list[str], folder: Path, ranks: int) -> float:
     began = time.monotonic()
     process = launch(arguments, folder, ranks)
     if process.wait(600) != 0:
-        raise Wrong((folder / "words.txt").read_text(errors="replace")[-2000:])
+        raise Wrong((folder / "output.txt").read_text(errors="replace")[-2000:])
     return time.monotonic() - began
 
 
@@ -283,13 +276,13 @@ def main() -> int:
             out = folder / f"killed-{finished}"
             while kills.total() < asked.kills:
                 target = draw.choice(TARGETS if asked.ranks > 1 else TARGETS[:1])
-                process = launch([*words, "--out", out.name, *how_to_go_on(out)], folder, asked.ranks)
-                wait_for_a_moment(process, out / "history.csv", draw, length)
+                process = launch([*words, "--out", out.name, *continue_options(out)], folder, asked.ranks)
+                wait_random_time(process, out / "history.csv", draw, length)
                 struck = strike(process, folder, target, draw)
                 wait_until_gone(process, folder)
                 if not struck:
                     if process.returncode != 0:
-                        raise Wrong((folder / "words.txt").read_text(errors="replace")[-2000:])
+                        raise Wrong((folder / "output.txt").read_text(errors="replace")[-2000:])
                     break
                 kills[target] += 1
                 states += check_announced(out)
@@ -298,7 +291,7 @@ def main() -> int:
                     flush=True,
                 )
             else:
-                run_to_end([*words, "--out", out.name, *how_to_go_on(out)], folder, asked.ranks)
+                run_to_end([*words, "--out", out.name, *continue_options(out)], folder, asked.ranks)
             compare(out, straight)
             finished += 1
             shutil.rmtree(out)

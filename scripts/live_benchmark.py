@@ -1,11 +1,11 @@
-"""What ``run --live`` costs: one run whose page is stopped and let go on again and again.
+"""Cost of ``run --live``: one run whose page is stopped and continued in turn.
 
     python scripts/live_benchmark.py [--ranks 2] [--pairs 20] [--seconds 2] [--watch chromium]
         [SCENE [--set KEY=VALUE …]]
 
-The page's process is stopped (SIGSTOP) for some seconds and goes on (SIGCONT) for as many. Two neighbouring
-spells make a pair: wall time for each iteration of the linear solver with the page over that without it,
-from history.csv. Other work on the machine hits both alike; the median of the ratios is the answer. With
+The page's process is stopped (SIGSTOP) for some seconds and continued (SIGCONT) for as many. Two neighbouring
+intervals make a pair: wall time per iteration of the linear solver with the page over that without it, from
+history.csv. Other work on the machine affects both alike; the median of the ratios is the result. With
 ``--watch`` that browser, without a screen and at the lowest priority, has the page open, and is stopped too.
 """
 
@@ -28,8 +28,8 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lyra_petsc.results.run import Run
-from lyra_petsc.study.launch import environment, find_launcher
+from lyra_petsc.api.mpirun import environment, find_launcher
+from lyra_petsc.output.read_run import Run
 
 BROWSER = (
     "--headless=new",
@@ -44,7 +44,7 @@ def page_process(folder: Path) -> int:
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
             words = entry.joinpath("cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
-            if b"lyra_petsc.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
+            if b"lyra_petsc.show.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
                 return int(entry.name)
     raise SystemExit("the run has no page")
 
@@ -56,13 +56,13 @@ def processor_seconds(process: int) -> float:
 
 
 def address(run: subprocess.Popen[str]) -> str:
-    """Where the page is."""
+    """The address of the page."""
     told = []
     for line in run.stderr or ():
         told.append(line)
         found = re.match(r"view: (\S+)", line)
         if found:
-            # the run must not wait for someone to read what it says
+            # the run must not block on a full pipe
             threading.Thread(target=lambda: list(run.stderr or ()), daemon=True).start()
             return found[1]
     raise SystemExit("".join(told))
@@ -72,17 +72,17 @@ def open_page(browser: str, url: str, folder: str) -> subprocess.Popen[bytes]:
     """A browser without a screen, in a group of its own."""
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
     # of low priority beside other sessions as well, where Linux groups processes by sessions
-    humble = ["sh", "-c", 'echo 19 >/proc/self/autogroup; exec nice -n 19 "$@"', "sh"]
-    words = [*humble, browser, *BROWSER, *root, f"--user-data-dir={folder}", "--remote-debugging-port=0"]
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen([*words, url], stdout=quiet, stderr=quiet, start_new_session=True)
+    low_priority = ["sh", "-c", 'echo 19 >/proc/self/autogroup; exec nice -n 19 "$@"', "sh"]
+    options = [*BROWSER, *root, f"--user-data-dir={folder}", "--remote-debugging-port=0"]
+    words, quiet = [*low_priority, browser, *options, url], subprocess.DEVNULL
+    return subprocess.Popen(words, stdout=quiet, stderr=quiet, start_new_session=True)
 
 
-def spells(page: int, group: int | None, out: Path, seconds: float, count: int) -> list[int]:
-    """Rows of history.csv at the ends of the spells; in the first, third, … the page is stopped."""
+def intervals(page: int, group: int | None, out: Path, seconds: float, count: int) -> list[int]:
+    """Rows of history.csv at the ends of the intervals; in the first, third, … the page is stopped."""
     rows = [len(Run(out).history["step"])]
-    for spell in range(count):
-        number = signal.SIGCONT if spell % 2 else signal.SIGSTOP
+    for i in range(count):
+        number = signal.SIGCONT if i % 2 else signal.SIGSTOP
         os.kill(page, number)
         if group is not None:
             os.killpg(group, number)
@@ -93,10 +93,10 @@ def spells(page: int, group: int | None, out: Path, seconds: float, count: int) 
 
 
 def ratios(out: Path, rows: Sequence[int]) -> list[float]:
-    """Time for each linear iteration with the page over that without, of neighbouring spells."""
+    """Time per linear iteration with the page over that without, for pairs of neighbouring intervals."""
     history = Run(out).history
     wall, work = np.asarray(history["wall_seconds"]), np.asarray(history["linear_iterations"])
-    # a step at the border belongs to neither
+    # a step at the end of an interval belongs to neither
     costs = [wall[a + 1 : b].sum() / max(work[a + 1 : b].sum(), 1) for a, b in itertools.pairwise(rows)]
     return [on / off for off, on in zip(costs[::2], costs[1::2], strict=True) if on > 0 and off > 0]
 
@@ -129,7 +129,7 @@ def main(
             if watch:
                 browser = open_page(watch, url, f"{folder}/browser")
                 time.sleep(10.0)
-            rows = spells(page, browser and browser.pid, out, seconds, 2 * pairs)
+            rows = intervals(page, browser and browser.pid, out, seconds, 2 * pairs)
             used = processor_seconds(page) - began
         finally:
             if browser is not None:

@@ -1,4 +1,4 @@
-"""Error against CPU time on the paper scene: the paper's semi-implicit steps beside ours.
+"""Error against CPU time on the paper scene: the paper's semi-implicit steps and the other integrators.
 
     OMP_NUM_THREADS=1 python scripts/paper_work_precision.py [--setting bdf2:0.01 …] [--repeats 3] [--json]
         [--plot FILE.png] [-petsc options]
@@ -36,7 +36,7 @@ from mpi4py import MPI  # noqa: E402
 
 from lyra_petsc.errors import SolverError  # noqa: E402
 from lyra_petsc.scene.load import load_scene  # noqa: E402
-from lyra_petsc.simulation import Simulation  # noqa: E402
+from lyra_petsc.stepping.simulation import Simulation  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = json.loads((ROOT / "tests" / "reference" / "paper.json").read_text(encoding="utf-8"))
@@ -131,7 +131,7 @@ def line(row: dict[str, Any]) -> str:
 
 
 def scatter() -> str:
-    """The row of what a single correct calculation is off by."""
+    """The row with the deviation of a single correct calculation."""
     spread, mean = REFERENCE["spread"], REFERENCE["mean"]
     kinetic = spread["kinetic_energy"][-1] / mean["kinetic_energy"][-1]
     apart = 1e3 * np.hypot(spread["mean_y"], spread["mean_z"])
@@ -163,7 +163,7 @@ def verdicts(rows: list[dict[str, Any]]) -> list[str]:
 
 def draw(rows: list[dict[str, Any]], file: Path) -> None:
     """The work-precision diagram."""
-    from lyra_petsc.report.plots import Series, work_precision
+    from lyra_petsc.show.report.plots import Series, work_precision
 
     names = dict.fromkeys(row["integrator"] for row in rows)
     groups = {name: [row for row in rows if row["integrator"] == name] for name in names}
@@ -189,11 +189,11 @@ def draw(rows: list[dict[str, Any]], file: Path) -> None:
 
 @click.command()
 @click.option("--setting", "settings", multiple=True, default=SETTINGS, help="INTEGRATOR:Δt in seconds")
-@click.option("--repeats", type=int, default=1, help="of which the median is told")
+@click.option("--repeats", type=int, default=1, help="of which the median is printed")
 @click.option("--plot", type=click.Path(path_type=Path), help="PNG file of the diagram")
 @click.option("--json", "as_json", is_flag=True, help="JSON instead of a table")
 def compare(settings: tuple[str, ...], repeats: int, plot: Path | None, as_json: bool) -> None:
-    run("beuler:0.04")  # kernels are compiled or loaded
+    run("beuler:0.04")  # compiles or loads the kernels
     if not as_json:
         print("| " + " | ".join(HEADINGS) + " |\n" + "| --- " * len(HEADINGS) + "|", flush=True)
     rows = []

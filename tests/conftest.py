@@ -1,7 +1,14 @@
 """Fixtures for all tests, and what keeps a parallel run of pytest from hanging.
 
+``tests/NAME`` has the tests of the package ``lyra_petsc/NAME``, and is what to run first after a change of
+it: ``bash scripts/test.sh tests/NAME``. Beside these, ``scenes`` follows whole scenes, ``surviving`` kills
+runs and fills disks, ``fuzz`` draws damaged input, ``docs`` runs what the documentation shows, ``scripts``
+tests the scripts, and ``test_house.py`` the order of imports. ``physics.py`` builds and steps a small scene
+in the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` writes a run without one.
+
 Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
 running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
+``parallel(2)`` keeps a test that takes long, and of which three ranks show no more, to two.
 After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
 shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
 """
@@ -36,6 +43,18 @@ def comm() -> MPI.Comm:
     return WORLD
 
 
+@pytest.fixture(autouse=True)
+def petsc_options() -> Iterator[None]:
+    """Give every test the options database that it would have alone."""
+    from petsc4py import PETSc
+
+    database = PETSc.Options()
+    before = set(database.getAll())
+    yield
+    for name in set(database.getAll()) - before:
+        database.delValue(name)
+
+
 @pytest.fixture
 def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty folder of this test, the same on every rank."""
@@ -44,7 +63,6 @@ def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.hookimpl(trylast=True)  # the terminal exists by then
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "parallel: runs on every rank of mpirun at the same time")
     import petsc4py.PETSc  # noqa: F401
 
     from lyra_petsc.parallel import take_back_signals
@@ -62,6 +80,19 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[TERMINAL] = os.fdopen(terminal, "w")
     if WORLD.rank > 0:  # rank 0 speaks for all
         config.get_terminal_writer()._file = open(os.devnull, "w")  # noqa: SIM115
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect tests that are to run on other numbers of ranks."""
+    if WORLD.size == 1:
+        return
+    chosen = [
+        item
+        for item in items
+        if not (mark := item.get_closest_marker("parallel")) or WORLD.size in (mark.args or (WORLD.size,))
+    ]
+    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+    items[:] = chosen
 
 
 def together(item: pytest.Item) -> bool:

@@ -13,11 +13,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.model import Model, build_model
-from lyra_petsc.output.phases import Phases
-from lyra_petsc.partition.points import Points
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.rounding import residual_roundoff
+from lyra_petsc.stepping.problem import Model, build_model
+from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic
 
@@ -73,10 +73,10 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
     return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)
 
 
-def gathered(points: Points, owned: Array) -> Array:
-    """Rows of the owned vertices (n_owned or more, …) in mesh order, on every rank; collective."""
-    pieces = points.comm.allgather((points.original, np.array(owned[: points.n_owned])))
-    out = np.empty((points.n_global, *owned.shape[1:]))
+def gathered(layout: Layout, owned: Array) -> Array:
+    """Rows of the owned vertices (n_vertices or more, …) in mesh order, on every rank; collective."""
+    pieces = layout.comm.allgather((layout.original, np.array(owned[: layout.n_vertices])))
+    out = np.empty((layout.n_vertices_global, *owned.shape[1:]))
     for original, rows in pieces:
         out[original] = rows
     return out
@@ -114,7 +114,6 @@ class Simulation:
         self.stepper = Stepper(
             self.scene,
             self.system,
-            self.model.pattern,
             self.model.surface,
             outline.spacing,
             residual_roundoff(self.system, outline.reach),
@@ -128,7 +127,7 @@ class Simulation:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if error is None:  # freeing is collective: a rank that fails must not wait for the others
             self.stepper.destroy()
-            self.model.points.destroy()
+            self.model.discretisation.destroy()
         database = PETSc.Options()
         for name in [*self._options, *self.stepper.our_options]:
             database.delValue(name)
@@ -156,17 +155,19 @@ class Simulation:
 
     def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
         """Replace positions or velocities, (V, 3) in mesh order."""
-        points = self.model.points
-        for target, values in ((self.system.x, x), (self.system.v, v)):
-            if values is not None:
-                target[: points.n_owned] = values[points.original]
-                points.update_ghosts(target)
+        layout, state = self.model.points, self.system.state
+        rows = slice(0, layout.n_vertices)
+        if x is not None:
+            state.x[rows] = x[layout.original]
+        if v is not None:
+            state.v[rows] = v[layout.original]
+        state.update_ghosts()
 
     def energy(self, name: str) -> float:
         """Energy [J] of an elastic term, over all ranks."""
         term = self.model.terms[name]
         assert isinstance(term, Elastic)
-        return float(self.comm.allreduce(float(term.energies(self.system.x).sum())))
+        return float(self.comm.allreduce(float(term.energies(self.system.x, self.system.frozen[term]).sum())))
 
     # -- steps -----------------------------------------------------------------------------------------
 

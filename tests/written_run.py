@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.meshing.mesh import Mesh
+from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS, History
 from lyra_petsc.output.mesh_file import write_mesh

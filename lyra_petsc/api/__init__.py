@@ -1,1 +1,4 @@
-"""What ``import lyra_petsc`` offers a program or a notebook; the package itself loads it when it is used."""
+"""Calls from Python and the run as a whole.
+
+In: a scene. Out: a run's folder, or a simulation to step through.
+"""

@@ -1,25 +1,25 @@
-"""A whole run with its files, from Python."""
+"""A whole run with its files, called from Python."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Callable
-from types import FrameType, TracebackType
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 import numpy as np
 from mpi4py import MPI
 
+from lyra_petsc.api.run_loop import ProgressCallbacks, StopAsked, simulate
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.api.simulations import refuse_mixed_options
 from lyra_petsc.errors import Interrupted
-from lyra_petsc.output.folder import choose
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
-from lyra_petsc.results.run import Run
-from lyra_petsc.simulation import Simulation, StepReport
-from lyra_petsc.whole_run import Watcher, carry_out
+from lyra_petsc.stepping.simulation import Simulation, StepReport
 
 OnStep = Callable[[StepReport], object]
 
@@ -69,14 +69,14 @@ def run(
     refuse_mixed_options(loaded)
     choice = choose(comm, loaded.source.stem if loaded.source else "scene", out, force=force, resume=resume)
     try:
-        with _Interrupt(comm) as interrupt, np.errstate(over="ignore", invalid="ignore"):
-            folder = carry_out(comm, loaded, choice, _Calls(on_step), interrupt.asked)
+        with _noted_interrupt(comm) as stop_asked, np.errstate(over="ignore", invalid="ignore"):
+            folder = simulate(comm, loaded, choice, _Callback(on_step), stop_asked)
     except Interrupted as stopped:
         raise KeyboardInterrupt(str(stopped)) from None
     return Run(folder)
 
 
-class _Calls(Watcher):
+class _Callback(ProgressCallbacks):
     def __init__(self, on_step: OnStep | None) -> None:
         self._on_step = on_step
 
@@ -85,28 +85,22 @@ class _Calls(Watcher):
             self._on_step(report)
 
 
-class _Interrupt:
-    """While it is entered, an interrupt is noted; a second one is Python's own again."""
+@contextmanager
+def _noted_interrupt(comm: MPI.Comm) -> Iterator[StopAsked]:
+    """Within the context a first interrupt is noted, and a second one is handled as before it."""
+    seen = 0
+    before = signal.getsignal(signal.SIGINT)
+    in_main_thread = threading.current_thread() is threading.main_thread()  # others may not handle signals
 
-    def __init__(self, comm: MPI.Comm) -> None:
-        self._comm = comm
-        self._seen = 0
-        self._before: Any = None
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal seen
+        seen = number
+        signal.signal(signal.SIGINT, before)
 
-    def asked(self) -> int:
-        return int(self._comm.allreduce(self._seen, MPI.MAX))
-
-    def __enter__(self) -> _Interrupt:
-        if threading.current_thread() is threading.main_thread():  # no other may handle signals
-            self._before = signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self._seen = number
-        signal.signal(signal.SIGINT, self._before)
+    if in_main_thread:
+        signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: int(comm.allreduce(seen, MPI.MAX))
+    finally:
+        if in_main_thread:
+            signal.signal(signal.SIGINT, before)

@@ -1,4 +1,4 @@
-"""A scene that is stepped through in a loop."""
+"""A scene that a Python program steps through in a loop."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.api.scenes import SceneLike, load
-from lyra_petsc.errors import InputError
-from lyra_petsc.fields import FIELDS, check_field
-from lyra_petsc.meshing.mesh import Mesh
-from lyra_petsc.nearest import nearest
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output.fields import FIELDS, check_field
 from lyra_petsc.parallel import on_root, take_back_signals
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.simulation import Simulation as Stepping
+from lyra_petsc.stepping.simulation import Simulation as Stepping
 
-take_back_signals()  # PETSc is imported by now
+take_back_signals()  # the import of PETSc has replaced them
 
 Array = NDArray[np.float64]
 
@@ -128,7 +127,7 @@ class Simulation:
         SolverError
             If even the smallest Δt fails; the state is that before the step.
         """
-        # a number that overflows makes a step fail, which is told in words
+        # numbers that overflow make a step fail, and the message says so
         with np.errstate(over="ignore", invalid="ignore"):
             report = self._running.step()
         return Step(
@@ -165,15 +164,12 @@ class Simulation:
     @property
     def positions(self) -> Array:
         """(n, 3) current positions [m] of this rank's vertices, a copy."""
-        return self._owned(self._running.model.system.x)
+        return self._running.model.system.x[: len(self.vertices)].copy()
 
     @property
     def velocities(self) -> Array:
         """(n, 3) current velocities [m/s] of this rank's vertices, a copy."""
-        return np.array(self._running.model.system.written_velocity())
-
-    def _owned(self, rows: Array) -> Array:
-        return rows[: len(self.vertices)].copy()
+        return np.array(self._running.model.system.written_velocity()[: len(self.vertices)])
 
     def field(self, name: str) -> Array:
         """A field that ``output.fields`` of a scene may name, on this rank's vertices or triangles.
@@ -192,9 +188,12 @@ class Simulation:
     @property
     def energies(self) -> dict[str, float]:
         """Of the whole sheet [J]: kinetic, membrane, bending, potential; and the cumulative works
-        external_work (handles and loads other than gravity) and dissipation (material damping).
+        external_work (handles and loads other than gravity) and dissipation (material damping); and the
+        energies of terms that have a column of their own in history.csv.
         """
-        return asdict(self._running.budget)
+        energies = asdict(self._running.budget)
+        more: dict[str, float] = energies.pop("more")
+        return energies | more
 
     @property
     def notes(self) -> list[str]:
@@ -244,11 +243,11 @@ class Simulation:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is None or self.comm.size == 1:  # else the others may not come here
+        if error is None or self.comm.size == 1:  # on several ranks others may not come here
             self.close()
 
     def __del__(self) -> None:
-        # of several ranks nobody knows whether all let go at the same time
+        # on several ranks it is not known whether all of them drop it at the same time
         if getattr(self, "_stepping", None) is not None and self.comm.size == 1 and not MPI.Is_finalized():
             self.close()
 

@@ -1,4 +1,4 @@
-"""The command line: its start, and how each way of failing leaves."""
+"""The start of the command line, and the message and exit code of each way of failing."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from lyra_petsc.parallel import take_back_signals
 PROGRAM = "lyra-petsc"
 
 COMPLETION = "_LYRA_PETSC_COMPLETE"
-"""Variable by which the shell asks click for what may follow; click makes it of the program's name."""
+"""Variable by which the shell asks click for completions; click derives it from the program's name."""
 
 BUG = 70
-"""Exit code of what should never happen."""
+"""Exit code of unexpected errors."""
 
 PETSC_OUT_OF_MEMORY = 55
 """PETSc's error code PETSC_ERR_MEM."""
 
 RESERVE = 4 * 2**20
-"""Bytes of address space kept back: a rank without memory needs some to say so, and MPI to end the job."""
+"""Bytes kept in reserve: a rank that is out of memory needs some to say so, and MPI to end the job."""
 
 
 def run_command_line(argv: Sequence[str]) -> int:
@@ -58,7 +58,7 @@ def run_command_line(argv: Sequence[str]) -> int:
     reserve = [bytes(RESERVE)]
     # numba would put colour codes on the standard output where it finds colorama
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-    # a number that overflows makes a step fail, which is told once and in words
+    # numbers that overflow make a step fail, and the message says so
     np.seterr(over="ignore", invalid="ignore")
     try:
         code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=comm)
@@ -74,15 +74,15 @@ def run_command_line(argv: Sequence[str]) -> int:
     except (Exception, KeyboardInterrupt) as error:
         reserve.clear()  # Open MPI without memory leaves with a code of its own
         code = _report_unexpected(comm, error)
-        _let_go(error)
+        _clear_frames(error)
         if comm.size > 1:
             comm.Abort(code)
         return code
     return code if isinstance(code, int) else 0
 
 
-def _let_go(error: BaseException) -> None:
-    """Free what the frames of an exception, and of those it came from, still hold."""
+def _clear_frames(error: BaseException) -> None:
+    """Free the objects that the frames of an exception and of its causes still hold."""
     chain: BaseException | None = error
     while chain is not None:
         traceback.clear_frames(chain.__traceback__)
@@ -97,11 +97,11 @@ def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
 
 
 def _leave_together(comm: Any, code: int, line: str) -> int:
-    """Exit if all ranks failed alike; end the whole job if some are still at work."""
+    """The exit code if all ranks failed together; else end the whole job."""
     from lyra_petsc.parallel import all_here
 
     if not all_here(comm):
-        if comm.rank > 0:  # rank 0, which speaks for all, has not heard of it
+        if comm.rank > 0:  # rank 0, which prints the messages, does not know
             with suppress(OSError):
                 print(f"lyra-petsc: rank {comm.rank}: {' '.join(line.split())}", file=sys.stderr, flush=True)
         comm.Abort(code)
@@ -109,7 +109,7 @@ def _leave_together(comm: Any, code: int, line: str) -> int:
 
 
 def _report_unexpected(comm: Any, error: BaseException) -> int:
-    """Say on this rank what happened to it alone, perhaps; the exit code."""
+    """Print an unexpected error of this rank, perhaps of this one alone; the exit code."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
     what = f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'} ({where})"

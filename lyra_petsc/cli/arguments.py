@@ -1,4 +1,4 @@
-"""Split a command line into our words and PETSc's options.
+"""Splits a command line into our arguments and PETSc's options.
 
 Ours begin with two dashes; everything with one dash and a letter goes to PETSc together with its
 value, as in every PETSc program. A scene that follows a PETSc flag is still the scene.

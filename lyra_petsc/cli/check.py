@@ -14,12 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from lyra_petsc.cli.run import read_scene
-from lyra_petsc.output.phases import Phases
-from lyra_petsc.recorder import Recorder
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.phases import Phases
 from lyra_petsc.scene.default import default_scene
-from lyra_petsc.scene.json_schema import SCHEMA_FILE
+from lyra_petsc.scene.json_schema import schema_text
 from lyra_petsc.scene.values import one_line
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 Counts = NDArray[np.int64]
 
@@ -53,7 +53,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
 def print_schema(comm: MPI.Comm) -> None:
     """Print the JSON Schema of scene files on rank 0."""
     if comm.rank == 0:
-        print(SCHEMA_FILE.read_text(encoding="utf-8"), end="")
+        print(schema_text(), end="")
 
 
 def _elements(simulation: Simulation) -> int:
@@ -88,7 +88,7 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
         ("mean edge", f"{outline.spacing:.4g} m"),
         ("active terms", ", ".join(outline.terms)),
         ("handles", str(len(scene.handles))),
-        ("unknowns", f"{3 * outline.n_vertices} (velocities)"),
+        ("unknowns", f"{model.points.n_unknowns} (velocities)"),
         (
             "nonzeros",
             f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row",

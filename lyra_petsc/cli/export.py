@@ -26,10 +26,10 @@ from lyra_petsc.cli.signals import watched
 @click.pass_obj
 def export(comm: Any, /, run: Path, **asked: Any) -> None:
     """Write the states of RUN for other programs."""
-    from lyra_petsc.export.export import export_run
     from lyra_petsc.parallel import on_root
+    from lyra_petsc.show.export.export_run import export_run
 
-    for number in watched():  # rank 0 works, and speaks for all
+    for number in watched():  # rank 0 does the work and prints the message
         signal.signal(number, _give_up if comm.rank == 0 else signal.SIG_IGN)
     done = on_root(comm, lambda: export_run(run, **asked))
     if comm.rank == 0 and done is not None:

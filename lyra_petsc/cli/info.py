@@ -1,4 +1,4 @@
-"""What lyra_petsc runs on here, and what of it does not fit together."""
+"""``info``: versions and configuration of what the program runs on, and what does not fit together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc import __version__
-from lyra_petsc.cli.fit import Facts, misfits
+from lyra_petsc.cli.installation_checks import Installation, misfits
 
 EXTERNAL = (
     "ptscotch",
@@ -43,7 +43,7 @@ def info(comm: Any) -> str:
         Several lines, the same on every rank; a part that is missing or broken is named as such.
     """
     hosts = comm.allgather(socket.gethostname())
-    facts = Facts(
+    facts = Installation(
         ranks=comm.size,
         launched=launched_ranks(os.environ),
         ranks_per_host=dict(Counter(hosts)),
@@ -96,7 +96,7 @@ def loaded_mpi_libraries() -> tuple[str, ...]:
     return tuple(sorted(file for file in files if Path(file).name.startswith(names)))
 
 
-def _described(name: str, describe: Callable[[Facts], str], facts: Facts) -> str:
+def _described(name: str, describe: Callable[[Installation], str], facts: Installation) -> str:
     try:
         return describe(facts)
     except ModuleNotFoundError:
@@ -107,15 +107,15 @@ def _described(name: str, describe: Callable[[Facts], str], facts: Facts) -> str
         return "broken"
 
 
-def _module_version(name: str) -> Callable[[Facts], str]:
-    def describe(facts: Facts) -> str:
+def _module_version(name: str) -> Callable[[Installation], str]:
+    def describe(facts: Installation) -> str:
         module = importlib.import_module(name)
         return str(getattr(module, "__version__", None) or importlib.metadata.version(name))
 
     return describe
 
 
-def _mpi(facts: Facts) -> str:
+def _mpi(facts: Installation) -> str:
     import mpi4py
     from mpi4py import MPI
 
@@ -124,7 +124,7 @@ def _mpi(facts: Facts) -> str:
     return f"{mpi4py.__version__} with {library} (MPI {standard})"
 
 
-def _petsc(facts: Facts) -> str:
+def _petsc(facts: Installation) -> str:
     import petsc4py
     from petsc4py import PETSc
 
@@ -148,14 +148,14 @@ def _petsc_debugging(config: Mapping[str, str]) -> bool | None:
         return None
 
 
-def _petsc_folder(facts: Facts) -> str:
+def _petsc_folder(facts: Installation) -> str:
     import petsc4py
 
     config = petsc4py.get_config()
     return os.path.join(config.get("PETSC_DIR", ""), config.get("PETSC_ARCH", "")).rstrip("/") or "not known"
 
 
-def _petsc_packages(facts: Facts) -> str:
+def _petsc_packages(facts: Installation) -> str:
     from petsc4py import PETSc
 
     present = [name for name in EXTERNAL if PETSc.Sys.hasExternalPackage(name)]
@@ -163,14 +163,14 @@ def _petsc_packages(facts: Facts) -> str:
     return f"{', '.join(present) or 'none'}; not: {', '.join(absent) or 'none'}"
 
 
-def _h5py(facts: Facts) -> str:
+def _h5py(facts: Installation) -> str:
     import h5py
 
     kind = "parallel" if h5py.get_config().mpi else "serial"
     return f"{h5py.__version__} with HDF5 {h5py.version.hdf5_version}, {kind}"
 
 
-PARTS: dict[str, Callable[[Facts], str]] = {
+PARTS: dict[str, Callable[[Installation], str]] = {
     "mpi4py": _mpi,
     "PETSc": _petsc,
     "PETSc folder": _petsc_folder,

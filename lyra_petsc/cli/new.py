@@ -75,8 +75,8 @@ def write_starter(name: str, mesh: Path | None) -> Path:
 def _own_mesh(file: Path) -> OwnMesh:
     from pydantic import ValidationError
 
-    from lyra_petsc.meshing.build import build_mesh
-    from lyra_petsc.meshing.select import DIMENSION_NAMES
+    from lyra_petsc.mesh.build import build_mesh
+    from lyra_petsc.mesh.select import DIMENSION_NAMES
     from lyra_petsc.scene.schema import MeshSource
     from lyra_petsc.scene.starter import OwnMesh
 

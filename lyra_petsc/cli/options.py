@@ -1,4 +1,4 @@
-"""What the declarations of several verbs share.
+"""Options that several verbs share.
 
 `cli.verbs` registers the commands. A module that declares one imports what it needs for its work only when
 it is called: the declarations of all verbs are read for each.

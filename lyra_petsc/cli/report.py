@@ -11,8 +11,8 @@ import click
 from lyra_petsc.cli.options import SETTINGS, helped, results
 
 if TYPE_CHECKING:
-    from lyra_petsc.report.document import Drawing
-    from lyra_petsc.results.run import Run
+    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.show.report.document import Drawing
 
 PAGE = "report.html"
 PICTURE_SIZE = "960x540"
@@ -46,8 +46,8 @@ def write_page(folder: Path, out: Path | None) -> Path:
     """
     from lyra_petsc.errors import InputError
     from lyra_petsc.output.atomic import replace_text
-    from lyra_petsc.report.run_page import plain_pictures, run_page
-    from lyra_petsc.results.run import Run
+    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.show.report.run_page import plain_pictures, run_page
 
     path = folder / PAGE if out is None else out
     if path.is_dir() or not path.absolute().parent.is_dir():
@@ -66,21 +66,21 @@ def _rendered(run: Run) -> list[Drawing]:
     from lyra_petsc.cli.render import PACKAGES
     from lyra_petsc.errors import LyraError
     from lyra_petsc.extras import missing
-    from lyra_petsc.report.document import Drawing
-    from lyra_petsc.report.run_page import chosen_states, state_caption
+    from lyra_petsc.show.report.document import Drawing
+    from lyra_petsc.show.report.run_page import chosen_states, state_caption
 
     if missing(PACKAGES):
         return []
-    from lyra_petsc.render.draw import draw
-    from lyra_petsc.render.plan import Asked, make_plan
+    from lyra_petsc.show.render.draw import draw
+    from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
 
     states = chosen_states(run)
     with tempfile.TemporaryDirectory() as folder:
         times = ",".join(repr(float(run.times[i])) for i in states)
-        asked = Asked(run.folder, at=times, out=Path(folder), size=PICTURE_SIZE, label=False)
+        options = RenderOptions(run.folder, at=times, out=Path(folder), size=PICTURE_SIZE, label=False)
         try:
-            plan = make_plan(asked)
-            draw(MPI.COMM_SELF, asked, plan, lambda done, count: None)
+            plan = make_plan(options)
+            draw(MPI.COMM_SELF, plan, lambda done, count: None)
             drawn = {state: path.read_bytes() for path, state in plan.pictures}
         except LyraError:  # no OpenGL: the page has plain pictures
             return []

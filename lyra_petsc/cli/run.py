@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.output.folder import choose
-from lyra_petsc.output.phases import Phases
+from lyra_petsc.linear.petsc_options import unused
+from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
+from lyra_petsc.phases import Phases
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.simulation import Simulation, StepReport
-from lyra_petsc.solvers.options import unused
-from lyra_petsc.whole_run import Watcher, carry_out
+from lyra_petsc.stepping.simulation import Simulation, StepReport
 
 if TYPE_CHECKING:
     from lyra_petsc.cli.view import Served
-    from lyra_petsc.view.live import LivePage
+    from lyra_petsc.show.view.live import LivePage
 
 
 def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str]) -> Scene:
@@ -36,7 +36,7 @@ def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str]) -> Scene:
 
 def run(
     comm: MPI.Comm,
-    path: Path | None,
+    scene: Path | None,
     settings: Sequence[str],
     *,
     out: Path | None,
@@ -44,14 +44,14 @@ def run(
     resume: bool,
     served: Served | None = None,
 ) -> None:
-    """Simulate a scene, with ``served`` also on a page; collective.
+    """Simulate a scene, which a page shows if ``served`` says where; collective.
 
     Raises
     ------
     InputError
         Bad input; nothing is written.
     SolverError, OutputError
-        The run could not go on; what was announced stands.
+        The run could not go on; all states announced before can be read.
     Interrupted
         A signal; the last step is in the checkpoint.
     """
@@ -59,23 +59,22 @@ def run(
         on_root(comm, lambda: served.check("--live"))
     phases = Phases()
     stop = StopRequest(comm)
-    if path is None and resume and out is not None:
-        path = out / "scene.yaml"
-    path = path or default_scene()
-    stem = path.stem
-    choice = choose(comm, stem, out, force=force, resume=resume)
-    scene = read_scene(comm, path, settings)
-    carry_out(comm, scene, choice, Shown(comm, served), stop.signal_number, phases)
+    if scene is None and resume and out is not None:
+        scene = out / "scene.yaml"
+    path = scene or default_scene()
+    choice = choose(comm, path.stem, out, force=force, resume=resume)
+    loaded = read_scene(comm, path, settings)
+    simulate(comm, loaded, choice, TerminalProgress(comm, served), stop.signal_number, phases)
 
 
-class Shown(Watcher):
-    """Shows a run on the terminal: its progress, its notes, and where the time went.
+class TerminalProgress(ProgressCallbacks):
+    """Shows the progress of a run, its notes, and at the end where the time went.
 
     Parameters
     ----------
     comm : MPI.Comm
     served : Served, optional
-        Where it is shown in the browser as well.
+        Where a page shows it as well.
     """
 
     def __init__(self, comm: MPI.Comm, served: Served | None = None) -> None:
@@ -83,7 +82,7 @@ class Shown(Watcher):
         self._progress: Progress | None = None
         self._page: LivePage | None = None
         if served is not None and comm.rank == 0:
-            from lyra_petsc.view.live import LivePage
+            from lyra_petsc.show.view.live import LivePage
 
             self._page = LivePage(
                 served.host,
@@ -97,39 +96,36 @@ class Shown(Watcher):
             self._progress.say(text)
 
     def begin(self, simulation: Simulation, folder: Path) -> None:
-        """Begin the progress bar, and the page."""
+        """Start the progress bar, and show the run on the page."""
         self._progress = Progress(
             self._comm,
             simulation.control.end,
             start=simulation.time,
             plain=_petsc_speaks(),
-            unit="s" if simulation.model.system.scheme.moves else "",
+            unit="s" if simulation.model.system.integrator.moves else "",
         )
         if self._page is not None:
             self._page.show(folder)
 
     def note(self, text: str) -> None:
-        """A line above the bar."""
+        """Print a line above the bar."""
         self._say(f"note: {text}")
 
     def step(self, simulation: Simulation, report: StepReport) -> None:
         """Move the bar."""
-        budget = simulation.budget
-        energy = budget.kinetic + budget.membrane + budget.bending + budget.potential
         if self._progress is not None:
-            self._progress.update(
-                report.step, report.time, report.newton_iterations, report.linear_iterations, energy
-            )
+            iterations = report.newton_iterations, report.linear_iterations
+            self._progress.update(report.step, report.time, *iterations, simulation.budget.total)
 
     def close(self) -> None:
-        """Leave the terminal as it was, and let the page go."""
+        """Leave the terminal as it was, and tell the page that the run has ended."""
         if self._page is not None:
             self._page.end()
         if self._progress is not None:
             self._progress.close()
 
     def done(self, simulation: Simulation, folder: Path) -> None:
-        """Where the time went, and options that nothing used."""
+        """Print where the time went, and which PETSc options nothing used."""
         simulation.stepper.ts.viewFromOptions("-ts_view")
         closing_table(self._comm, simulation.phases.seconds(), folder, "done")
         if self._page is not None:
@@ -141,6 +137,6 @@ class Shown(Watcher):
 
 
 def _petsc_speaks() -> bool:
-    """Whether PETSc prints while the run goes on, which would tear a progress bar apart."""
+    """Whether PETSc prints while the run goes on, which would spoil a progress bar."""
     names = PETSc.Options().getAll()
     return any(word in name for name in names for word in ("monitor", "converged_reason", "_view", "info"))

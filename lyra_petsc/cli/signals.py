@@ -1,4 +1,4 @@
-"""What becomes of signals: a run finishes its step and writes a checkpoint; before that, nothing is left."""
+"""Signals: a run finishes its step and writes a checkpoint; during the set-up the process ends at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 ASKED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 LOST = signal.SIGHUP
-"""The terminal is gone; under nohup it is ignored, and stays so."""
+"""The terminal was closed; ignored under nohup, where it stays so."""
 
 
 def watched() -> tuple[signal.Signals, ...]:
@@ -21,7 +21,7 @@ def watched() -> tuple[signal.Signals, ...]:
 
 
 def leave_at_once() -> None:
-    """Until a run watches them, let these signals end the process without words."""
+    """Let these signals end the process without a message, until a run watches them."""
     for number in watched():
         signal.signal(number, _leave)
 
@@ -31,7 +31,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 class StopRequest:
-    """Notes the first signal that this rank gets; a second SIGINT ends it at once."""
+    """Notes the first signal that this rank receives; a second SIGINT ends the job at once."""
 
     def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
@@ -45,7 +45,7 @@ class StopRequest:
         self._seen = self._seen or number
 
     def signal_number(self) -> int:
-        """The signal that any rank has got, else 0; collective."""
+        """The signal that any rank has received, else 0; collective."""
         from mpi4py import MPI
 
         return int(self._comm.allreduce(self._seen, MPI.MAX))

@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import signal
-import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
 from mpi4py import MPI
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from lyra_petsc.cli.arguments import split
-from lyra_petsc.cli.progress import duration
-from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.cli.verify import FAILED, WIDTH
-from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.output.folder import free_name
+from lyra_petsc.api.mpirun import find_launcher
+from lyra_petsc.cli.experiments import FAILED, Terminal, command, petsc_words, plain_table, watched
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.launch import Launcher
+from lyra_petsc.experiments.results import Results
+from lyra_petsc.experiments.stress.base import setting_of
+from lyra_petsc.experiments.stress.case import Case, Level
+from lyra_petsc.experiments.stress.launch import launched, save
+from lyra_petsc.experiments.stress.registry import FAMILIES, selected
+from lyra_petsc.experiments.stress.runner import BaseClock, Outcome, run_case
+from lyra_petsc.experiments.stress.view import HEADINGS, Stress, cells, release_shapes
+from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
-from lyra_petsc.solvers.options import unused
-from lyra_petsc.stress.base import setting_of
-from lyra_petsc.stress.case import Case, Family, Level
-from lyra_petsc.stress.exchange import save
-from lyra_petsc.stress.launch import Launcher
-from lyra_petsc.stress.registry import selected
-from lyra_petsc.stress.report import release_shapes
-from lyra_petsc.stress.results import finish, write
-from lyra_petsc.stress.runner import BaseClock, Outcome, run_case
-from lyra_petsc.stress.table import cells, headings
-from lyra_petsc.study.launch import find_launcher
-from lyra_petsc.verification.results import prepare
 
 FOLDER = Path("stress")
 """Where results go unless ``--out`` says otherwise."""
+
+WIDTH = 150
 
 
 @dataclass(frozen=True)
@@ -70,6 +60,20 @@ class Asked:
         """Cases and families asked for."""
         return tuple(name.strip() for text in self.only for name in text.split(",") if name.strip())
 
+    @property
+    def what(self) -> list[str]:
+        """Scene and options that say what each case is."""
+        words = [str(self.scene)] if self.scene is not None else []
+        for text in self.settings:
+            words += ["--set", text]
+        return words + ([f"--{self.level.name.lower()}"] if self.level != Level.USUAL else [])
+
+    @property
+    def words(self) -> list[str]:
+        """All that repeats it."""
+        words = self.what + (["--only", ",".join(self.names)] if self.names else [])
+        return words + (["--ranks", str(self.ranks)] if self.ranks is not None else [])
+
 
 def stress(comm: MPI.Comm, asked: Asked) -> int:
     """Run the cases and print what came of each; the exit code; collective.
@@ -84,156 +88,86 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
     cases = selected(asked.names, asked.level)
     setting = on_root(comm, lambda: setting_of(asked.scene, asked.settings, asked.level))
     assert setting is not None
-    launcher = _launcher(comm, asked)
+    launcher = None
+    if asked.ranks is not None:
+        found = on_root(comm, lambda: find_launcher(asked.ranks or 0))
+        launcher = Launcher(found or [], "stress", petsc_words())
     first = FOLDER / (asked.scene.stem if asked.scene is not None else "sheet")
     folder = asked.out or on_root(comm, lambda: first if asked.force else free_name(first))
     assert folder is not None
-    stop = StopRequest(comm)
     outcomes: list[Outcome] = []
 
-    def watch() -> None:
-        number = stop.signal_number()
-        if number:
-            name = signal.Signals(number).name
-            kept = f"the cases that had ended are in {folder}" if outcomes else "no case had ended"
-            raise Interrupted(f"stopped by {name}; {kept}", number)
+    def kept() -> str:
+        return f"; the cases that had ended are in {folder}" if outcomes else "; no case had ended"
 
+    watch = watched(comm, kept)
     if launcher is None:
         # a base scene that does not run is refused before anything is written
         clock = BaseClock(comm, setting, watch)
         setting = replace(setting, size=clock.size)
+
+    def run(case: Case) -> Outcome:
+        if launcher is not None:
+            return launched(launcher, case, asked.what, watch)
+        return run_case(comm, case, setting, clock, watch)
+
     if asked.job is not None:
-        (family, case), folder = cases[0], asked.job
-        outcome = run_case(comm, case, family.name, setting, clock, watch)
-        on_root(comm, lambda: save(outcome, folder))
+        outcome, job = run(cases[0]), asked.job
+        on_root(comm, lambda: save(outcome, job))
         return 0 if outcome.passed else FAILED
-    prepare(comm, folder, force=asked.force)
-    show = Show(comm, len(cases))
-    command, ranks = _command(comm, asked), asked.ranks or comm.size
-    try:
-        for family, case in cases:
-            show.begin(case)
-            if launcher is not None:
-                outcomes.append(launcher(case, family.name, watch))
-            else:
-                outcomes.append(run_case(comm, case, family.name, setting, clock, watch))
-            show.case(outcomes[-1])
-            release_shapes(outcomes)
-            write(comm, folder, outcomes, ranks, complete=len(outcomes) == len(cases))
-    except Interrupted:
-        finish(comm, folder, outcomes, setting, ranks, command)
-        raise
-    note = finish(comm, folder, outcomes, setting, ranks, command)
-    show.summary(outcomes, folder, note)
+    view = Stress(setting, len(cases))
+    again = command(comm, "stress", asked.words)
+    results = Results(comm, folder, view, ranks=asked.ranks or comm.size, command=again, force=asked.force)
+    outcomes = results.outcomes
+    show = Show(comm, len(cases), outcomes)
+    note = results.run(cases, run, show)
+    show.families(folder, note)
     return 0 if all(outcome.passed for outcome in outcomes) else FAILED
-
-
-def _command(comm: MPI.Comm, asked: Asked) -> list[str]:
-    """The command line that repeats it."""
-    words = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
-    words += ["python", "-m", "lyra_petsc", "stress", *_what(asked)]
-    words += ["--only", ",".join(asked.names)] if asked.names else []
-    words += ["--ranks", str(asked.ranks)] if asked.ranks is not None else []
-    return [*words, *split(sys.argv[1:])[1]]
-
-
-def _what(asked: Asked) -> list[str]:
-    """Scene and options that say what each case is."""
-    words = [str(asked.scene)] if asked.scene is not None else []
-    for text in asked.settings:
-        words += ["--set", text]
-    return words + ([f"--{asked.level.name.lower()}"] if asked.level != Level.USUAL else [])
-
-
-def _launcher(comm: MPI.Comm, asked: Asked) -> Launcher | None:
-    """What starts the cases with ``--ranks``.
-
-    Raises
-    ------
-    InputError
-        Under an mpirun, or without one to start.
-    """
-    if asked.ranks is None:
-        return None
-    command = on_root(comm, lambda: find_launcher(asked.ranks or 0))
-    return Launcher(command or [], _what(asked), split(sys.argv[1:])[1])
 
 
 def list_cases(comm: MPI.Comm, asked: Asked) -> None:
     """Print name and title of every case of the level on rank 0."""
     found = selected(asked.names, asked.level)
     if comm.rank == 0:
-        width = max(len(case.name) for _, case in found)
-        told: Family | None = None
-        for family, case in found:
-            if family is not told:
-                click.echo(f"{family.name}: {family.title}")
-                told = family
+        width = max(len(case.name) for case in found)
+        told = ""
+        for case in found:
+            if case.family != told:
+                told = case.family
+                click.echo(f"{told}: {FAMILIES.load(told).title}")
             click.echo(f"  {case.name:<{width}}  {case.title}")
 
 
-class Show:
-    """The table on the terminal, line by line; on rank 0.
+class Show(Terminal):
+    """The table, line by line; ``outcomes`` are those so far."""
 
-    Parameters
-    ----------
-    comm : MPI.Comm
-    count : int
-        Cases to come.
-    """
+    def __init__(self, comm: MPI.Comm, count: int, outcomes: list[Outcome]) -> None:
+        super().__init__(comm, count, WIDTH)
+        self._outcomes = outcomes
+        self._line(list(HEADINGS), "bold")
 
-    def __init__(self, comm: MPI.Comm, count: int) -> None:
-        self._speaks, self._count, self._done = comm.rank == 0, count, 0
-        wide = max(WIDTH + 40, Console().width)
-        self._console = Console(width=wide, highlight=False, soft_wrap=True)
-        self._widths = [max(len(name), least) for name, least in headings()]
-        if self._speaks:
-            self._console.print(Text(self._line([name for name, _ in headings()]), style="bold"))
-
-    def begin(self, case: Case) -> None:
-        """A case starts."""
-        self._done += 1
-        if self._speaks and sys.stderr.isatty():
-            print(f"{self._done} of {self._count}: {case.name} …", file=sys.stderr, end="\r", flush=True)
-
-    def case(self, outcome: Outcome) -> None:
-        """A case has ended."""
-        if not self._speaks:
-            return
-        if sys.stderr.isatty():
-            print("\x1b[2K", file=sys.stderr, end="\r", flush=True)
+    def end(self, outcome: Outcome) -> None:  # type: ignore[override]
+        super().end(outcome)
         if outcome.left_out:
-            self._console.print(Text(f"{outcome.case.name}: left out: {outcome.left_out}", style="dim"))
+            self.print(f"{outcome.case.name}: left out: {outcome.left_out}", "dim")
             return
-        self._console.print(Text(self._line(cells(outcome)), style="" if outcome.passed else "bold red"))
+        self._line(cells(outcome), "" if outcome.passed else "bold red")
         for name, verdict in outcome.failures.items():
-            self._console.print(Text(f"    {name}: {verdict.words}", style="red"))
+            self.print(f"    {name}: {verdict.words}", "red")
+        release_shapes(self._outcomes)
 
-    def summary(self, outcomes: Sequence[Outcome], folder: Path, note: str) -> None:
-        """The end."""
-        if not self._speaks:
-            return
-        run = [outcome for outcome in outcomes if not outcome.left_out]
-        table = Table("family", box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
-        table.add_column(Text("passed"), justify="right")
-        table.add_column(Text("run time [s]"), justify="right")
-        for family in dict.fromkeys(outcome.family for outcome in run):
-            mine = [outcome for outcome in run if outcome.family == family]
+    def families(self, folder: Path, note: str) -> None:
+        """The end: what passed of each family."""
+        run = [outcome for outcome in self._outcomes if not outcome.left_out]
+        table = plain_table(["family"], ["passed", "run time [s]"])
+        for family in dict.fromkeys(outcome.case.family for outcome in run):
+            mine = [outcome for outcome in run if outcome.case.family == family]
             passed = sum(outcome.passed for outcome in mine)
             table.add_row(family, f"{passed} of {len(mine)}", f"{sum(o.seconds for o in mine):.1f}")
-        self._console.print()
-        self._console.print(table)
-        passed = sum(outcome.passed for outcome in run)
-        total = sum(outcome.seconds for outcome in run)
-        self._console.print(f"{passed} of {len(run)} cases passed, {duration(total)} in all")
-        self._console.print(Text(f"results: {folder}"))
-        if note:
-            self._console.print(Text(f"note: {note}"))
-        left = unused([])
-        if left:
-            listed = ", ".join(f"-{name}" for name in left)
-            print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
+        self.print()
+        self.summary(run, table, folder, note)
 
-    def _line(self, texts: Sequence[str]) -> str:
-        pairs = list(zip(texts, self._widths, strict=True))
-        return "  ".join(t.ljust(w) if i == 0 else t.rjust(w) for i, (t, w) in enumerate(pairs)).rstrip()
+    def _line(self, texts: list[str], style: str) -> None:
+        widths = [max(len(name), least) for name, least in HEADINGS.items()]
+        first, *others = zip(texts, widths, strict=True)
+        self.print("  ".join([first[0].ljust(first[1]), *(t.rjust(w) for t, w in others)]).rstrip(), style)

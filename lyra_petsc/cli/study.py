@@ -4,33 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.cli.arguments import split
+from lyra_petsc.api.mpirun import find_launcher
+from lyra_petsc.cli.experiments import command, petsc_words, tell_unused, watched
 from lyra_petsc.cli.run import _petsc_speaks
-from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.cli.study_progress import StudyProgress
-from lyra_petsc.errors import InputError, Interrupted, SolverError
+from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.experiments import records
+from lyra_petsc.experiments.launch import Launcher
+from lyra_petsc.experiments.study.case import Job, Result
+from lyra_petsc.experiments.study.conduct import Outcome, conduct
+from lyra_petsc.experiments.study.folder import Lock, StudyFolder, choose_folder
+from lyra_petsc.experiments.study.launch import launched, report_progress
+from lyra_petsc.experiments.study.plan import Plan, make_plan
+from lyra_petsc.experiments.study.reference import Chosen, Physics, choose_references
+from lyra_petsc.experiments.study.request import REQUEST_FILE, Request, read_request
+from lyra_petsc.experiments.study.runner import run_case
+from lyra_petsc.experiments.study.work import Work
 from lyra_petsc.extras import require
-from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.default import default_scene
-from lyra_petsc.solvers.options import unused
-from lyra_petsc.study.case import Job
-from lyra_petsc.study.conduct import Outcome, conduct
-from lyra_petsc.study.folder import Lock, StudyFolder, choose_folder
-from lyra_petsc.study.launch import Launcher, find_launcher, report_progress
-from lyra_petsc.study.plan import Plan, make_plan
-from lyra_petsc.study.reference import Chosen, Physics, choose_references
-from lyra_petsc.study.request import REQUEST_FILE, Request, read_request
-from lyra_petsc.study.runner import run_case
-from lyra_petsc.study.work import Runner, Work
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +54,7 @@ class _Ready:
     folder: StudyFolder
     plan: Plan
     chosen: dict[Physics, Chosen]
-    launcher: tuple[str, ...] = ()
+    launcher: Launcher | None = None
 
 
 def study(comm: MPI.Comm, asked: Asked) -> None:
@@ -71,25 +69,19 @@ def study(comm: MPI.Comm, asked: Asked) -> None:
     Interrupted
         A signal; the folder can be resumed.
     """
-    stop = StopRequest(comm)
+    obey = watched(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
     ready = on_root(comm, lambda: _prepare(comm, asked))
     assert ready is not None
     plan = ready.plan
     lock = Lock(comm, ready.folder)
     folder = lock.path
-    on_root(comm, lambda: replace_text(folder / REQUEST_FILE, plan.request.text()))
-    run: Runner = lambda job, watch, warm: run_case(comm, job, watch, warm=warm)  # noqa: E731
-    if ready.launcher:
-        run = Launcher(ready.launcher, split(sys.argv[1:])[1], lock.descriptor)
+    on_root(comm, lambda: records.save(folder / REQUEST_FILE, plan.request))
 
-    def obey() -> None:
-        number = stop.signal_number()
-        if number:
-            raise Interrupted(
-                f"stopped by {signal.Signals(number).name}; finished combinations are kept in {folder}, "
-                "--resume goes on",
-                number,
-            )
+    def run(job: Job, watch: Callable[[float], None], warm: bool) -> Result:
+        if ready.launcher is not None:
+            # every process warms up by itself
+            return launched(ready.launcher, job, watch, lock.descriptor)
+        return run_case(comm, job, watch, warm=warm)
 
     with StudyProgress(comm, obey, len(plan.combinations), plain=_petsc_speaks()) as progress:
         for note in plan.notes:
@@ -108,14 +100,14 @@ def _prepare(comm: MPI.Comm, asked: Asked) -> _Ready:
         stem = (asked.scene or default_scene()).stem
     folder = choose_folder(stem, asked.out, force=asked.force, resume=asked.resume)
     request = _request(asked, read_request(folder.path) if asked.resume else None)
-    launcher: tuple[str, ...] = ()
+    launcher = None
     if request.ranks is not None:
         if comm.size > 1:
             raise InputError(
                 "starts one mpirun per case and cannot be used under mpirun; leave one of them out",
                 key="--ranks",
             )
-        launcher = tuple(find_launcher(request.ranks))
+        launcher = Launcher(find_launcher(request.ranks), "study", petsc_words())
     plan = make_plan(request)
     return _Ready(folder, plan, choose_references(plan), launcher)
 
@@ -138,8 +130,7 @@ def _request(asked: Asked, stored: Request | None) -> Request:
 def _command(comm: MPI.Comm, plan: Plan) -> str:
     """The command line that repeats the study from the beginning."""
     request = plan.request
-    words = ["mpirun", "-n", str(comm.size)] if comm.size > 1 else []
-    words += ["python", "-m", "lyra_petsc", "study", request.scene]
+    words = [request.scene]
     for text in request.settings:
         words += ["--set", text]
     for axis in plan.axes:
@@ -149,12 +140,11 @@ def _command(comm: MPI.Comm, plan: Plan) -> str:
     words += ["--quantities", request.quantities] if request.quantities else []
     words += ["--repeats", str(request.repeats)]
     words += ["--ranks", str(request.ranks)] if request.ranks is not None else []
-    return shlex.join([*words, *split(sys.argv[1:])[1]])
+    return shlex.join(command(comm, "study", words))
 
 
 def _close(comm: MPI.Comm, outcome: Outcome, folder: Path) -> None:
     """Words at the end, and the ways in which a study fails as a whole."""
-    left = unused([]) if comm.rank == 0 else []
     if comm.rank == 0:
         for advice in outcome.advice.values():
             for one in advice:
@@ -162,9 +152,7 @@ def _close(comm: MPI.Comm, outcome: Outcome, folder: Path) -> None:
         done = len(outcome.rows) - len(outcome.failed)
         print(f"{done} of {len(outcome.rows)} combinations done, {len(outcome.failed)} failed")
         print(f"report       {folder / 'report.html'}", flush=True)
-        if left:
-            listed = ", ".join(f"-{name}" for name in left)
-            print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
+        tell_unused()
     if not any(row.result.done for row in outcome.rows):
         raise SolverError(
             f"all {len(outcome.rows)} combinations failed; the first: {outcome.rows[0].result.problem}",
@@ -188,12 +176,12 @@ def run_job(comm: MPI.Comm, path: Path) -> None:
     Interrupted
         A signal.
     """
-    stop = StopRequest(comm)
+    obey = watched(comm)
 
     def read() -> Job:
         try:
-            return Job.read(path)
-        except (OSError, ValueError, TypeError, KeyError):
+            return records.load(path, Job)
+        except (OSError, ValueError):
             raise InputError("is no job of a study", file=path, key="--job") from None
 
     job = on_root(comm, read)
@@ -201,9 +189,7 @@ def run_job(comm: MPI.Comm, path: Path) -> None:
     tell: Callable[[float], None] = report_progress(Path(job.folder))
 
     def watch(fraction: float) -> None:
-        number = stop.signal_number()
-        if number:
-            raise Interrupted(f"stopped by {signal.Signals(number).name}", number)
+        obey()
         if comm.rank == 0:
             tell(fraction)
 

@@ -1,4 +1,4 @@
-"""The verbs: what each takes; the work itself is in the module of its name.
+"""The verbs and their options; the work is in the module of the same name.
 
 A module that declares its command itself (``@click.command(context_settings=SETTINGS)``) is registered at the
 end, by ``verbs.add_command(…)``.
@@ -18,8 +18,7 @@ from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
 from lyra_petsc.cli.render import render
 from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
-from lyra_petsc.errors import InputError
-from lyra_petsc.nearest import nearest
+from lyra_petsc.errors import InputError, nearest
 
 
 class _Verbs(click.Group):
@@ -79,21 +78,12 @@ def verbs(ctx: click.Context) -> None:
 @where_served
 @click.pass_obj
 def run(
-    comm: Any,
-    /,
-    scene: Path | None,
-    settings: tuple[str, ...],
-    out: Path | None,
-    force: bool,
-    resume: bool,
-    live: bool,
-    **where: Any,
+    comm: Any, /, live: bool, host: str | None, port: int | None, no_browser: bool, **options: Any
 ) -> None:
     """Simulate SCENE (default: a flag in the wind)."""
     from lyra_petsc.cli.run import run as run_scene
 
-    served = Served.of_live(live, **where)
-    run_scene(comm, scene, settings, out=out, force=force, resume=resume, served=served)
+    run_scene(comm, served=Served.of_live(live, host, port, no_browser), **options)
 
 
 @verbs.command(context_settings=SETTINGS)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
 from lyra_petsc.cli.options import SETTINGS, helped, results
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
+from lyra_petsc.output.agreement import raise_together
 
 PACKAGES = ("trame", "trame_vtk", "trame_vuetify", "trame_plotly", "vtkmodules", "matplotlib")
 """What the page needs of the extra ``view``."""
@@ -25,7 +24,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def where_served(function: Function) -> Function:
-    """The options that say where the page is."""
+    """Add the options that say where the page is served."""
     for option in (
         click.option("--no-browser", is_flag=True, help="Do not open the page in a browser."),
         click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Its port (a free one)."),
@@ -37,7 +36,7 @@ def where_served(function: Function) -> Function:
 
 @dataclass(frozen=True)
 class Served:
-    """Where the page is served, and whether a browser is opened."""
+    """Where the page is served, and whether a browser opens it."""
 
     host: str
     port: int
@@ -55,7 +54,7 @@ class Served:
         Raises
         ------
         InputError
-            For options that mean nothing then.
+            For options that have no meaning without ``--live``.
         """
         if live:
             return cls.of(host, port, no_browser)
@@ -66,7 +65,7 @@ class Served:
         return None
 
     def check(self, what: str) -> None:
-        """Refuse what cannot be served, before anything else is done; for one rank.
+        """Check that the page can be served, before anything else is done; for one rank.
 
         Raises
         ------
@@ -74,14 +73,14 @@ class Served:
             For packages that are missing, or an address that cannot be used.
         """
         require(what, PACKAGES, "view")
-        from lyra_petsc.view.server import check_address
+        from lyra_petsc.show.view.server import check_address
 
         check_address(self.host, self.port)
 
     def announce(self, url: str, say: Callable[[str], Any]) -> None:
-        """Say where the page is and who can reach it, and open it."""
-        from lyra_petsc.view.access import is_loopback
-        from lyra_petsc.view.server import open_browser
+        """Print the address of the page and who can reach it, and open it."""
+        from lyra_petsc.show.view.access import is_loopback
+        from lyra_petsc.show.view.server import open_browser
 
         say(f"view: {url}")
         if not is_loopback(self.host):
@@ -103,28 +102,21 @@ def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: b
             _serve(run, Served.of(host, port, no_browser))
         except LyraError as error:
             problem = error
-    _wait_for_rank_0(comm)
-    problem = comm.bcast(problem, root=0)
-    if problem is not None:
-        raise problem
-
-
-def _wait_for_rank_0(comm: MPI.Comm) -> None:
-    """Meet the other ranks without keeping their processors busy."""
     request = comm.Ibarrier()
-    while not request.Test():
+    while not request.Test():  # a barrier that keeps no processor busy
         time.sleep(0.2)
+    raise_together(comm, problem)
 
 
 def _serve(folder: Path, served: Served) -> None:
     """Serve until a signal."""
     served.check("view")
-    from lyra_petsc.view.server import find_run, serve
+    from lyra_petsc.show.view.server import find_run, serve
 
     def ready(url: str) -> None:
         served.announce(url, click.echo)
         click.echo("Ctrl-C ends")
 
-    number = serve(find_run(folder), host=served.host, port=served.port, ready=ready)
+    number = asyncio.run(serve(find_run(folder), served.host, served.port, ready))
     if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
         raise Interrupted(f"ended by {signal.Signals(number).name}", number)

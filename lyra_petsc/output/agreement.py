@@ -1,4 +1,4 @@
-"""Failures of file operations: in words, and shared by all ranks."""
+"""Errors of file operations: their cause in words, and raised alike on all ranks."""
 
 from __future__ import annotations
 

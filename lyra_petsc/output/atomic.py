@@ -1,4 +1,4 @@
-"""Small files that are old or new, never half."""
+"""Small files replaced atomically: a reader finds the old or the new content, never a part of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work of rank 0 on files that the steps need not wait for."""
+"""File operations of rank 0 in a thread of its own, while the steps go on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lyra_petsc.output.agreement import raise_together
 
 
 class Background:
-    """One piece of work at a time, in a thread of rank 0, which no MPI may be called in.
+    """One task at a time, in a thread of rank 0; a task must not call MPI.
 
     Parameters
     ----------
@@ -26,17 +26,17 @@ class Background:
         self._work: Future[None] | None = None
 
     def begin(self, work: Callable[[], None]) -> None:
-        """Let rank 0 do it, after `settle`."""
+        """Start a task on rank 0; `settle` has to come before."""
         if self._comm.rank == 0:
             self._work = self._worker.submit(work)
 
     def settle(self) -> None:
-        """Return when it is done; collective.
+        """Wait for the task; collective.
 
         Raises
         ------
         LyraError
-            On every rank what the work raised, once.
+            On every rank what the task raised, once.
         """
         problem = None if self._work is None else self._work.exception()
         self._work = None
@@ -45,5 +45,5 @@ class Background:
         raise_together(self._comm, problem)
 
     def close(self) -> None:
-        """End the thread when it is done, whatever came of it; for one rank."""
+        """Wait for the task and end the thread; errors of the task are dropped. For one rank."""
         self._worker.shutdown()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,8 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.hdf5 import NewFile, read_slab
+from lyra_petsc.output.hdf5 import NewFile, cannot_write, read_slab
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.slabs import cannot_write
 from lyra_petsc.parallel import on_root
 
 CHECKPOINT = "checkpoint.h5"
@@ -43,12 +43,15 @@ class Checkpoint:
         The file read: the newest that is whole.
     note : str or None
         Why it is not the newest one, for the user.
+    edges : dict of str to (n_edges,) array
+        Unknowns of edges by name, in this rank's numbering.
     """
 
     arrays: dict[str, NDArray[Any]]
     scalars: Scalars
     file: Path
     note: str | None = None
+    edges: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
 def checkpoint_file(
@@ -56,6 +59,8 @@ def checkpoint_file(
     order: FileOrder,
     arrays: Mapping[str, NDArray[Any]],
     scalars: Mapping[str, Any],
+    edge_order: FileOrder | None = None,
+    edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> NewFile:
     """A newer checkpoint, to be written; then the old one is kept as the previous.
 
@@ -67,12 +72,18 @@ def checkpoint_file(
         Order of the vertices each rank owns; collective over its ranks.
     arrays : mapping of str to (n_owned, ...) array of float64 or int64
         Vertex arrays: ``position`` [m], ``velocity`` [m/s], and what the integrator remembers.
+    edge_order : FileOrder or None
+        Order of the edges each rank owns that carry an unknown; None: there are none.
+    edge_arrays : mapping of str to (n_edges,) array of float64
+        The same of the unknowns of edges.
     scalars : mapping
         What JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
         works, …; the same on every rank.
     """
     folder = Path(folder)
     slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
+    if edge_order is not None:
+        slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
     sums = {name: _sum(slab, order.comm) for name, slab in slabs.items()}
     attributes: dict[str, dict[str, int | float | str]] = {
         "/": {"format": FORMAT, "n_vertices": order.n_global, "scalars": json.dumps(dict(scalars))},
@@ -90,7 +101,9 @@ def _rotate(folder: Path) -> None:
         raise cannot_write(folder / CHECKPOINT, error) from error
 
 
-def read_checkpoint(folder: str | os.PathLike[str], order: FileOrder) -> Checkpoint:
+def read_checkpoint(
+    folder: str | os.PathLike[str], order: FileOrder, edge_order: FileOrder | None = None
+) -> Checkpoint:
     """The newest whole checkpoint of a run, whatever number of ranks wrote it.
 
     Parameters
@@ -108,13 +121,20 @@ def read_checkpoint(folder: str | os.PathLike[str], order: FileOrder) -> Checkpo
     newest: InputError | None = None
     for file in checkpoint_files(folder, order.comm):
         try:
-            scalars, names, sums = on_root(order.comm, lambda f=file: _head(f, order)) or ({}, [], {})  # type: ignore[misc]
-            arrays = {name: _rows(file, name, sums[name], order) for name in names}
+            scalars, sums = on_root(order.comm, lambda f=file: _head(f, order)) or ({}, {})  # type: ignore[misc]
+            arrays, edges = (
+                {
+                    name.split("/", 1)[1]: _rows(file, name, sums[name], by)
+                    for name in sorted(sums)
+                    if name.startswith(kind) and by is not None
+                }
+                for kind, by in (("vertices/", order), ("edges/", edge_order))
+            )
         except InputError as error:
             newest = newest or error
             continue
         note = f"{newest}; going on from the one before" if newest else None
-        return Checkpoint(arrays, scalars, file, note)
+        return Checkpoint(arrays, scalars, file, note, edges)
     if newest is None:
         raise InputError("holds no checkpoint to resume from; run without --resume", file=folder)
     raise InputError(
@@ -134,13 +154,16 @@ def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = Non
     return work() if comm is None else on_root(comm, work) or []
 
 
-def _head(file: Path, order: FileOrder) -> tuple[Scalars, list[str], dict[str, int]]:
+def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:
     try:
         with import_h5py().File(file, "r") as content:
             version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
             scalars = json.loads(content.attrs["scalars"])
-            arrays = content["vertices"]
-            sums = {name: int(data.attrs["sum"]) for name, data in arrays.items()}
+            sums = {
+                f"{kind}/{name}": int(data.attrs["sum"])
+                for kind in ("vertices", "edges")
+                for name, data in content.get(kind, {}).items()
+            }
     except HDF5_ERRORS as error:
         raise InputError(f"checkpoint is damaged: {reason(error)}", file=file) from error
     if version != FORMAT:
@@ -151,13 +174,15 @@ def _head(file: Path, order: FileOrder) -> tuple[Scalars, list[str], dict[str, i
             "resume with the scene it was written by",
             file=file,
         )
-    return scalars, sorted(sums), sums
+    return scalars, sums
 
 
 def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
-    slab = read_slab(file, f"vertices/{name}", order)
+    slab = read_slab(file, name, order)
     if _sum(slab, order.comm) != expected:
-        raise InputError(f"checkpoint is damaged: the check sum of {name} does not fit", file=file)
+        raise InputError(
+            f"checkpoint is damaged: the check sum of {name.split('/', 1)[1]} does not fit", file=file
+        )
     return order.from_slab(slab)
 
 

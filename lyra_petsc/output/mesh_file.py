@@ -12,13 +12,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.meshing.mesh import Group, Mesh
+from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
-
-MESH_FILE = "mesh.h5"
 
 ROUNDING = 1e-9
 """Difference between coordinates over the size of the mesh that another machine's arithmetic may make."""

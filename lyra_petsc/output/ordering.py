@@ -1,4 +1,4 @@
-"""Between the rows that ranks own and the order of the mesh file."""
+"""Redistribution of rows between their owners and slabs in the order of the mesh file."""
 
 from __future__ import annotations
 

@@ -18,13 +18,11 @@ from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
-from lyra_petsc.output.mesh_file import MESH_FILE
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.vtkhdf import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
-from lyra_petsc.output.xdmf import Field, State, TimeSeries, group_name
+from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
+from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
 from lyra_petsc.parallel import on_root
 
-XDMF_FILE = "states.xdmf"
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
 Fields = Mapping[str, NDArray[Any]]
@@ -70,7 +68,7 @@ class StateWriter:
         self.vertices = vertices
         self.triangles = triangles
         self.n_triangles = n_triangles
-        self._states: list[State] = []  # kept on rank 0
+        self._states: list[WrittenState] = []  # kept on rank 0
         self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
@@ -133,7 +131,7 @@ class StateWriter:
         attributes = {group: stamp, f"{group}/position": {**stamp, "on": "vertex"}}
         attributes |= {f"{group}/{field.name}": {"on": field.on} for field in fields}
         name = f"states-{number:04d}.h5"
-        state = State(number, int(step), float(time), name, fields)
+        state = WrittenState(number, int(step), float(time), name, fields)
         datasets = {f"{group}/{key}": slab for key, slab in slabs.items()}
         file = NewFile(self.folder / name, datasets, attributes, publish=lambda: self._announce(state))
         write_collective([file, *beside], self._comm, self._background)
@@ -141,14 +139,14 @@ class StateWriter:
         return number
 
     @staticmethod
-    def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[Field, ...]:
+    def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[StoredField, ...]:
         return tuple(
-            Field(name, on, (order.n_global, *slab.shape[1:]), slab.dtype.name)
+            StoredField(name, on, (order.n_global, *slab.shape[1:]), slab.dtype.name)
             for name, slab in slabs.items()
             if name != "position"
         )
 
-    def _announce(self, state: State | None) -> None:
+    def _announce(self, state: WrittenState | None) -> None:
         states = self._states if state is None else [*self._states, state]
         replace_text(self.folder / XDMF_FILE, self._series.text(states))
         if self._vtkhdf:
@@ -176,7 +174,7 @@ def state_files(folder: str | os.PathLike[str]) -> list[Path]:
     return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
 
 
-def read_state(path: Path) -> State | None:
+def read_state(path: Path) -> WrittenState | None:
     """What a state file holds, or ``None`` if it cannot be read."""
     match = STATE_FILE.fullmatch(path.name)
     try:
@@ -184,10 +182,12 @@ def read_state(path: Path) -> State | None:
             number = int(match[1]) if match else 0
             group = file[group_name(number)]
             fields = tuple(
-                Field(name, str(data.attrs["on"]), data.shape, data.dtype.name)
+                StoredField(name, str(data.attrs["on"]), data.shape, data.dtype.name)
                 for name, data in group.items()
                 if name != "position"
             )
-            return State(number, int(group.attrs["step"]), float(group.attrs["time"]), path.name, fields)
+            return WrittenState(
+                number, int(group.attrs["step"]), float(group.attrs["time"]), path.name, fields
+            )
     except HDF5_ERRORS:
         return None

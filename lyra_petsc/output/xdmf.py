@@ -8,9 +8,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+XDMF_FILE = "states.xdmf"
+MESH_FILE = "mesh.h5"
+
 
 @dataclass(frozen=True)
-class Field:
+class StoredField:
     """A dataset of a state.
 
     Attributes
@@ -32,7 +35,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class State:
+class WrittenState:
     """A state file that is complete on disk.
 
     Attributes
@@ -45,7 +48,7 @@ class State:
         [s].
     file : str
         File name, relative to the XDMF file.
-    fields : tuple of Field
+    fields : tuple of StoredField
         What it holds besides the positions.
     """
 
@@ -53,7 +56,7 @@ class State:
     step: int
     time: float
     file: str
-    fields: tuple[Field, ...]
+    fields: tuple[StoredField, ...]
 
 
 # a row's number of components, as XDMF names it; other widths are matrices
@@ -83,11 +86,11 @@ class TimeSeries:
         self._before = (
             f'   <Topology TopologyType="Triangle" NumberOfElements="{n_triangles}">{triangles}</Topology>\n'
         )
-        rest = Field("rest", "vertex", (n_vertices, 3), "float64")
+        rest = StoredField("rest", "vertex", (n_vertices, 3), "float64")
         self._after = _attribute(rest, f"{mesh_file}:/mesh/rest")
-        self._grids: dict[int, tuple[State, str]] = {}
+        self._grids: dict[int, tuple[WrittenState, str]] = {}
 
-    def text(self, states: Sequence[State]) -> str:
+    def text(self, states: Sequence[WrittenState]) -> str:
         """The whole document, states in the order given."""
         grids = "".join(map(self._known, states))
         return (
@@ -96,14 +99,14 @@ class TimeSeries:
             f"{grids}  </Grid>\n </Domain>\n</Xdmf>\n"
         )
 
-    def _known(self, state: State) -> str:
+    def _known(self, state: WrittenState) -> str:
         made, text = self._grids.get(state.number, (None, ""))
         if made is not state:  # a number is used again when its state could not be announced
             text = self._grid(state)
             self._grids[state.number] = state, text
         return text
 
-    def _grid(self, state: State) -> str:
+    def _grid(self, state: WrittenState) -> str:
         group = f"{state.file}:/{group_name(state.number)}"
         position = _item((self._n_vertices, 3), "float64", f"{group}/position")
         return (
@@ -115,7 +118,7 @@ class TimeSeries:
         )
 
 
-def _attribute(field: Field, where: str) -> str:
+def _attribute(field: StoredField, where: str) -> str:
     kind = ATTRIBUTE_TYPES.get(int(np.prod(field.shape[1:], dtype=int)), "Matrix")
     return (
         f'   <Attribute Name={quoteattr(field.name)} AttributeType="{kind}" Center="{CENTERS[field.on]}">'

@@ -1,16 +1,26 @@
-"""Base of every block of scene keys: unknown keys are errors, an empty key counts as absent."""
+"""Base of every block of scene keys: unknown keys are errors, an empty key counts as absent.
+
+Messages, JSON Schema and reference page are generated from a block's fields, rules and docstring.
+"""
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema
+from typing_extensions import Self
 
-from lyra_petsc.nearest import nearest
-from lyra_petsc.scene.describe import attributes, summary
+from lyra_petsc.errors import nearest
+from lyra_petsc.scene.rules import Rule, holds
 from lyra_petsc.scene.values import problem, shown
+
+_ENTRY = re.compile(r"(?P<names>\w+(?:, \w+)*)(?: : (?P<kind>.*))?")
+_UNIT = re.compile(r"\[([^\]]*)\]")
 
 
 class Block(BaseModel):
@@ -24,8 +34,8 @@ class Block(BaseModel):
     # keys that a scene may well try, and what to say of them
     not_yet: ClassVar[dict[str, str]] = {}
 
-    # how keys depend on each other, as far as JSON Schema can say it (scene.rules)
-    rules: ClassVar[tuple[dict[str, Any], ...]] = ()
+    # how keys depend on each other
+    rules: ClassVar[tuple[Rule, ...]] = ()
 
     # keys that `complete` fills in only in some cases
     sometimes_filled: ClassVar[frozenset[str]] = frozenset()
@@ -57,10 +67,19 @@ class Block(BaseModel):
         """Hook: defaults that depend on which other keys are given."""
         return data
 
+    @model_validator(mode="after")
+    def _rules_hold(self) -> Self:
+        for rule in self.rules:
+            if not holds(rule.condition, self):
+                told = rule.message
+                words = told.format(**self.__dict__) if isinstance(told, str) else told(self)
+                raise problem(words, *filter(None, rule.at.split(".")))
+        return self
+
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         schema = handler.resolve_ref_schema(handler(core))
-        said = attributes(cls)
+        described = attributes(cls)
         keys = {}
         for name, field in cls.model_fields.items():
             key = field.alias or name
@@ -73,15 +92,70 @@ class Block(BaseModel):
                 content = {"anyOf": [content, {"type": "null"}]}
             elif "$ref" in content:  # draft 7 ignores what stands beside a reference
                 content = {"allOf": [content]}
-            keys[key] = {"description": said[name].sentence, **content}
+            keys[key] = {"description": described[name].sentence, **content}
             if default not in (None, math.inf):
                 keys[key]["default"] = default
         schema.pop("title", None)
         needed = [key for key in schema.get("required", ()) if key not in cls.sometimes_filled]
-        schema["required"] = needed
-        schema |= {"description": summary(cls), "properties": keys}
-        return schema | ({"allOf": list(cls.rules)} if cls.rules else {})
+        schema |= {"required": needed, "description": summary(cls), "properties": keys}
+        return schema | ({"allOf": [rule.condition for rule in cls.rules]} if cls.rules else {})
 
-    def given(self, *names: str) -> list[str]:
-        """Those of ``names`` that have a value."""
-        return [name for name in names if getattr(self, name) is not None]
+    def get(self, key: str) -> Any:
+        """The value of a key of `keys`, None where it is absent."""
+        return getattr(self, "start" if key == "from" else key)
+
+    def given(self, *keys: str) -> list[str]:
+        """Those of ``keys`` that have a value."""
+        return [key for key in keys if self.get(key) is not None]
+
+
+@dataclass(frozen=True)
+class Described:
+    """One entry of a docstring's list of attributes.
+
+    Attributes
+    ----------
+    kind : str
+        Type and shape, with the unit in brackets.
+    text : str
+    """
+
+    kind: str
+    text: str
+
+    @property
+    def sentence(self) -> str:
+        """The text with the unit behind it."""
+        unit = _UNIT.search(self.kind)
+        return " ".join(part for part in (self.text, unit[0] if unit and unit[1] else "") if part)
+
+
+def summary(block: type) -> str:
+    """The first paragraph of a class's docstring, on one line."""
+    return " ".join((inspect.getdoc(block) or "").split("\n\n")[0].split())
+
+
+def attributes(block: type) -> dict[str, Described]:
+    """The entries under ``Attributes`` of a class and those it derives from, by name."""
+    found: dict[str, Described] = {}
+    for parent in reversed(block.__mro__):
+        found |= _listed(inspect.cleandoc(parent.__dict__.get("__doc__") or ""))
+    return found
+
+
+def _listed(doc: str) -> dict[str, Described]:
+    _, _, section = doc.partition("Attributes\n----------\n")
+    found: dict[str, Described] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        if line.startswith(" "):
+            for name in names:
+                text = f"{found[name].text} {line.strip()}".strip()
+                found[name] = Described(found[name].kind, text)
+        elif entry := _ENTRY.fullmatch(line):
+            # an entry without a type refers to another docstring
+            names = entry["names"].split(", ") if entry["kind"] else []
+            found |= {name: Described(entry["kind"], "") for name in names}
+        else:
+            names = []
+    return found

@@ -1,20 +1,21 @@
-"""The JSON Schema of scene files, for editors: ``check --schema`` prints it."""
+"""The JSON Schema of scene files, for editors: generated from the blocks of the scene."""
 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
+import lyra_petsc
 from lyra_petsc.scene.overrides import ONE_OR_MANY
 from lyra_petsc.scene.schema import Scene
 
-SCHEMA_FILE = Path(__file__).with_name("scene.schema.json")
-"""What `schema_text` gave when the package was made; editors can be pointed at it."""
+FILE = f"lyra_petsc-{lyra_petsc.__version__}.schema.json"
 
 
 def scene_schema() -> dict[str, Any]:
-    """The schema (draft 7), made from the blocks of the scene.
+    """The schema (draft 7) of a scene.
 
     It refuses what the loader refuses as far as JSON Schema can say it. Beyond it are: files that do not
     exist, groups of the mesh, names of motions that are not there, a membrane that is not positive definite,
@@ -40,9 +41,22 @@ def scene_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as the text of a file."""
+    """The schema as the text of a file: what ``check --schema`` prints."""
     return json.dumps(scene_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
-if __name__ == "__main__":
-    SCHEMA_FILE.write_text(schema_text(), encoding="utf-8")
+def schema_file() -> Path:
+    """A file with the schema in the user's cache folder, written if it is not there yet.
+
+    Where it cannot be written: the name under which a user may keep what ``check --schema`` prints beside the
+    scene.
+    """
+    try:
+        path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lyra_petsc" / FILE
+        text = schema_text()
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    except (OSError, RuntimeError):  # a full disk, a folder of another user, or no home at all
+        return Path("scene.schema.json")
+    return path

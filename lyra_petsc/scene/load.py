@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.messages import dotted, input_error
-from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain, unshared
+from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
 from lyra_petsc.scene.values import shown
@@ -49,7 +49,7 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
     if not isinstance(data, dict):
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
     try:
-        data = unshared(data)
+        data = plain(data)
         overridden = apply_overrides(data, overrides)
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=path) from None

@@ -1,4 +1,4 @@
-"""From pydantic's findings to one line that names the key as the user wrote it."""
+"""Pydantic's errors as one line that names the key as the user wrote it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def dotted(path: Sequence[str | int], data: Any = None) -> str:
 def input_error(
     error: ValidationError, data: Any, *, file: object | None, overridden: Sequence[str] = ()
 ) -> InputError:
-    """The first of pydantic's findings as an `InputError`, and how many more there are.
+    """The first of pydantic's errors as an `InputError`, with the number of further ones.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Scenes of the original Lyra program (conf.json) in our keys.
+"""Scenes of the original Lyra program (conf.json, with its material tables and vertex labels) in our keys.
 
 What differs from a scene of ours, and is kept as the original has it: Δt = frame_time/frame_steps
 with one linearised step each (``semi-implicit``); handles are springs of 1000 N/m; measured
@@ -8,24 +8,303 @@ does not do. ``texture`` is for its window only and has no counterpart.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from typing_extensions import Self
 
-from lyra_petsc.errors import InputError
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.materials.library import ClothTable, entries, of_table
 from lyra_petsc.scene.messages import input_error
-from lyra_petsc.scene.original_files import ObjLabels, find_beside, material_numbers
-from lyra_petsc.scene.original_keys import (
-    OriginalCloth,
-    OriginalHandle,
-    OriginalKeyframe,
-    OriginalMaterial,
-    OriginalScene,
+from lyra_petsc.scene.text import parse_json, read_text
+from lyra_petsc.scene.values import (
+    Count,
+    Index,
+    NonNegative,
+    Number,
+    Positive,
+    Text,
+    Vector,
+    integer,
+    number,
+    problem,
+    shown,
 )
-from lyra_petsc.scene.values import shown
 
 HANDLE_STIFFNESS = 1000.0  # N/m
+STRETCHING_SHAPE = (6, 4)
+BENDING_SHAPE = (3, 5)
+DEFAULT_FRAME_TIME = 0.04  # s
+DEFAULT_FRAME_STEPS = 8
+
+
+def _rotation(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or len(value) != 4:
+        raise problem(f"must be [degrees, x, y, z], not {shown(value)}")
+    return tuple(number(entry) for entry in value)
+
+
+def _motion_keyframes(value: Any) -> Any:
+    if isinstance(value, dict):
+        if "motfile" in value:
+            raise problem("motion files are not read; write the keyframes into the scene", "motfile")
+        for key in value:
+            if key not in ("center", "points"):
+                raise problem("unknown key, known: center, points", str(key))
+        center = value.get("center")
+        if center is not None and any(number(c) != 0 for c in (center if isinstance(center, list) else [])):
+            raise problem("must be [0, 0, 0]: motions are about the origin", "center")
+        value = value.get("points")
+    if not isinstance(value, list) or not value:
+        raise problem(f"must be a list of keyframes, not {shown(value)}")
+    return value
+
+
+def _motion_number(value: Any) -> Any:
+    # the original writes "none" as -1
+    return None if value == -1 else value
+
+
+class Placement(Block):
+    """``transform``: scale, then rotate, then translate."""
+
+    translate: Vector = (0.0, 0.0, 0.0)
+    scale: Number = 1.0
+    rotate: Annotated[tuple[float, float, float, float], BeforeValidator(_rotation)] = (0.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _has_axis(self) -> Self:
+        if self.rotate[0] != 0.0 and not any(self.rotate[1:]):
+            raise problem("needs an axis: [degrees, x, y, z]", "rotate")
+        return self
+
+    def in_our_keys(self) -> dict[str, Any]:
+        """As our ``transform``, or as the spatial part of a keyframe."""
+        block: dict[str, Any] = {"scale": self.scale, "translate": list(self.translate)}
+        degrees, *axis = self.rotate
+        if degrees != 0.0:
+            block["rotate"] = {"axis": axis, "degrees": degrees}
+        return block
+
+
+class OriginalMaterial(Block):
+    not_yet = dict.fromkeys(("yield_curv", "weakening"), "plastic creases are not there; leave the key out")
+
+    data: Text
+    density_mult: Positive = 1.0
+    stretching_mult: Positive = 1.0
+    bending_mult: NonNegative = 1.0
+    thicken: Positive = 1.0
+    damping: NonNegative = 0.0
+
+
+class OriginalCloth(Block):
+    mesh: Text
+    transform: Placement = Field(default_factory=Placement)
+    materials: list[OriginalMaterial]
+    texture: Text = ""
+
+    @model_validator(mode="after")
+    def _one_material(self) -> Self:
+        if len(self.materials) != 1:
+            raise problem(f"must hold one material, not {len(self.materials)}", "materials")
+        if self.transform.scale <= 0:
+            raise problem("must be > 0", "transform", "scale")
+        return self
+
+
+class OriginalHandle(Block):
+    type: Text = "node"
+    cloth: Index = 0
+    nodes: list[Index] = Field(default_factory=list)
+    label: Annotated[int, BeforeValidator(integer)] = -1
+    motion: Annotated[Index | None, BeforeValidator(_motion_number)] = None
+    start_time: Number = 0.0
+    end_time: Number | None = None
+    fade_time: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _on_nodes(self) -> Self:
+        if self.type != "node":
+            raise problem(f"only handles of type 'node' are read, not {self.type!r}", "type")
+        if self.label == -1 and not self.nodes:
+            raise problem("must have nodes or label")
+        return self
+
+
+class OriginalKeyframe(Block):
+    time: Number
+    transform: Placement = Field(default_factory=Placement)
+    velocity: Placement | None = None
+
+    @model_validator(mode="after")
+    def _translation_only(self) -> Self:
+        moving = self.velocity
+        if moving is not None and (moving.scale not in (0.0, 1.0) or moving.rotate[0] != 0.0):
+            raise problem("may hold translate only", "velocity")
+        return self
+
+
+class OriginalWind(Block):
+    density: NonNegative = 0.0
+    velocity: Vector = (0.0, 0.0, 0.0)
+    drag: NonNegative = 0.0
+
+
+class OriginalScene(Block):
+    """The keys of a conf.json, with the original's defaults."""
+
+    frame_time: Positive = DEFAULT_FRAME_TIME
+    frame_steps: Count
+    end_time: Positive | None = None
+    end_frame: Count | None = None
+    cloths: list[OriginalCloth]
+    handles: list[OriginalHandle] = Field(default_factory=list)
+    motions: list[Annotated[list[OriginalKeyframe], BeforeValidator(_motion_keyframes)]] = Field(
+        default_factory=list
+    )
+    gravity: Vector | None = None
+    wind: OriginalWind = Field(default_factory=OriginalWind)
+
+    @classmethod
+    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Without a frame_time the step is that of the shipped scene, else one step a frame."""
+        return {"frame_steps": 1 if "frame_time" in data else DEFAULT_FRAME_STEPS, **data}
+
+    @model_validator(mode="after")
+    def _numbers_exist(self) -> Self:
+        if not self.cloths:
+            raise problem("must hold at least one cloth", "cloths")
+        for i, handle in enumerate(self.handles):
+            if handle.motion is not None and handle.motion >= len(self.motions):
+                raise problem(
+                    f"there is no motion {handle.motion}, only {len(self.motions)}", "handles", i, "motion"
+                )
+            if handle.cloth >= len(self.cloths):
+                raise problem(
+                    f"there is no cloth {handle.cloth}, only {len(self.cloths)}", "handles", i, "cloth"
+                )
+        return self
+
+
+def find_beside(name: str, scene: Path) -> Path | None:
+    """The file ``name`` beside the scene, beside its folder, or in the working directory."""
+    folder = scene.absolute().parent
+    for directory in (folder, folder.parent, Path.cwd()):
+        try:
+            if (directory / name).is_file():
+                return directory / name
+        except (OSError, ValueError):
+            return None
+    return None
+
+
+def _table(shape: tuple[int, int]) -> BeforeValidator:
+    rows, columns = shape
+
+    def check(value: Any) -> Any:
+        right = isinstance(value, list) and len(value) == rows
+        if not right or any(not isinstance(row, list) or len(row) != columns for row in value):
+            raise problem(f"must be {rows} rows of {columns} numbers")
+        return [[number(entry) for entry in row] for row in value]
+
+    return BeforeValidator(check)
+
+
+class MaterialFile(Block):
+    """The tables of one cloth as the original's material files have them."""
+
+    density: Positive
+    stretching: Annotated[list[list[float]], _table(STRETCHING_SHAPE)]
+    bending: Annotated[list[list[float]], _table(BENDING_SHAPE)]
+
+
+def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
+    """density, membrane and bending in our keys of the material that a conf.json names.
+
+    The file if it exists, else the library's cloth of that name. Negative entries count as 0, as
+    in the original.
+
+    Raises
+    ------
+    InputError
+        Neither a file nor a known name; a table that no sheet can have.
+    """
+    found = find_beside(data, scene)
+    if found is not None:
+        table = _read_material(found)
+    else:
+        cloths = {name: entry for name, entry in entries().items() if isinstance(entry, ClothTable)}
+        name = Path(data).stem
+        if name not in cloths:
+            raise InputError(
+                f"neither a file nor a library cloth: {data!r}, {nearest(name, cloths)}", file=scene, key=key
+            )
+        table = cloths[name]
+    c11, c12, c22, c33 = (max(c, 0.0) for c in (table.c11, table.c12, table.c22, table.c33))
+    if min(c11, c22, c33) == 0.0 or c11 * c22 <= c12 * c12:
+        raise InputError(
+            f"the small-strain row [{c11:g}, {c12:g}, {c22:g}, {c33:g}] N/m is not positive definite",
+            file=found or scene,
+            key="stretching[0]" if found else key,
+        )
+    at_0, at_45, at_90 = (max(k, 0.0) for k in table.bending)
+    shell, _ = of_table(ClothTable(table.density, c11, c12, c22, c33, (at_0, at_45, at_90)), data)
+    return {
+        "density": shell.density,
+        "membrane": {"c11": shell.c11, "c22": shell.c22, "c12": shell.c12, "c33": shell.c33},
+        "bending": list(shell.bending),
+    }
+
+
+def _read_material(path: Path) -> ClothTable:
+    data = parse_json(read_text(path), file=path)
+    try:
+        tables = MaterialFile.model_validate(data)
+    except ValidationError as error:
+        raise input_error(error, data, file=path) from None
+    c11, c12, c22, c33 = tables.stretching[0]
+    at_0, at_45, at_90 = (row[0] for row in tables.bending)
+    return ClothTable(tables.density, c11, c12, c22, c33, (at_0, at_45, at_90))
+
+
+class ObjLabels:
+    """Vertex counts and vertex labels (``nl`` lines) of a scene's .obj files, read when asked for."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self.files = files
+        self._lines: dict[int, list[list[str]]] = {}
+
+    def first_vertex(self, cloth: int) -> int:
+        """Number of the cloth's first vertex when all are numbered consecutively."""
+        return sum(1 for earlier in range(cloth) for words in self._words(earlier) if words[0] == "v")
+
+    def labelled(self, cloth: int, label: int) -> list[int]:
+        """Numbers of the cloth's vertices that bear ``label``; a label follows its vertex."""
+        vertex = self.first_vertex(cloth) - 1
+        found: list[int] = []
+        for words in self._words(cloth):
+            if words[0] == "v":
+                vertex += 1
+            elif words[0] == "nl" and words[1:2] == [str(label)]:
+                found.append(vertex)
+        return sorted({vertex for vertex in found if vertex >= 0})
+
+    def has_texture_coordinates(self, cloth: int) -> bool:
+        """Whether the cloth's rest shape is given by ``vt`` lines."""
+        return any(words[0] == "vt" for words in self._words(cloth))
+
+    def _words(self, cloth: int) -> list[list[str]]:
+        if cloth not in self._lines:
+            split = (
+                line.split(maxsplit=2)[:2]
+                for line in read_text(self.files[cloth], largest=math.inf).splitlines()
+            )
+            self._lines[cloth] = [words for words in split if words and words[0] in ("v", "nl", "vt")]
+        return self._lines[cloth]
 
 
 def import_original(data: Any, path: Path) -> dict[str, Any]:

@@ -44,7 +44,10 @@ def apply_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A copy made of what a scene file can hold; numpy's numbers and arrays, paths and tuples are read so."""
+    """A copy made of what a scene file can hold: lists for tuples and arrays, text for paths.
+
+    No two places hold the same block, as YAML anchors make them.
+    """
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -52,13 +55,6 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value) if isinstance(value, Path) else value
-
-
-def unshared(value: Any) -> Any:
-    """A copy in which no two places hold the same block (YAML anchors make such)."""
-    if isinstance(value, dict):
-        return {key: unshared(entry) for key, entry in value.items()}
-    return [unshared(entry) for entry in value] if isinstance(value, list) else value
 
 
 def _apply(data: dict[str, Any], text: str) -> str:

@@ -7,44 +7,777 @@ term is off.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import BeforeValidator, Field, PrivateAttr, model_validator
+import numpy as np
+from pydantic import BeforeValidator, Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
-from lyra_petsc.nearest import nearest
+from lyra_petsc.errors import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.control import Output, Solver, Time
-from lyra_petsc.scene.forcing import Handle, Initial, Keyframe, Load, Selector, Wind
+from lyra_petsc.scene.materials.library import names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
-from lyra_petsc.scene.render import Camera, Render
-from lyra_petsc.scene.rules import given, when
-from lyra_petsc.scene.sheet import Grid, Material, Membrane, MeshSource, Rotation, Transform
-from lyra_petsc.scene.values import JsonSchema, Name, Text, Vec3, Vector, problem, shown
+from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, some, when
+from lyra_petsc.scene.values import (
+    INDEX,
+    VECTOR,
+    Angle,
+    Axis,
+    Bending,
+    Count,
+    Flag,
+    Fraction,
+    Index,
+    JsonSchema,
+    Name,
+    NonNegative,
+    Number,
+    Poisson,
+    Positive,
+    PositiveScale,
+    Scale,
+    Seed,
+    StepLength,
+    Text,
+    Until,
+    Vec3,
+    Vector,
+    problem,
+    shown,
+    vector,
+)
 
-__all__ = [
-    "Camera",
-    "Grid",
-    "Handle",
-    "Initial",
-    "Keyframe",
-    "Load",
-    "Material",
-    "Membrane",
-    "MeshSource",
-    "Output",
-    "Render",
-    "Rotation",
-    "Scene",
-    "Selector",
-    "Solver",
-    "Time",
-    "Transform",
-    "Vec3",
-    "Wind",
-]
+MESH_SUFFIXES = (".geo", ".msh", ".obj")
+
+
+class Rotation(Block):
+    """Right-handed rotation about an axis through the origin.
+
+    Attributes
+    ----------
+    axis : (3,)
+        Direction of the axis; not zero, need not be a unit vector.
+    degrees : float [°]
+        Angle.
+    """
+
+    axis: Axis
+    degrees: Number
+
+
+class Transform(Block):
+    """Scaling, then rotation, then translation, all about the origin.
+
+    Attributes
+    ----------
+    scale : float or (3,)
+        Factor, or one for each axis; > 0.
+    rotate : Rotation or None
+        Rotation after the scaling.
+    translate : (3,) [m]
+        Displacement after the rotation.
+    """
+
+    scale: PositiveScale = 1.0
+    rotate: Rotation | None = None
+    translate: Vector = (0.0, 0.0, 0.0)
+
+
+class Grid(Block):
+    """A rectangle of cells in the xy plane, one corner at the origin.
+
+    Attributes
+    ----------
+    width, height : float [m]
+        Extent in x and y.
+    nx, ny : int
+        Cells in x and y.
+    pattern : str
+        How cells are cut into triangles: all diagonals alike, alternating, or four triangles a cell.
+    """
+
+    width: Positive
+    height: Positive
+    nx: Count
+    ny: Count
+    pattern: Literal["diagonal", "alternating", "criss-cross"] = "diagonal"
+
+
+def _file(*endings: str) -> dict[str, Any]:
+    """Schema of a file name with one of these endings, in any case."""
+    any_case = ("".join(f"[{letter}{letter.upper()}]" for letter in ending) for ending in endings)
+    return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
+
+
+class MeshSource(Block):
+    """Where one sheet comes from: a file or a grid.
+
+    Attributes
+    ----------
+    file : Path or None
+        A .geo, .msh or .obj; a relative path stands beside the scene file.
+    grid : Grid or None
+        A rectangle instead of a file.
+    size : float [m] or None
+        Element size for a .geo.
+    transform : Transform
+        Where the sheet starts; without ``vt`` its scaling counts for the rest shape, too.
+    name : str or None
+        Name of the sheet; a surface group of that name holds its triangles.
+    """
+
+    rules = (
+        exactly_one("file", "grid"),
+        Rule(
+            when(given("size"), given(file=_file("geo"))),
+            "is for .geo files only (others come with their elements)",
+            "size",
+        ),
+    )
+
+    file: Annotated[Path, JsonSchema(_file("geo", "msh", "obj"))] | None = None
+    grid: Grid | None = None
+    size: Positive | None = None
+    transform: Transform = Field(default_factory=Transform)
+    name: Name | None = None
+
+    @field_validator("file", mode="before")
+    @classmethod
+    def _beside_scene(cls, value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
+            raise problem(f"must be the path of a mesh file, not {shown(value)}")
+        path = Path(value)
+        if path.suffix.lower() not in MESH_SUFFIXES:
+            raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
+        directory = (info.context or {}).get("directory", Path.cwd())
+        # normalised by name only: a symbolic link may be what the user wants to see
+        return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
+
+
+class MembraneStiffness(Block):
+    """Orthotropic St. Venant-Kirchhoff stiffness [N/m]; axis 1 is the warp.
+
+    Attributes
+    ----------
+    c11, c22 : float [N/m]
+        Along warp and weft.
+    c12 : float [N/m]
+        Coupling of the two; c12² < c11 c22.
+    c33 : float [N/m]
+        Shear modulus of engineering shear.
+    """
+
+    c11: Positive
+    c22: Positive
+    c12: Number
+    c33: Positive
+
+    @model_validator(mode="after")
+    def _positive_definite(self) -> Self:
+        if abs(self.c12) >= (self.c11**0.5) * (self.c22**0.5):
+            raise problem(
+                f"is not positive definite: |c12| = {abs(self.c12):g} must be below"
+                f" sqrt(c11 c22) = {(self.c11**0.5) * (self.c22**0.5):g} N/m",
+                "c12",
+            )
+        return self
+
+
+# the ways to give a material's numbers: the keys of each, and those it needs
+_MATERIAL_WAYS = (
+    (("cloth",), ()),
+    (("membrane", "bending"), ("membrane", "density")),
+    (("young", "poisson", "thickness"), ("young", "poisson", "thickness", "density")),
+)
+
+
+def _several_ways(material: Material) -> str:
+    used = [keys[0] for keys in (material.given(*way) for way, _ in _MATERIAL_WAYS) if keys]
+    found = f"; {' and '.join(used)} are given" if used else ""
+    return (
+        "must be given in exactly one way: cloth, or density + membrane + bending,"
+        f" or young + poisson + thickness + density{found}"
+    )
+
+
+def _needed(way: tuple[str, ...], key: str) -> Rule:
+    """A key that has to be given beside any of the others."""
+    return Rule(when(some(*way), given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
+
+
+class Material(Block):
+    """One material, named from a library or given by its numbers.
+
+    Exactly one of three ways: ``cloth``; ``density`` + ``membrane`` (+ ``bending``);
+    ``young`` + ``poisson`` + ``thickness`` + ``density``.
+
+    Attributes
+    ----------
+    group : str or None
+        Surface group it is for; without: all triangles that no other block names.
+    cloth : str or None
+        Name of a measured cloth or an engineering material of the library, instead of numbers.
+    density : float [kg/m²] or None
+        Areal density.
+    membrane : MembraneStiffness or None
+        Stretching stiffness.
+    bending : float or (3,) [N·m] or None
+        Cylindrical stiffness B; three values hold for hinge edges at 0°, 45°, 90° to the warp.
+    young : float [Pa] or None
+        Young's modulus of an isotropic shell.
+    poisson : float or None
+        Poisson's ratio of an isotropic shell.
+    thickness : float [m] or None
+        Thickness of an isotropic shell.
+    damping : float [s]
+        γ of stiffness-proportional damping.
+    warp_degrees : float [°]
+        Rotation of the warp in the material plane, anticlockwise.
+    density_scale, stretching_scale, bending_scale : float
+        Factors on density, membrane and bending.
+    thicken : float
+        t: density × t, membrane × t, bending × t³.
+    rest_curvature : (3,) [1/m] or None
+        Curvature κ11, κ22, κ12 at rest, in the material axes.
+    """
+
+    rules = (
+        Rule({"oneOf": [some(*way) for way, _ in _MATERIAL_WAYS]}, _several_ways),
+        Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
+        *(_needed(way, key) for way, needed in _MATERIAL_WAYS for key in needed),
+    )
+
+    group: Name | None = None
+    cloth: Annotated[Name, JsonSchema({"enum": names()})] | None = None
+    density: Positive | None = None
+    membrane: MembraneStiffness | None = None
+    bending: Bending | None = None
+    young: Positive | None = None
+    poisson: Poisson | None = None
+    thickness: Positive | None = None
+    damping: NonNegative = 0.0
+    warp_degrees: Number = 0.0
+    density_scale: Positive = 1.0
+    stretching_scale: Positive = 1.0
+    bending_scale: NonNegative = 1.0
+    thicken: Positive = 1.0
+    rest_curvature: Vector | None = None
+
+    @classmethod
+    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Numbers without ``bending`` mean a membrane: the zero is written out."""
+        return {**data, "bending": 0.0} if "membrane" in data and "bending" not in data else data
+
+    @field_validator("cloth")
+    @classmethod
+    def _in_a_library(cls, cloth: str | None) -> str | None:
+        if cloth is not None and cloth not in names():
+            raise problem(f"unknown cloth {cloth!r}, {nearest(cloth, names())}")
+        return cloth
+
+
+Direction = Literal["x", "y", "z"]
+AXES: tuple[Direction, ...] = ("x", "y", "z")
+_AXES = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
+
+
+class UniformWind(Block):
+    """Uniform wind.
+
+    Attributes
+    ----------
+    velocity : (3,) [m/s]
+        Of the air; zeros are still air.
+    density : float [kg/m³]
+        Of the air.
+    drag : float [kg/(m² s)]
+        Tangential drag coefficient.
+    """
+
+    velocity: Vector
+    density: NonNegative
+    drag: NonNegative = 0.0
+
+
+def _vertex_list(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not value:
+        raise problem(f"must be a list of vertex numbers, not {shown(value)}")
+    return list(value)
+
+
+_VERTICES = {"type": "array", "items": INDEX.schema, "minItems": 1, "uniqueItems": True}
+_BOX = {"type": "array", "items": VECTOR, "minItems": 2, "maxItems": 2}
+
+
+class VertexChoice(Block):
+    """The three ways to name vertices.
+
+    Attributes
+    ----------
+    group : str or None
+        A group of the mesh, or a sheet's name.
+    nodes : list of int or None
+        Vertex numbers, from 0, in file order.
+    box : two (3,) [m] or None
+        Lower and upper corner; start positions, faces included.
+    """
+
+    group: Name | None = None
+    nodes: Annotated[list[Index], BeforeValidator(_vertex_list), JsonSchema(_VERTICES)] | None = None
+    box: Annotated[tuple[Vec3, Vec3], JsonSchema(_BOX)] | None = None
+
+    @field_validator("nodes")
+    @classmethod
+    def _each_once(cls, nodes: list[int] | None) -> list[int] | None:
+        if nodes is not None and len(set(nodes)) != len(nodes):
+            twice = Counter(nodes).most_common(1)[0][0]
+            raise problem(f"lists vertex {twice} twice")
+        return nodes
+
+    @field_validator("box", mode="before")
+    @classmethod
+    def _corners(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)) or len(value) != 2:
+            raise problem(f"must be two corners [[x, y, z], [x, y, z]], not {shown(value)}")
+        low, high = vector(value[0]), vector(value[1])
+        if any(a > b for a, b in zip(low, high, strict=True)):
+            raise problem("must have its lower corner first")
+        return low, high
+
+
+class Selector(VertexChoice):
+    """Vertices by exactly one of group, nodes, box."""
+
+    rules = (exactly_one("group", "nodes", "box"),)
+
+
+class Handle(Selector):
+    """Vertices whose motion is prescribed, or pulled by springs.
+
+    Attributes
+    ----------
+    axes : tuple of "x", "y", "z"
+        Directions that are held.
+    clamp : bool
+        Keep the slope of held boundary edges.
+    motion : str or None
+        Name in ``motions``; without: held in place.
+    interpolation : str
+        Of the motion in time, between keyframes.
+    start, until : float [s]
+        Held for from ≤ t ≤ until (without: to the end).
+    fade : float [s]
+        After ``until`` the hold fades as (1 − (t − until)/fade)⁴.
+    stiffness : float [N/m] or None
+        Per vertex and axis: a spring instead of a constraint.
+    """
+
+    axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
+    clamp: Flag = False
+    motion: Name | None = None
+    interpolation: Literal["hermite", "linear"] = "hermite"
+    start: Number = Field(default=0.0, alias="from")
+    until: Until = math.inf
+    fade: NonNegative = 0.0
+    stiffness: Positive | None = None
+
+    @property
+    def axis_numbers(self) -> tuple[int, ...]:
+        """``axes`` as 0, 1, 2, ascending."""
+        return tuple(AXES.index(axis) for axis in self.axes)
+
+    @field_validator("axes", mode="before")
+    @classmethod
+    def _axes(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)) or not value or any(axis not in AXES for axis in value):
+            raise problem(f"must be a list of x, y, z, not {shown(value)}")
+        return tuple(axis for axis in AXES if axis in value)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        _check_times(self.start, self.until)
+        return self
+
+
+def _check_times(start: float, until: float) -> None:
+    if not start < until:
+        raise problem(f"must be later than from = {start:g}, not {until:g}", "until")
+
+
+class Keyframe(Block):
+    """Where a motion has carried the held vertices at one time: scaled, rotated, translated.
+
+    Attributes
+    ----------
+    time : float [s]
+        Later than the keyframe before.
+    scale : float or (3,)
+        Factor about the origin, or one for each axis; not 0.
+    rotate : Rotation or None
+        Rotation after the scaling.
+    translate : (3,) [m]
+        Displacement after the rotation.
+    velocity : (3,) [m/s] or None
+        Of the translation; without: by central differences, zero at both ends.
+    """
+
+    time: Number
+    scale: Scale = 1.0
+    rotate: Rotation | None = None
+    translate: Vector = (0.0, 0.0, 0.0)
+    velocity: Vector | None = None
+
+
+class AppliedLoad(VertexChoice):
+    """A force, a pressure or a traction.
+
+    Attributes
+    ----------
+    group : str or None
+        A group of the mesh, or a sheet's name; for pressure and traction a surface group, or nothing (every
+        triangle).
+    force : (3,) [N] or None
+        Total, shared by the selected vertices.
+    pressure : float [Pa] or None
+        Along the current normal.
+    traction : (3,) [N/m²] or None
+        Per rest area, direction fixed in space.
+    start, until : float [s]
+        Acts for from ≤ t ≤ until (without: to the end).
+    """
+
+    rules = (
+        exactly_one("force", "pressure", "traction"),
+        Rule(
+            when(given("force"), one_of("group", "nodes", "box")),
+            "needs exactly one of group, nodes, box to act on",
+            "force",
+        ),
+        *(
+            Rule(when(given(kind), absent(key)), f"cannot select triangles for {kind}; use group", key)
+            for kind in ("pressure", "traction")
+            for key in ("box", "nodes")
+        ),
+    )
+
+    force: Vector | None = None
+    pressure: Number | None = None
+    traction: Vector | None = None
+    start: Number = Field(default=0.0, alias="from")
+    until: Until = math.inf
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        _check_times(self.start, self.until)
+        return self
+
+
+class Initial(Block):
+    """State at t = 0, beside the start positions.
+
+    Attributes
+    ----------
+    velocity : (3,) [m/s]
+        Of all vertices.
+    angular_velocity : (3,) [rad/s]
+        About the centre of mass.
+    noise : float [m]
+        Standard deviation of a normally distributed displacement of every vertex that no
+        handle holds, along the vertex normal of the start shape.
+    seed : int
+        Of the noise.
+    """
+
+    velocity: Vector = (0.0, 0.0, 0.0)
+    angular_velocity: Vector = (0.0, 0.0, 0.0)
+    noise: NonNegative = 0.0
+    seed: Seed = 0
+
+
+Analysis = Literal["dynamic", "static"]
+Integrator = Literal["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"]
+INTEGRATORS: tuple[str, ...] = get_args(Integrator)
+TOLERANCE = 1e-3
+SPECTRAL_RADIUS = 0.5
+LOAD_STEP = 0.25
+FIELD_UNITS = {
+    "velocity": "m/s",
+    "green_strain": "1",
+    "stress": "N/m",
+    "membrane_energy": "J/m²",
+    "bending_energy": "J/m²",
+    "curvature": "1/m",
+    "rank": "1",
+}
+FIELDS = tuple(FIELD_UNITS)
+
+
+_FIELDS = {"type": "array", "items": {"enum": list(FIELDS)}}
+
+
+_STATIC = given(analysis={"const": "static"})
+_MEANINGLESS = "has no meaning in a static analysis; leave it out"
+
+
+def _one_word_of(words: Any) -> BeforeValidator:
+    known = get_args(words)
+
+    def check(value: Any) -> Any:
+        if value is not None and value not in known:
+            raise problem(f"must be one of {', '.join(known)}, not {shown(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+class Time(Block):
+    """Time stepping, or the way to an equilibrium.
+
+    Attributes
+    ----------
+    analysis : str
+        ``dynamic``: a motion in time; ``static``: the equilibrium under the loads, which grow with a
+        load factor from 0 to 1 that takes the place of time.
+    end : float [s]
+        Time at which the run ends; 1 in a static analysis.
+    step : float [s] or "auto"
+        Nominal and largest Δt; ``auto``: as the tolerance asks. In a static analysis the first
+        increment of the load factor.
+    tolerance : float or None
+        With ``step: auto``: error in the positions that the steps may add up to by the end, as a fraction
+        of the diagonal of the rest shape's bounding box.
+    integrator : str or None
+        ``beuler`` (first order, full Newton), ``semi-implicit`` (one linear solve a step), ``midpoint``,
+        ``alpha2`` (generalised-α), ``bdf2`` (second order); none in a static analysis. By default ``beuler``.
+    spectral_radius : float or None
+        Spectral radius of ``alpha2`` at high frequencies: 0 damps them in a step, 1 keeps them.
+    """
+
+    rules = (
+        *(
+            Rule(when(_STATIC, absent(key)), _MEANINGLESS, key)
+            for key in ("integrator", "tolerance", "spectral_radius")
+        ),
+        Rule(
+            when(_STATIC, {"properties": {"end": {"enum": [1, None]}}}),
+            "is 1 in a static analysis (the full load); leave it out",
+            "end",
+        ),
+        Rule(
+            when(_STATIC, {"properties": {"step": {"type": ["number", "null"], "maximum": 1}}}),
+            "is the first increment of the load factor, at most 1, not {step!r}",
+            "step",
+        ),
+        Rule({"anyOf": [_STATIC, given("end", "step")]}, "needs end and step"),
+        Rule(
+            when(given("tolerance"), given(step={"const": "auto"})),
+            "is for step: auto; with a fixed step leave it out",
+            "tolerance",
+        ),
+        Rule(
+            {"properties": {"tolerance": {"exclusiveMaximum": 1}}},
+            "is a fraction of the sheet's size, below 1, not {tolerance:g}",
+            "tolerance",
+        ),
+        Rule(
+            when(given("spectral_radius"), given(integrator={"const": "alpha2"})),
+            "is for integrator: alpha2; {integrator} has none, leave it out",
+            "spectral_radius",
+        ),
+    )
+    sometimes_filled = frozenset({"end", "step"})
+
+    analysis: Annotated[Analysis, _one_word_of(Analysis)] = "dynamic"
+    end: Positive
+    step: StepLength
+    tolerance: Positive | None = None
+    integrator: Annotated[Integrator | None, _one_word_of(Integrator)] = None
+    spectral_radius: Fraction | None = None
+
+    @property
+    def scheme(self) -> str:
+        """Name of the time scheme: the integrator, or ``static``."""
+        return self.integrator or "static"
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether the step length follows a tolerance."""
+        return self.step == "auto"
+
+    @classmethod
+    def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """Defaults that depend on the analysis and on the integrator."""
+        if data.get("analysis") == "static":
+            return {"end": 1.0, "step": LOAD_STEP, **data}
+        data = {"integrator": "beuler", **data}
+        if data.get("step") == "auto":
+            data.setdefault("tolerance", TOLERANCE)
+        if data["integrator"] == "alpha2":
+            data.setdefault("spectral_radius", SPECTRAL_RADIUS)
+        return data
+
+
+class CheckpointInterval(Block):
+    """How often a checkpoint is written at least.
+
+    Attributes
+    ----------
+    seconds : float [s]
+        Wall time.
+    steps : int or None
+        Accepted steps; without: only by wall time.
+    """
+
+    seconds: Positive = 60.0
+    steps: Count | None = None
+
+
+class Output(Block):
+    """What is written.
+
+    Attributes
+    ----------
+    every : float [s] or None
+        Simulated time between states; empty: every step.
+    fields : list of str
+        What a state holds beside the positions.
+    checkpoint : CheckpointInterval
+        How often a checkpoint is written at least.
+    reactions : bool
+        Write the forces at the handles to reactions.csv.
+    vtkhdf : bool
+        Announce the states also in states.vtkhdf, which newer ParaView reads faster than the XDMF.
+    """
+
+    null_is_a_value: ClassVar[frozenset[str]] = frozenset({"every"})
+
+    every: Positive | None = 0.04
+    fields: Annotated[list[str], JsonSchema(_FIELDS)] = Field(default_factory=list)
+    checkpoint: CheckpointInterval = Field(default_factory=CheckpointInterval)
+    reactions: Flag = False
+    vtkhdf: Flag = False
+
+    @field_validator("fields", mode="before")
+    @classmethod
+    def _known_fields(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)):
+            raise problem(f"must be a list, not {shown(value)}; known: {', '.join(FIELDS)}")
+        for name in value:
+            if name not in FIELDS:
+                word = name if isinstance(name, str) else shown(name)
+                raise problem(f"unknown field {word!r}, {nearest(word, FIELDS)}")
+        return list(dict.fromkeys(value))
+
+
+class Solver(Block):
+    """When a step counts as converged, and how Newton treats its Hessian.
+
+    Attributes
+    ----------
+    force_tolerance : float
+        Force residual over the forces at work.
+    step_tolerance : float
+        How far a coordinate is expected to move yet, over element size.
+    max_iterations : int
+        Newton iterations a step may take.
+    hessian : str
+        ``exact``, ``regularised`` (always positive definite), or ``adaptive``: as exact as it can be.
+    """
+
+    force_tolerance: Positive = 1e-6
+    step_tolerance: Positive = 1e-6
+    max_iterations: Count = 50
+    hessian: Literal["adaptive", "regularised", "exact"] = "adaptive"
+
+
+PARALLEL = 1e-6
+"""Sine of the angle between two directions below which they count as one."""
+
+
+class Camera(Block):
+    """Where the pictures are taken from; what is left out is found from the whole motion.
+
+    Attributes
+    ----------
+    direction : (3,) or None
+        From the sheet towards the camera; its distance is fitted to the whole motion.
+    position : (3,) [m] or None
+        Where it stands, instead of a direction; needs a target.
+    target : (3,) [m] or None
+        What it looks at.
+    up : (3,) or None
+        Upwards in the picture; without: against gravity, or z.
+    angle : float [degrees]
+        Height of the field of view, from 1 to 120.
+    zoom : float
+        With a fitted distance: how much larger than it fits.
+    """
+
+    rules = (
+        *(
+            Rule(
+                when(given(here), given(other)),
+                f"needs {other} beside it; to have the distance fitted give direction",
+                here,
+            )
+            for here, other in (("position", "target"), ("target", "position"))
+        ),
+        *(
+            Rule(
+                when(given("position"), absent(key)),
+                "has no meaning beside position and target; leave it out",
+                key,
+            )
+            for key in ("direction", "zoom")
+        ),
+    )
+
+    direction: Axis | None = None
+    position: Vector | None = None
+    target: Vector | None = None
+    up: Axis | None = None
+    angle: Angle = 25.0
+    zoom: Positive | None = None
+
+    @model_validator(mode="after")
+    def _has_directions(self) -> Self:
+        if self.position is not None and self.position == self.target:
+            raise problem("is where the camera stands; it must look at another point", "target")
+        view = self.line_of_sight
+        if view is not None and self.up is not None and parallel(view, self.up):
+            raise problem("must not point along the line of sight", "up")
+        return self
+
+    @property
+    def line_of_sight(self) -> Vec3 | None:
+        """Direction from what is seen to the camera, of any length, if the scene gives it."""
+        if self.position is None or self.target is None:
+            return self.direction
+        x, y, z = (a - b for a, b in zip(self.position, self.target, strict=True))
+        return x, y, z
+
+
+def parallel(a: Vec3, b: Vec3) -> bool:
+    """Whether two directions are the same or opposite."""
+    first, second = (np.asarray(v) / np.abs(v).max() for v in (a, b))
+    sine = np.linalg.norm(np.cross(first, second)) / (np.linalg.norm(first) * np.linalg.norm(second))
+    return bool(sine < PARALLEL)
+
+
+class Render(Block):
+    """How ``render`` shows the scene.
+
+    Attributes
+    ----------
+    camera : Camera or None
+        Where the pictures are taken from; without: where most of the sheet is seen.
+    """
+
+    camera: Camera | None = None
 
 
 SMALLEST_STEP = 2.0**-52
@@ -56,9 +789,6 @@ def _too_small(step: float, end: float) -> str:
         f"is too small, {step:g}: times near {end:g} s are not told apart below {end * SMALLEST_STEP:.2g} s; "
         "take a longer one or an earlier time.end"
     )
-
-
-_AT_REST = {"anyOf": [{"type": "null"}, {"items": {"const": 0}}]}
 
 
 def _one_or_many(value: Any) -> Any:
@@ -96,13 +826,13 @@ class Scene(Block):
         One block, or a list; at most one without a group: it serves the triangles that no other block names.
     gravity : (3,) [m/s²] or None
         Acceleration of gravity; without this key there is none.
-    wind : Wind or None
+    wind : UniformWind or None
         Uniform wind; without this key there is no air.
     handles : list of Handle
         Vertices that are held or moved.
     motions : dict of list of Keyframe
         Motions of handles, by name; times strictly ascending.
-    loads : list of Load
+    loads : list of AppliedLoad
         Forces, pressures and tractions.
     initial : Initial or None
         State at t = 0, where it is not rest.
@@ -121,27 +851,28 @@ class Scene(Block):
     """
 
     # a static analysis starts at rest
-    rules = (
-        when(
-            given(time=given(analysis={"const": "static"}), initial={"type": "object"}),
-            {
-                "properties": {
-                    "initial": {"properties": dict.fromkeys(("velocity", "angular_velocity"), _AT_REST)}
-                }
-            },
-        ),
+    rules = tuple(
+        Rule(
+            when(
+                given(time=_STATIC, initial={"type": "object"}),
+                {"properties": {"initial": {"properties": {key: {"items": {"const": 0}}}}}},
+            ),
+            _MEANINGLESS,
+            f"initial.{key}",
+        )
+        for key in ("velocity", "angular_velocity")
     )
 
     title: Text = ""
     mesh: Annotated[list[MeshSource], BeforeValidator(_one_or_many)]
     material: Annotated[list[Material], BeforeValidator(_one_or_many)]
     gravity: Vector | None = None
-    wind: Wind | None = None
+    wind: UniformWind | None = None
     handles: Annotated[list[Handle], BeforeValidator(_many)] = Field(default_factory=list)
     motions: Annotated[
         dict[Name, Annotated[list[Keyframe], BeforeValidator(_many)]], BeforeValidator(_named)
     ] = Field(default_factory=dict)
-    loads: Annotated[list[Load], BeforeValidator(_many)] = Field(default_factory=list)
+    loads: Annotated[list[AppliedLoad], BeforeValidator(_many)] = Field(default_factory=list)
     initial: Initial | None = None
     time: Time
     output: Output = Field(default_factory=Output)
@@ -213,10 +944,6 @@ class Scene(Block):
                     i,
                     "motion",
                 )
-        if self.time.analysis == "static" and self.initial is not None:
-            for name in ("velocity", "angular_velocity"):
-                if any(getattr(self.initial, name)):
-                    raise problem("has no meaning in a static analysis; leave it out", "initial", name)
         groups: set[str | None] = set()
         for i, material in enumerate(self.material):
             if material.group in groups:

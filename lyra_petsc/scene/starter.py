@@ -1,4 +1,4 @@
-"""The text of a starter scene, with a grid or around a mesh of the user's."""
+"""The text of a starter scene, with a grid or with a mesh file of the user's."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from lyra_petsc.materials.tables import names
-from lyra_petsc.scene.control import FIELDS
-from lyra_petsc.scene.json_schema import SCHEMA_FILE
+from lyra_petsc.scene.json_schema import schema_file
+from lyra_petsc.scene.materials.library import names
+from lyra_petsc.scene.schema import FIELDS
 
 CLOTHS = 4
 """Names of the library that are shown."""
@@ -32,11 +32,12 @@ _GRID_HANDLE = """\
     # motion: swing"""
 
 _PLAIN_NAME = re.compile(r"[A-Za-z_][\w-]*")
+_RESERVED = re.compile("null|true|false|yes|no|on|off", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class OwnMesh:
-    """What the starter tells of a mesh.
+    """What the starter scene says of a mesh file.
 
     Attributes
     ----------
@@ -67,9 +68,10 @@ def starter(scene: Path, commands: tuple[str, str], mesh: OwnMesh | None = None)
     mesh : OwnMesh, optional
         Without it, a grid.
     """
+    schema = schema_file()
     text = files("lyra_petsc.scene").joinpath("starter.yaml").read_text(encoding="utf-8")
     return Template(text).substitute(
-        schema=SCHEMA_FILE.as_uri() if " " in str(SCHEMA_FILE) else SCHEMA_FILE,
+        schema=schema.as_uri() if " " in str(schema) and schema.is_absolute() else schema,
         one=commands[0],
         two=commands[1],
         file=shlex.quote(scene.name),
@@ -127,13 +129,5 @@ def _digits(value: float) -> str:
 
 def _quoted(text: str) -> str:
     """Text as YAML takes it for text."""
-    plain = _PLAIN_NAME.fullmatch(text) and text.lower() not in (
-        "null",
-        "true",
-        "false",
-        "yes",
-        "no",
-        "on",
-        "off",
-    )
+    plain = _PLAIN_NAME.fullmatch(text) and not _RESERVED.fullmatch(text)
     return text if plain else json.dumps(text, ensure_ascii=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -123,30 +124,14 @@ def parse_json(text: str, *, file: object | None) -> Any:
         raise InputError(one_line(f"is not JSON: {error}"), file=file) from None
 
 
+_JSON_PARTS = re.compile(
+    r"""(?P<text>"[^"\\]*(?:\\.[^"\\]*)*"?)
+    | (?P<comment>//[^\n]*|/\*.*?(?:\*/|\Z))
+    | ,(?=(?:\s|//[^\n]*(?:\n|\Z)|/\*(?:(?!\*/).)*\*/)*[]}])""",
+    re.VERBOSE | re.DOTALL,
+)
+
+
 def _plain_json(text: str) -> str:
     """``text`` with comments and trailing commas blanked, so that line and column stay true."""
-    plain: list[str] = []
-    comma: int | None = None  # place in `plain` of a comma after which nothing has come yet
-    at = 0
-    while at < len(text):
-        here = text[at]
-        if here == '"':
-            end = at + 1
-            while end < len(text) and text[end] != '"':
-                end += 2 if text[end] == "\\" else 1
-            plain.append(text[at : end + 1])
-            at, comma = end + 1, None
-        elif text.startswith(("//", "/*"), at):
-            line = text.startswith("//", at)
-            end = text.find("\n" if line else "*/", at + (0 if line else 2))
-            end = len(text) if end < 0 else end if line else end + 2
-            plain.append("".join(c if c == "\n" else " " for c in text[at:end]))
-            at = end
-        else:
-            if here in "]}" and comma is not None:
-                plain[comma] = " "
-            if not here.isspace():
-                comma = len(plain) if here == "," else None
-            plain.append(here)
-            at += 1
-    return "".join(plain)
+    return _JSON_PARTS.sub(lambda part: part["text"] or re.sub(r"[^\n]", " ", part[0]), text)

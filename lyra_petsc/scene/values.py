@@ -15,8 +15,10 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import GetJsonSchemaHandler, PlainValidator
-from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from lyra_petsc.scene.rules import Condition, holds
 
 Vec3 = tuple[float, float, float]
 
@@ -32,7 +34,7 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
 def problem(message: str, *at: str | int) -> PydanticCustomError:
     """Error of a scene value; ``at`` is the key below the block that is being checked."""
     # braces in user text would be taken for a template
-    return PydanticCustomError("scene", "{message}", {"message": message, "at": list(at), "problem": True})
+    return PydanticCustomError("scene", "{message}", {"message": message, "at": list(at)})
 
 
 def shown(value: object) -> str:
@@ -77,16 +79,6 @@ def _reads_as_number(text: str) -> bool:
     return True
 
 
-def _bounded(check: Callable[[float], bool], allowed: str) -> Callable[[Any], float]:
-    def validate(value: Any) -> float:
-        result = number(value)
-        if not check(result):
-            raise problem(f"must be {allowed}, not {shown(value)}")
-        return result
-
-    return validate
-
-
 def _until(value: Any) -> float:
     # "never" may be said outright
     return math.inf if value == math.inf and isinstance(value, float) else number(value)
@@ -107,37 +99,11 @@ def _axis(value: Any) -> Vec3:
     return axis
 
 
-def _scale(value: Any) -> float | Vec3:
-    scale = vector(value) if isinstance(value, (list, tuple)) else number(value)
-    if 0.0 in (scale if isinstance(scale, tuple) else (scale,)):
-        raise problem("must not be 0")
-    return scale
-
-
-def _positive_scale(value: Any) -> float | Vec3:
-    scale = _scale(value)
-    if min(scale if isinstance(scale, tuple) else (scale,)) < 0:
-        raise problem(f"must be > 0, not {shown(value)}")
-    return scale
-
-
 def integer(value: Any) -> int:
     """``value`` as a whole number; bool, text and 1.0 are refused."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise problem(f"must be a whole number, not {shown(value)}")
     return value
-
-
-def _integer(lowest: int, highest: int) -> Callable[[Any], int]:
-    def validate(value: Any) -> int:
-        value = integer(value)
-        if value < lowest:
-            raise problem(f"must be a whole number >= {lowest}, not {shown(value)}")
-        if value > highest:
-            raise problem(f"must be a whole number <= {highest}, not {shown(value)}")
-        return int(value)
-
-    return validate
 
 
 def _text(value: Any) -> str:
@@ -164,87 +130,109 @@ def _flag(value: Any) -> bool:
     return value
 
 
-def _bending(value: Any) -> float | Vec3:
-    """One stiffness, or one for hinge edges at 0°, 45° and 90° to the warp."""
-    given = vector(value) if isinstance(value, (list, tuple)) else number(value)
-    if min(given if isinstance(given, tuple) else (given,)) < 0:
-        raise problem(f"must be >= 0 [N·m], not {shown(value)}")
-    return given
-
-
 def _step_length(value: Any) -> float | str:
     if value == "auto":
         return "auto"
     if isinstance(value, str) and not _reads_as_number(value):
         raise problem(f"must be a number or auto, not {shown(value)}")
-    step = number(value)
-    if step <= 0:
-        raise problem(f"must be > 0, not {shown(value)}")
+    step: float = _POSITIVE.check(value)
     return step
-
-
-Schema = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class JsonSchema:
     """What JSON Schema says of a value; pydantic gets a copy, as some versions write into what they get."""
 
-    schema: Schema
+    schema: Condition
 
-    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
+    def __get_pydantic_json_schema__(self, core: CoreSchema, handler: GetJsonSchemaHandler) -> Condition:
         return deepcopy(self.schema)
 
 
-# what JSON Schema can say of the values; .inf is a number to YAML
-FINITE: Schema = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
-NAME: Schema = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
+@dataclass(frozen=True, eq=False)
+class Value(JsonSchema):
+    """How a value is checked, beside what JSON Schema says of it."""
+
+    check: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
 
 
-def _triple(of: Schema) -> Schema:
+def _real(allowed: str, **bounds: float) -> Value:
+    """A number within bounds, named by their words in JSON Schema; ``allowed`` says them to the user."""
+    schema = FINITE | bounds
+    if "exclusiveMinimum" in bounds:
+        del schema["minimum"]
+
+    def check(value: Any) -> float:
+        result = number(value)
+        if not holds(schema, result):
+            raise problem(f"must be {allowed}, not {shown(value)}")
+        return result
+
+    return Value(schema, check)
+
+
+def _one_or_three(*allowed: tuple[Condition, str]) -> Value:
+    """A number or three, each obeying conditions that come with the message for where they do not hold."""
+    schema = FINITE | allowed[-1][0]
+
+    def check(value: Any) -> float | Vec3:
+        result = vector(value) if isinstance(value, (list, tuple)) else number(value)
+        for condition, message in allowed:
+            if not all(
+                holds(condition, entry) for entry in (result if isinstance(result, tuple) else [result])
+            ):
+                raise problem(message.replace("VALUE", shown(value)))
+        return result
+
+    return Value({"anyOf": [schema, _triple(schema)]}, check)
+
+
+def _whole(lowest: int, highest: int) -> Value:
+    def check(value: Any) -> int:
+        value = integer(value)
+        if value < lowest:
+            raise problem(f"must be a whole number >= {lowest}, not {shown(value)}")
+        if value > highest:
+            raise problem(f"must be a whole number <= {highest}, not {shown(value)}")
+        return int(value)
+
+    return Value({"type": "integer", "minimum": lowest, "maximum": highest}, check)
+
+
+def _triple(of: Condition) -> Condition:
     return {"type": "array", "items": of, "minItems": 3, "maxItems": 3}
 
 
-def whole(lowest: int, highest: int) -> Schema:
-    return {"type": "integer", "minimum": lowest, "maximum": highest}
-
-
-POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0, "maximum": sys.float_info.max}
-NON_NEGATIVE = FINITE | {"minimum": 0}
-NONZERO = FINITE | {"not": {"const": 0}}
+# what JSON Schema can say of the values; .inf is a number to YAML
+FINITE: Condition = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
 VECTOR = _triple(FINITE)
+_ANY_NAME: Condition = {"anyOf": [{"type": "string", "pattern": r"^[^\0]*\S[^\0]*$"}, {"type": "integer"}]}
+_NONZERO = {"not": {"const": 0}}, "must not be 0"
+_ABOVE_ZERO = {"exclusiveMinimum": 0}, "must be > 0, not VALUE"
+_POSITIVE = _real("> 0", exclusiveMinimum=0)
 
-Number = Annotated[float, PlainValidator(number), JsonSchema(FINITE)]
-Positive = Annotated[float, PlainValidator(_bounded(lambda x: x > 0, "> 0")), JsonSchema(POSITIVE)]
-NonNegative = Annotated[float, PlainValidator(_bounded(lambda x: x >= 0, ">= 0")), JsonSchema(NON_NEGATIVE)]
-Fraction = Annotated[
-    float,
-    PlainValidator(_bounded(lambda x: 0 <= x <= 1, "from 0 to 1")),
-    JsonSchema({"type": "number", "minimum": 0, "maximum": 1}),
-]
+Number = Annotated[float, Value(FINITE, number)]
+Positive = Annotated[float, _POSITIVE]
+NonNegative = Annotated[float, _real(">= 0", minimum=0)]
+Fraction = Annotated[float, _real("from 0 to 1", minimum=0, maximum=1)]
+Poisson = Annotated[float, _real("in (-1, 0.5]", exclusiveMinimum=-1, maximum=0.5)]
+Angle = Annotated[float, _real("from 1 to 120 degrees", minimum=1, maximum=120)]
 StepLength = Annotated[
-    float | Literal["auto"],
-    PlainValidator(_step_length),
-    JsonSchema({"anyOf": [POSITIVE, {"const": "auto"}]}),
+    float | Literal["auto"], Value({"anyOf": [_POSITIVE.schema, {"const": "auto"}]}, _step_length)
 ]
-Poisson = Annotated[
-    float,
-    PlainValidator(_bounded(lambda x: -1 < x <= 0.5, "in (-1, 0.5]")),
-    JsonSchema({"type": "number", "exclusiveMinimum": -1, "maximum": 0.5}),
-]
-Until = Annotated[float, PlainValidator(_until), JsonSchema({"type": "number"})]
-Vector = Annotated[Vec3, PlainValidator(vector), JsonSchema(VECTOR)]
-Axis = Annotated[Vec3, PlainValidator(_axis), JsonSchema(VECTOR | {"contains": {"not": {"const": 0}}})]
-Scale = Annotated[float | Vec3, PlainValidator(_scale), JsonSchema({"anyOf": [NONZERO, _triple(NONZERO)]})]
-PositiveScale = Annotated[
-    float | Vec3, PlainValidator(_positive_scale), JsonSchema({"anyOf": [POSITIVE, _triple(POSITIVE)]})
-]
-Bending = Annotated[
-    float | Vec3, PlainValidator(_bending), JsonSchema({"anyOf": [NON_NEGATIVE, _triple(NON_NEGATIVE)]})
-]
-Count = Annotated[int, PlainValidator(_integer(1, LARGEST_INDEX)), JsonSchema(whole(1, LARGEST_INDEX))]
-Index = Annotated[int, PlainValidator(_integer(0, LARGEST_INDEX)), JsonSchema(whole(0, LARGEST_INDEX))]
-Seed = Annotated[int, PlainValidator(_integer(0, 2**63 - 1)), JsonSchema(whole(0, 2**63 - 1))]
-Text = Annotated[str, PlainValidator(_text), JsonSchema({"type": "string", "pattern": r"^[^\0]*$"})]
-Name = Annotated[str, PlainValidator(_name), JsonSchema(NAME)]
-Flag = Annotated[bool, PlainValidator(_flag), JsonSchema({"type": "boolean"})]
+Until = Annotated[float, Value({"type": "number"}, _until)]
+Vector = Annotated[Vec3, Value(VECTOR, vector)]
+Axis = Annotated[Vec3, Value(VECTOR | {"contains": {"not": {"const": 0}}}, _axis)]
+Scale = Annotated[float | Vec3, _one_or_three(_NONZERO)]
+PositiveScale = Annotated[float | Vec3, _one_or_three(_NONZERO, _ABOVE_ZERO)]
+Bending = Annotated[float | Vec3, _one_or_three(({"minimum": 0}, "must be >= 0 [N·m], not VALUE"))]
+Count = Annotated[int, _whole(1, LARGEST_INDEX)]
+INDEX = _whole(0, LARGEST_INDEX)
+Index = Annotated[int, INDEX]
+Seed = Annotated[int, _whole(0, 2**63 - 1)]
+Text = Annotated[str, Value({"type": "string", "pattern": r"^[^\0]*$"}, _text)]
+Name = Annotated[str, Value(_ANY_NAME, _name)]
+Flag = Annotated[bool, Value({"type": "boolean"}, _flag)]

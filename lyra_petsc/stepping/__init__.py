@@ -1,1 +1,4 @@
-"""The reduced implicit system, PETSc TS/SNES/KSP, step control and recovery."""
+"""From a state to the next: integrators, Newton's method, step control and recovery.
+
+In: a checked scene. Out: accepted steps, or why there is none.
+"""

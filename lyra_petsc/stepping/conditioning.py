@@ -6,26 +6,30 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
 
 
-def vertex_scales(system: ReducedSystem, size: float) -> Array:
-    """Force [N] at each owned vertex (n_owned,) if all coordinates changed by ``size`` [m] at random."""
+def vertex_scales(system: StageEquations, size: float) -> Array:
+    """Force [N] at each owned row (n_owned,) if all coordinates changed by ``size`` [m] at random."""
     points = system.points
     scale = np.zeros(points.n_local)
     for term in system.elastic:
         amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
         scale += np.bincount(term.stencil.ravel(), amount, points.n_local)
+        if term.edges is not None:
+            of_edges = np.repeat(term.force_scale(size), term.edges.shape[1])
+            scale += np.bincount(term.edges.ravel() // 3, of_edges, points.n_local)
     return scale[: points.n_owned]
 
 
-def expected_iterations(system: ReducedSystem, dt: float) -> float:
+def expected_iterations(system: StageEquations, dt: float) -> float:
     """Iterations of conjugate gradients with block Jacobi in a step of length dt [s]; collective.
 
     Half the root of the largest ratio of stiffness to inertia: what is left of the spectrum after scaling
     by the diagonal reaches from the one to the other.
     """
-    ratio = dt * dt * vertex_scales(system, 1.0) / system.mass
+    n = system.points.n_vertices
+    ratio = dt * dt * vertex_scales(system, 1.0)[:n] / system.mass[:n]
     return 0.5 * float(np.sqrt(system.points.comm.allreduce(float(ratio.max(initial=0.0)), MPI.MAX)))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.blocks import BlockRows
-from lyra_petsc.partition.points import Points
-from lyra_petsc.remembered import Remembered
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.term import Elastic, Term
 
 Array = NDArray[np.float64]
 
@@ -48,8 +49,7 @@ class Damping:
 
     Parameters
     ----------
-    points : Points
-    blocks : BlockRows
+    discretisation : Discretisation
     elastic : sequence of Elastic
         All of the scene; those without damping are passed over.
     moves : bool
@@ -66,25 +66,33 @@ class Damping:
     """
 
     def __init__(
-        self, points: Points, blocks: BlockRows, elastic: Sequence[Elastic], *, moves: bool, once: bool
+        self, discretisation: Discretisation, elastic: Sequence[Elastic], *, moves: bool, once: bool
     ) -> None:
-        self._points, self._blocks, self._once = points, blocks, once
-        self._terms = [t for t in elastic if moves and t.damped and np.any(t.elements.data["damping"])]
-        self.acts = bool(points.comm.allreduce(len(self._terms), MPI.MAX))
+        self._discretisation, self._once = discretisation, once
+        self._terms = [
+            t for t in elastic if moves and t.registration.damped and np.any(t.elements.data["damping"])
+        ]
+        self.acts = bool(discretisation.layout.comm.allreduce(len(self._terms), MPI.MAX))
         self._values: Array | None = None
         self._stored = False
         self._multiple: Multiple | None = None
         self._at: Array | None = None
+        self._frozen: Mapping[Term, Any] = {}
         # residual, objective and works ask at the same velocities
         self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
         uniform = len(factors) > 0 and factors.min() == factors.max() and len(self._terms) == len(elastic)
         self._gamma = float(factors[0]) if uniform else 0.0
 
-    def freeze(self, x: Array) -> None:
-        """Take the geometry of positions x (n_local, 3)."""
+    @property
+    def _blocks(self) -> BlockRows:
+        """Damped terms have fixed stencils."""
+        return self._discretisation.fixed
+
+    def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
+        """Take the geometry of positions x (n_local, 3), with what terms froze for the step."""
         self.let_go()
-        self._at, self._stored = x.copy(), False
+        self._at, self._stored, self._frozen = x.copy(), False, frozen
         self.product.forget()
         if not self._once:
             self._own()
@@ -93,20 +101,23 @@ class Damping:
         """Work no longer with the rows that ``with_stiffness_into`` was given."""
         self._multiple = None
 
+    def _add(self, x: Array, weight: Callable[[Elastic], Array | float], values: Array) -> None:
+        for term in self._terms:
+            self._blocks.add_stiffness(term, x, self._frozen[term], 1.0, weight(term), values)
+
     def _own(self) -> Array:
         """D, stored from here on until the geometry is another."""
         if self._values is None:
             self._values = self._blocks.zeros()
         if not self._stored and self._at is not None:
             self._values[:] = 0.0
-            for term in self._terms:
-                self._blocks.add_stiffness(term, self._at, 1.0, term.elements.data["damping"], self._values)
+            self._add(self._at, lambda term: term.elements.data["damping"], self._values)
             self._stored = True
         return self._values
 
     def _product(self, v: Array) -> Array:
         if not v.any():  # as where a semi-implicit step looks at its forces
-            return np.zeros((self._points.n_owned, 3))
+            return np.zeros((self._discretisation.layout.n_owned, 3))
         if self._multiple is not None:
             return self._multiple.product(self._blocks, v)
         return self._blocks.product(self._own(), v)
@@ -114,10 +125,13 @@ class Damping:
     def into(self, values: Array, diagonal: Array) -> None:
         """Let ``values`` (n_blocks, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
         self.let_go()
-        if self.acts:
-            self._blocks.scale(self._own(), 1.0, diagonal, values)
+        rows, place = self._discretisation.rows, self._discretisation.place
+        if self.acts and place is None:
+            rows.scale(self._own(), 1.0, diagonal, values)
         else:
-            self._blocks.set_diagonal(diagonal, values)
+            rows.set_diagonal(diagonal, values)
+            if self.acts and place is not None:
+                values[place] += self._own()
 
     def with_stiffness_into(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]
@@ -134,8 +148,7 @@ class Damping:
         factor = 1.0 + weight / self._gamma
         if self._once and not self._stored:
             self._blocks.set_diagonal(diagonal, values)
-            for term in self._terms:
-                self._blocks.add_stiffness(term, x, 1.0, self._gamma + weight, values)
+            self._add(x, lambda term: self._gamma + weight, values)
             self._multiple = Multiple(values, factor, diagonal, changing)
         else:
             self._blocks.scale(self._own(), factor, diagonal, values)

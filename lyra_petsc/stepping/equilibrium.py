@@ -17,11 +17,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.integrators.static import Static
+from lyra_petsc.stepping.newton_trace import Iteration, Stuck
 from lyra_petsc.stepping.relaxation import Relaxation
-from lyra_petsc.stepping.schemes.static import Static
+from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
-from lyra_petsc.stepping.system import ReducedSystem
-from lyra_petsc.stepping.trace import Iteration, Stuck
 
 Array = NDArray[np.float64]
 
@@ -57,8 +57,8 @@ class Equilibrium:
 
     Parameters
     ----------
-    system : ReducedSystem
-        With the scheme `Static`; its positions are the start shape.
+    system : StageEquations
+        With the integrator `Static`; its positions are the start shape.
     stepper : Stepper
     tolerances : Solver
     spacing, size : float
@@ -69,15 +69,15 @@ class Equilibrium:
 
     def __init__(
         self,
-        system: ReducedSystem,
+        system: StageEquations,
         stepper: Stepper,
         tolerances: Solver,
         spacing: float,
         size: float,
         floor: float,
     ) -> None:
-        assert isinstance(system.scheme, Static)
-        self._system, self._stepper, self._scheme = system, stepper, system.scheme
+        assert isinstance(system.integrator, Static)
+        self._system, self._stepper, self._integrator = system, stepper, system.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest = LONGEST
         self._in_vain = 0
@@ -101,10 +101,10 @@ class Equilibrium:
         attempt = Attempt(False, 0, 0, 0.0)
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
-            anchored = anchored if solves else system.anchored
+            anchored = anchored if solves else system.moving_energy_before
             history.append(_row(force, attempt if solves else None))
             if arrived and force <= self._allowed():
-                system.anchored = anchored
+                system.moving_energy_before = anchored
                 self._in_vain = 0
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
@@ -112,7 +112,7 @@ class Equilibrium:
             if words:
                 break
             if force > WORSE * last:
-                self._scheme.pseudo *= SHRINK
+                self._integrator.pseudo *= SHRINK
             last = force
             system.given_loads = relaxation.following(system.loads_now) if self._follows else None
             attempt = self._stepper.attempt(before, factor)
@@ -122,13 +122,13 @@ class Equilibrium:
             linear += attempt.linear_iterations
             if attempt.converged:
                 arrived = True
-                self._scheme.pseudo = min(
-                    self._scheme.pseudo * growth(attempt.newton_iterations), self._longest
+                self._integrator.pseudo = min(
+                    self._integrator.pseudo * growth(attempt.newton_iterations), self._longest
                 )
             elif self._stepper.linear_solver_failed:
                 break
             else:
-                self._scheme.pseudo *= SHRINK
+                self._integrator.pseudo *= SHRINK
         self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
@@ -166,7 +166,7 @@ class Equilibrium:
         force, _ = system.out_of_balance()
         goal = x.copy()
         if system.held:
-            system.held.targets(before, factor, factor, goal)
+            system.prescribed.targets(before, factor, factor, goal)
         return Stuck(
             iterations=tuple(history),
             norm=self._norm(force),
@@ -190,10 +190,11 @@ class Equilibrium:
         norm = self._norm(force)
         self._scale = max(self._scale, largest)
         if first and norm > 0.0:
-            fastest = float(np.abs(force / system.mass[:, None]).max(initial=0.0))
+            n = system.points.n_vertices
+            fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
-            self._scheme.pseudo = float(np.sqrt(self._spacing / fastest))
-            self._longest = LONGEST * self._scheme.pseudo
+            self._integrator.pseudo = float(np.sqrt(self._spacing / fastest))
+            self._longest = LONGEST * self._integrator.pseudo
         return norm
 
     def _allowed(self) -> float:

@@ -2,7 +2,7 @@
 
 Order 1: ½ Δt² ẍ, with Δt ẍ = v_{n+1} − v_n. Order 2: C Δt³ x⃛, with x⃛ from the second divided difference
 of the velocities over this step and the one before (or the accelerations at the start, where there is
-none or forces have jumped), C the scheme's error constant.
+none or forces have jumped), C the integrator's error constant.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.stepping.system import ReducedSystem
+from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
 
@@ -23,10 +23,10 @@ class LocalError:
 
     Parameters
     ----------
-    system : ReducedSystem
+    system : StageEquations
     """
 
-    def __init__(self, system: ReducedSystem) -> None:
+    def __init__(self, system: StageEquations) -> None:
         self._system = system
         self._slope: Array | None = None
         self._dt = 0.0
@@ -35,7 +35,7 @@ class LocalError:
     @property
     def needs_acceleration(self) -> bool:
         """Whether the coming step's accelerations at its start are asked for."""
-        return self._system.scheme.order > 1 and self._slope is None
+        return self._system.integrator.order > 1 and self._slope is None
 
     def start_from(self, acceleration: Array) -> None:
         """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
@@ -49,19 +49,22 @@ class LocalError:
         """Largest local error [m] over the free coordinates of the step just taken, from v_before on."""
         system = self._system
         n = system.points.n_owned
-        slope = (system.v[:n] - v_before) / dt
-        if system.scheme.order == 1:
+        slope = (
+            system.v[:n] - v_before
+        ) / dt  # rows of edges follow the vertices and have no error of their own
+        if system.integrator.order == 1:
             error = 0.5 * dt * dt * slope
         else:
             assert self._slope is not None
             third = 2.0 * (slope - self._slope) / (dt + self._dt)
-            error = system.scheme.error_constant * dt**3 * third
-        largest = float(np.abs(error).max(initial=0.0, where=~system.prescribed.mask[:n]))
+            error = system.integrator.error_constant * dt**3 * third
+        vertices = slice(0, system.points.n_vertices)
+        largest = float(np.abs(error[vertices]).max(initial=0.0, where=system.prescribed.free[vertices]))
         return float(system.points.comm.allreduce(largest, MPI.MAX))
 
     def accepted(self, v_before: Array, dt: float) -> None:
         """The step stands."""
-        if self._system.scheme.order > 1:
+        if self._system.integrator.order > 1:
             n = self._system.points.n_owned
             self._slope, self._dt = (self._system.v[:n] - v_before) / dt, dt
 

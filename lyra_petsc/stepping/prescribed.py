@@ -1,68 +1,111 @@
-"""Coordinates that handles prescribe in a step: which, where to, and with what velocity at the stage."""
+"""Unknowns that are prescribed in a step: which, where to, and with what velocity at the stage."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.assembly.blocks import BlockRows
-from lyra_petsc.handles.held import Held
-from lyra_petsc.partition.points import Points
+from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.stepping.reference_positions import ReferencePositions
+from lyra_petsc.terms.prescribed_handles import Held
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
 class Prescribed:
-    """The exact handles of a scene in one step on one rank.
+    """The exact handles of a scene in one step on one rank, and unknowns that nothing uses.
 
     Attributes
     ----------
     mask : (n_local, 3) bool
-        Prescribed coordinates.
+        Prescribed unknowns.
     free : (n_owned, 3) bool
         The others.
     at : (m,) int
-        Which of all owned coordinates, row by row, are prescribed.
-    rows : (n,) int
-        Block rows that couple to prescribed coordinates.
-    blocks : (n,) int
-        The blocks in them.
+        Which of all owned unknowns, row by row, are prescribed.
     goal : (m,)
-        Positions [m] of the prescribed coordinates at the end of the step.
+        Positions [m] of the prescribed unknowns at the end of the step.
     velocity : (m,)
         Their velocities [m/s] at the stage.
     """
 
-    def __init__(self, points: Points, held: Held, blocks: BlockRows) -> None:
-        self._points, self.held, self._blocks = points, held, blocks
+    def __init__(self, discretisation: Discretisation, held: Held, reference: ReferencePositions) -> None:
+        self._discretisation, self.held, self._reference = discretisation, held, reference
         self._active: tuple[int, ...] | None = None
         self._span = (0.0, 0.0)
-        self.mask: Mask = np.zeros((points.n_local, 3), dtype=bool)
-        self.free: Mask = ~self.mask[: points.n_owned]
-        self.at = self.rows = self.blocks = np.empty(0, dtype=np.int64)
-        self.goal, self.velocity = np.empty(0), np.empty(0)
+        self._beside: tuple[BlockRows, Ints, Ints] | None = None
+        own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
+        own.ravel()[discretisation.layout.padding] = True
+        self._set(own)
+        self.goal = self.velocity = np.zeros(len(self.at))
+
+    def _set(self, own: Mask) -> None:
+        """Prescribe these owned unknowns (n_owned, 3); collective."""
+        layout = self._discretisation.layout
+        flags = np.zeros((layout.n_local, 3))
+        flags[: layout.n_owned] = own
+        layout.update_ghosts(flags)
+        self.mask: Mask = flags > 0.5
+        self.free: Mask = ~own
+        self.at: Ints = np.flatnonzero(own)
+        self._beside = None
+
+    def fit(self) -> None:
+        """Follow the layout to other ghosts; collective."""
+        self._set(~self.free)
+
+    @property
+    def blocks(self) -> Ints:
+        """Blocks of the present pattern that couple to prescribed unknowns."""
+        return self._coupled()[1]
+
+    @property
+    def rows(self) -> Ints:
+        """The block rows in which they are."""
+        return self._coupled()[0]
+
+    def _coupled(self) -> tuple[Ints, Ints]:
+        rows = self._discretisation.rows
+        if self._beside is None or self._beside[0] is not rows:
+            none = np.empty(0, dtype=np.int64)
+            found = rows.beside(self.mask) if self.mask.any() else (none, none)
+            self._beside = rows, *found
+        return self._beside[1:]
 
     def begin_step(self, t0: float, t1: float) -> bool:
         """Take the handles of the step t0..t1 [s]; whether they changed; collective."""
         if not self.held:
             return False
-        n = self._points.n_owned
+        layout = self._discretisation.layout
         self._span = t0, t1
         active = self.held.active(t0, t1)
         changed = self._active is not None and active != self._active
         if active != self._active:
             self._active = active
             # ranks own different vertices of a handle, but all agree on which handles hold
-            flags = np.zeros((self._points.n_local, 3))
-            flags[:n] = self.held.mask(t0, t1, n)
-            self._points.update_ghosts(flags)
-            self.mask = flags > 0.5
-            self.free = ~self.mask[:n]
-            self.at = np.flatnonzero(self.mask[:n])
-            self.rows, self.blocks = self._blocks.beside(self.mask)
+            own = self.held.mask(t0, t1, layout.n_owned)
+            own.ravel()[layout.padding] = True
+            self._set(own)
         self.goal = self._positions(t1)
         return changed
+
+    def hold_vertices(self, x: Array) -> None:
+        """Prescribe positions x (n_owned, 3) [m] of all vertices, until `release_vertices`; collective."""
+        layout = self._discretisation.layout
+        self._kept = ~self.free, self.goal, self.velocity
+        own = np.zeros((layout.n_owned, 3), dtype=bool)
+        own[: layout.n_vertices] = True
+        own.ravel()[layout.padding] = True
+        self._set(own)
+        self.goal = x.take(self.at)
+
+    def release_vertices(self) -> None:
+        """Prescribe again what was prescribed before `hold_vertices`; collective."""
+        own, self.goal, self.velocity = self._kept
+        self._set(own)
 
     def solve(self, x_h: Array, reach: float) -> None:
         """Take the velocities that lead from the history x_h (n_owned, 3) to the goal."""
@@ -74,20 +117,24 @@ class Prescribed:
         self.put(x_h, self._positions(at) - reach * self.velocity)
 
     def put(self, values: Array, prescribed: Array) -> None:
-        """Overwrite the prescribed coordinates of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""
+        """Overwrite the prescribed unknowns of ``values`` (n_owned, 3) by ``prescribed`` (m,)."""
         np.put(values, self.at, prescribed)
 
     def overwrite_with_rates(self, velocity: Array) -> None:
-        """Write ẋ* [m/s] at the end of the step over the prescribed coordinates of ``velocity``."""
+        """Write ẋ* [m/s] at the end of the step over the prescribed unknowns of ``velocity``."""
         if self.held and self._span[1] > self._span[0]:
             self.put(velocity, self._rates(self._span[1]))
 
+    def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
+        """Write the positions [m] that handles prescribe at time ``at`` into ``out`` (n_owned, 3)."""
+        self.held.targets(t0, t1, at, self._reference.at, out)
+
     def _positions(self, at: float) -> Array:
-        out = np.empty((self._points.n_owned, 3))
-        self.held.targets(*self._span, at, out)
+        out = np.zeros((self._discretisation.layout.n_owned, 3))
+        self.targets(*self._span, at, out)
         return out.take(self.at)
 
     def _rates(self, at: float) -> Array:
-        out = np.empty((self._points.n_owned, 3))
-        self.held.velocities(*self._span, at, out)
+        out = np.zeros((self._discretisation.layout.n_owned, 3))
+        self.held.velocities(*self._span, at, self._reference.at, out)
         return out.take(self.at)

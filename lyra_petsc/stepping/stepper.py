@@ -10,26 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.assembly.matrix import SystemMatrix
-from lyra_petsc.assembly.pattern import BlockPattern
 from lyra_petsc.errors import SolverError
+from lyra_petsc.linear import failed_factors, presets, reasons
+from lyra_petsc.linear.hierarchy import Surface
+from lyra_petsc.linear.petsc_options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.parallel import all_here
-from lyra_petsc.profiling import FROZEN, RESIDUAL, logged
+from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers import failed_factors, presets, reasons
-from lyra_petsc.solvers.hierarchy import Surface
-from lyra_petsc.solvers.multigrid import Multigrid, kind_asked_for
-from lyra_petsc.solvers.options import Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
+from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.extrapolation import Extrapolation
-from lyra_petsc.stepping.forcing import LOOSEST
-from lyra_petsc.stepping.guess import first_guess
+from lyra_petsc.stepping.inexact import LOOSEST
+from lyra_petsc.stepping.initial_guess import first_guess
+from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
-from lyra_petsc.stepping.shift import allows_enlarging
-from lyra_petsc.stepping.system import ReducedSystem
-from lyra_petsc.stepping.trace import Stuck, Trace
-from lyra_petsc.stepping.ts_options import refuse_contradictions
+from lyra_petsc.stepping.newton_trace import Stuck, Trace
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.ts_options import hidden
 
 Array = NDArray[np.float64]
 
@@ -53,16 +51,15 @@ FIRST_OF_ALL = 1e-3
 
 
 class Stepper:
-    """Each step's stage by TSBEULER or TSTHETA on the reduced system.
+    """Each step's stage by TSBEULER or TSTHETA on the stage equations.
 
     TSBDF and TSALPHA2 keep their histories where neither a checkpoint nor a changed linear solver reaches
-    them; ours are in the scheme, and TS solves for the stage.
+    them; ours are in the integrator, and TS solves for the stage.
 
     Parameters
     ----------
     scene : Scene
-    system : ReducedSystem
-    pattern : BlockPattern
+    equations : StageEquations
     surface : Surface
     spacing : float
         Mean edge length [m], for the step tolerance.
@@ -73,6 +70,8 @@ class Stepper:
     ----------
     ts, snes, ksp : PETSc objects
         Without options prefix.
+    linear : LinearSystem
+        The matrices.
     preset : str
         Name of the linear solver in use.
     presets : list of str
@@ -83,25 +82,19 @@ class Stepper:
     Raises
     ------
     InputError
-        For options that contradict the scene (``-ts_type``, ``-ts_theta_endpoint``, …).
+        For options that PETSc refuses.
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        system: ReducedSystem,
-        pattern: BlockPattern,
-        surface: Surface,
-        spacing: float,
-        floor: float,
+        self, scene: Scene, equations: StageEquations, surface: Surface, spacing: float, floor: float
     ) -> None:
-        self._scene, self._system, self._pattern, self._surface = scene, system, pattern, surface
+        self._scene, self._equations, self._surface = scene, equations, surface
         self._spacing, self._floor = spacing, floor
         self._iterates = scene.time.scheme != "semi-implicit"
-        points = system.points
+        points = equations.points
         step = 0.0 if scene.time.step == "auto" else scene.time.step
         static = scene.time.scheme == "static"
-        expected = 0.0 if static else expected_iterations(system, step)
+        expected = 0.0 if static else expected_iterations(equations, step)
         self.presets = presets.candidates(
             points.n_global, points.comm.size, static=static, newton=self._iterates, iterations=expected
         )
@@ -109,35 +102,31 @@ class Stepper:
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
-        self._shape = (system.points.n_owned, 3)
-        self._extrapolation = Extrapolation(system.points.comm)
+        self._shape = (points.n_owned, 3)
+        self._extrapolation = Extrapolation(points.comm)
         self._create()
 
     # -- objects -------------------------------------------------------------------------------------
 
     def _create(self) -> None:
-        system, scene = self._system, self._scene
-        points = system.points
+        equations, scene = self._equations, self._scene
+        points = equations.points
         self.preset = self.presets[0]
         self._fill(presets.options_of(self.preset, points.comm.size))
-        self.matrix = SystemMatrix(points, self._pattern, "baij")
-        self.preconditioner = self.matrix
-        if self._separate():
-            diagonal = PETSc.Options().getString("pc_type", "") in presets.READS_DIAGONAL
-            self.preconditioner = SystemMatrix(
-                points, self._pattern, "baij", given=not diagonal, beside=self.matrix, diagonal=diagonal
-            )
-        self.velocity = PETSc.Vec().createMPI(
-            (3 * points.n_owned, 3 * points.n_global), bsize=3, comm=points.comm
+        self.linear = LinearSystem(
+            equations, self._surface, self.preset, scene.solver.hessian, iterates=self._iterates
         )
+        self.velocity = PETSc.Vec().create(points.comm)
+        self.velocity.setSizes((3 * points.n_owned, 3 * points.n_global), bsize=3)
+        self.velocity.setType(PETSc.Vec.Type.MPI if points.comm.size > 1 else PETSc.Vec.Type.SEQ)
         self.residual = self.velocity.duplicate()
         self.ts = ts = PETSc.TS().create(points.comm)
         ts.setProblemType(PETSc.TS.ProblemType.NONLINEAR)
-        ts.setType(system.scheme.ts_type)
-        if system.scheme.ts_type == "theta":
+        ts.setType(equations.integrator.ts_type)
+        if equations.integrator.ts_type == "theta":
             ts.setTheta(0.5)
         ts.setIFunction(self._ifunction, self.residual)
-        ts.setIJacobian(self._ijacobian, self.matrix.mat, self.preconditioner.mat)
+        self._set_jacobian()
         ts.setMaxTime(scene.time.end)
         ts.setTimeStep(FIRST_OF_ALL * scene.time.end if scene.time.step == "auto" else scene.time.step)
         ts.setMaxSteps(np.iinfo(PETSc.IntType).max - 1)
@@ -148,28 +137,18 @@ class Stepper:
         self.ksp = ksp = snes.getKSP()
         snes.setInitialGuess(self._guess)
         limit = presets.linear_limit(points.n_global, self.presets)
+        convergence = Convergence(equations, scene.solver, self._spacing, self._floor, linear_limit=limit)
         self._newton = newton = Newton(
-            snes,
-            system,
-            self.matrix,
-            self.preconditioner,
-            self._blend,
-            scene.solver,
-            self._spacing,
-            self._floor,
-            iterates=self._iterates,
-            linear_limit=limit,
+            snes, equations, self.linear, self._blend, convergence, iterates=self._iterates
         )
         ksp.setType(PETSc.KSP.Type.CG)
-        self._multigrid: Multigrid | None = None
-        if kind_asked_for():
-            rows = self.preconditioner, points, self._pattern, self._surface
-            self._multigrid = Multigrid(ksp, *rows, held=lambda: system.prescribed.mask)
-        self._trace = Trace(snes, system, self._linear_iterations)
+        self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
+        if equations.discretisation.changes:
+            snes.setUpdate(lambda snes, iteration: self._follow_stencils())
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
-            snes.setObjective(newton.objective)
+            snes.setObjective(newton.globalisation.objective)
             snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(newton.converged)
             snes.setLineSearchPreCheck(newton.direction)
@@ -181,28 +160,24 @@ class Stepper:
             ksp.setTolerances(rtol=1e-6, max_it=5000)
             ksp.setInitialGuessNonzero(True)
         try:
-            ts.setFromOptions()
+            self.velocity.setFromOptions()
+            with hidden():
+                ts.setFromOptions()
         except PETSc.Error as error:
             raise refused(error) from None
-        if self._multigrid is not None:
-            self._multigrid.after_options(ksp, self.matrix)
+        self.linear.attach(ksp)
         if ksp.getType() in presets.CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        refuse_contradictions(ts, system.scheme.ts_type)
         ts.setSolution(self.velocity)
 
-    def _separate(self) -> bool:
-        """Whether the preconditioner is built from a matrix of its own, the regularised one.
+    def _set_jacobian(self) -> None:
+        self.ts.setIJacobian(self._ijacobian, self.linear.operator.mat, self.linear.preconditioner.mat)
 
-        So it stays positive definite, and conjugate gradients see negative curvature of the exact
-        Hessian only where there is some.
-        """
-        if not self._iterates:
-            # their diagonal is a little larger
-            return self.preset in presets.INCOMPLETE and not allows_enlarging(self.matrix)
-        kind = PETSc.Options().getString("ksp_type", "cg")
-        return self._scene.solver.hessian != "regularised" and kind != "preonly"
+    def _follow_stencils(self) -> None:
+        """Let the matrices be those of the present stencils; collective."""
+        if self.linear.renew():
+            self._set_jacobian()
 
     def _fill(self, options: Mapping[str, Value]) -> None:
         self._filled = fill_gaps(options)
@@ -224,80 +199,94 @@ class Stepper:
         database = PETSc.Options()
         for name in self._filled:
             database.delValue(name)
-        self._system.forget_rows()
         self.ts.destroy()
-        self.matrix.destroy()
-        if self.preconditioner is not self.matrix:
-            self.preconditioner.destroy()
-        if self._multigrid is not None:
-            self._multigrid.destroy()
+        self.linear.destroy()
         self.velocity.destroy()
         self.residual.destroy()
 
     # -- a step ----------------------------------------------------------------------------------------
 
     def start(self, time: float, step: int) -> None:
-        """Set time [s] and step number, and take the velocities from the system."""
+        """Set time [s] and step number, and take the velocities from the equations' state."""
         self.ts.setTime(time)
         self.ts.setStepNumber(step)
-        self.velocity.setArray(self._system.v[: self._shape[0]].ravel())
+        self.velocity.setArray(self._equations.v[: self._shape[0]].ravel())
 
     def attempt(self, t0: float, t1: float) -> Attempt:
-        """Try the step from t0 to t1 [s]; on success the system holds the new state; collective."""
-        system = self._system
+        """Try the step from t0 to t1 [s]; on success the state is the new one; collective."""
+        equations = self._equations
         with PETSc.Log.Event(FROZEN):
-            system.begin_step(t0, t1)
-        self.velocity.setArray(system.history.ravel())
+            equations.begin_step(t0, t1)
         number = self.ts.getStepNumber()
-        # a TS step that ends where its stage shall be, with the shift that the scheme wants
-        theta = 0.5 if system.scheme.ts_type == "theta" else 1.0
-        length = 1.0 / (theta * system.stage.sigma)
-        self.ts.setTime(t0 + system.stage.after - theta * length)
+        before = equations.x[: self._shape[0]].copy() if equations.edges_lag else None
+        rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
+        velocity, words = self._solve(t0)
+        stuck: Stuck | None = None
+        newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
+        outcome = self._newton.convergence
+        ended = outcome.norm, outcome.left, outcome.at_roundoff
+        if velocity is not None:
+            equations.accept(velocity)
+            if before is not None:
+                assert rate_before is not None
+                equations.begin_edges(before)
+                rates, words = self._solve(t0)
+                newton, linear = (
+                    newton + self.snes.getIterationNumber(),
+                    linear + self._newton.linear_iterations,
+                )
+                if rates is None:
+                    stuck, velocity = self._trace.stuck(), None
+                equations.end_edges(rates)
+                if rates is None:
+                    equations.state.set(before, rate_before)
+        else:
+            stuck = self._trace.stuck()
+        self.ts.setTimeStep(t1 - t0)
+        if velocity is not None:
+            self.velocity.setArray(equations.v[: self._shape[0]].ravel())
+            self.ts.setTime(t1)
+            self.ts.setStepNumber(number + 1)
+            norm, left, at_roundoff = ended
+            return Attempt(True, newton, linear, norm, left, at_roundoff=at_roundoff)
+        self.ts.setTime(t0)
+        self.ts.setStepNumber(number)
+        self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
+        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_()):
+            return self.attempt(t0, t1)
+        return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
+
+    def _solve(self, t0: float) -> tuple[Array | None, str]:
+        """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective."""
+        equations, stage = self._equations, self._equations.stage
+        self._follow_stencils()
+        self.velocity.setArray(equations.history.ravel())
+        # a TS step that ends where its stage shall be, with the shift that the integrator wants
+        theta = 0.5 if equations.integrator.ts_type == "theta" else 1.0
+        length = 1.0 / (theta * stage.sigma)
+        self.ts.setTime(t0 + stage.after - theta * length)
         self.ts.setTimeStep(length)
         self._newton.begin_step()
         self._trace.begin()
         try:
             self.ts.step()
         except PETSc.Error as error:
-            together = all_here(system.points.comm)
+            together = all_here(equations.points.comm)
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
                 f"PETSc stopped in the step from t = {t0:g} s: {reasons.last_words(error)}; "
                 f"{kept} is kept; check {culprits(error)}",
                 collective=together,
             ) from None
-        newton, linear = self.snes.getIterationNumber(), self._linear_iterations()
-        words = "the velocities are not finite"
         self._linear_failed = False
-        if self.ts.getConvergedReason() >= 0 and self.snes.getConvergedReason() > 0:
-            velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
-            if system.points.comm.allreduce(int(not np.isfinite(velocity).all())) == 0:
-                system.accept(velocity)
-                self.velocity.setArray(system.v[: self._shape[0]].ravel())
-                self.ts.setTime(t1)
-                self.ts.setTimeStep(t1 - t0)
-                return Attempt(
-                    True,
-                    newton,
-                    linear,
-                    self._newton.norm,
-                    self._newton.left,
-                    at_roundoff=self._newton.at_roundoff,
-                )
-        else:
-            words = reasons.in_words(self.snes, self.ksp)
-            self._linear_failed = self._newton.too_slow or reasons.preconditioner_failed(self.ksp)
-        stuck = self._trace.stuck()
-        self.ts.setTime(t0)
-        self.ts.setTimeStep(t1 - t0)
-        self.ts.setStepNumber(number)
-        self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        if not self._iterates and (failed_factors.forget(self.ksp) or self._newton.shift.raise_()):
-            return self.attempt(t0, t1)
-        return Attempt(False, newton, linear, self._newton.norm, words=words, stuck=stuck)
-
-    def _linear_iterations(self) -> int:
-        return int(self.snes.getLinearSolveIterations()) + self._newton.more_linear
+        if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
+            slow = self._newton.convergence.too_slow
+            self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)
+            return None, reasons.in_words(self.snes, self.ksp)
+        velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
+        if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
+            return None, "the velocities are not finite"
+        return velocity, ""
 
     @property
     def blend(self) -> float:
@@ -311,7 +300,7 @@ class Stepper:
     @property
     def linear_solver_slow(self) -> bool:
         """Whether it did not fail, but took more iterations than another one would cost."""
-        return self._newton.too_slow
+        return self._newton.convergence.too_slow
 
     @property
     def linear_solver_failed(self) -> bool:
@@ -327,23 +316,22 @@ class Stepper:
     @logged(RESIDUAL)
     def _ifunction(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, f: PETSc.Vec) -> None:
         v, rate = (vec.getArray(readonly=True).reshape(self._shape) for vec in (u, udot))
-        self._system.residual(v, rate, f.getArray().reshape(self._shape))
+        self._equations.residual(v, rate, f.getArray().reshape(self._shape))
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
-        first_guess(self._system, guess)
+        first_guess(self._equations, guess)
         if not self._iterates:
             # the linear solve sets out from there; its tolerance stays relative to the whole
-            system = self._system
-            ahead = self._extrapolation.to(system.t1, system.t0, system.v[: len(guess)])
-            system.prescribe(ahead)
+            equations = self._equations
+            ahead = self._extrapolation.to(equations.t1, equations.t0, equations.v[: len(guess)])
+            equations.prescribe(ahead)
             snes.getSolutionUpdate().setArray((guess - ahead).ravel())
 
     def _ijacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, a: PETSc.Mat, p: PETSc.Mat
     ) -> bool:
         self._newton.assemble(u)
-        self._newton.factor()
         if self._iterates:
-            self._newton.remember(u)
+            self._newton.globalisation.remember(u)
         return True

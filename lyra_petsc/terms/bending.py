@@ -17,15 +17,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.partition.elements import Elements
-from lyra_petsc.remembered import Remembered
+from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import hinge_forces, hinge_shape
 from lyra_petsc.terms.hinge_energy import fading_limit
-from lyra_petsc.terms.hinge_rows import add_across, add_within, all_offsets
+from lyra_petsc.terms.hinge_rows import add_across, add_within
 from lyra_petsc.terms.hinge_triangles import triangles_of
+from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Couplings, Elastic, Offsets
+from lyra_petsc.terms.term import Across, Couplings, Elastic, Offsets
 
 Array = NDArray[np.float64]
 Stencil = NDArray[np.int32] | NDArray[np.int64]
@@ -73,8 +73,6 @@ class Bending(Elastic):
         the opposite vertices have among the corners of their triangles (0, 1, 2).
     """
 
-    name = "bending"
-
     def __init__(self, elements: Elements) -> None:
         data = elements.data
         super().__init__(elements.without("limit", "places"))
@@ -106,7 +104,7 @@ class Bending(Elastic):
         hinge_forces.weights(x, self.stencil, self._triangles.sides, self._limit, out)
         return out
 
-    def energies(self, x: Array) -> Array:
+    def energies(self, x: Array, frozen: None = None) -> Array:
         return self.all_energies(x, self.n_owned)
 
     def all_energies(self, x: Array, n: int) -> Array:
@@ -116,30 +114,27 @@ class Bending(Elastic):
         hinge_forces.energies(x, *hinges, triangles, self._limit, angles, self._k, self._rest, out)
         return out
 
-    def add_gradient(self, x: Array, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
         corners, sides, hinges = self._triangles
         triangles, angles, lengths = self._bent(x)
         pulls, law = np.empty(self.n_elements + 1), (self._k, self._rest)
         hinge_forces.pulls(x, self.stencil, sides, triangles, self._limit, angles, lengths, *law, pulls, out)
         hinge_forces.add_gradient(corners, hinges, triangles, pulls, out)
 
-    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        hinges, law = (self.stencil, self._triangles.sides), (self._k, self._rest)
-        hinge_forces.hessians(x, *hinges, lo, hi, self._limit, self.angles(x), blend, *law, out)
-
     @property
     def couplings(self) -> Couplings:
-        return {self.name: self._triangles.corners, ACROSS: self.stencil[:, 2:]}
+        return {self.name: self._triangles.corners, ACROSS: Across(self.stencil[:, 2:])}
 
-    def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:
-        within = offsets[self.name]
-        out = np.empty_like(within, shape=(self.n_elements, 10))
-        all_offsets(self.stencil, self._triangles.sides, within, offsets[ACROSS], out)
-        return out
-
-    def add_hessians(
-        self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
-    ) -> bool:
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: None,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        before: Array | None = None,
+    ) -> None:
         corners, sides, hinges = self._triangles
         within, across, bent = offsets[self.name], offsets[ACROSS], self._bent(x)
         factors = np.empty((self.n_elements + 1, 2))
@@ -147,7 +142,6 @@ class Bending(Elastic):
         add_across(x, self.stencil, sides, *bent, blend, *law, within, across, values, factors)
         add_within(x, corners, hinges, sides, bent.triangles, factors, within, values)
         self._bent.forget()  # what comes next is a linear solve, which needs the room
-        return True
 
     def force_scale(self, size: float) -> Array:
         scale: Array = self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2

@@ -11,20 +11,22 @@ the material's rest curvature. Below a tenth of its rest area a triangle's energ
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.handles.motion import Motion, Window, motion_of
-from lyra_petsc.meshing.select import select_vertices
-from lyra_petsc.meshing.topology import boundary_edges
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.topology import boundary_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.bending import edge_in_material, mirrored_angles
 from lyra_petsc.terms.hinge import angle, point
 from lyra_petsc.terms.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.terms.term import Elastic, Step
 
 Array = NDArray[np.float64]
 
@@ -66,6 +68,30 @@ def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[
         out[e - lo] = o[:3, :3]
 
 
+class Mirrors(NamedTuple):
+    """Clamps in one step.
+
+    Attributes
+    ----------
+    mirror : (E, 3)
+        The opposite vertices' mirror images [m].
+    k : (E,)
+        Stiffness [N·m]; 0 of handles that do not hold.
+    """
+
+    mirror: Array
+    k: Array
+
+
+def _mirrored(tail: Array, head: Array, opposite: Array) -> Array:
+    """Mirror images (E, 3) [m] of the opposite vertices about the edges."""
+    edge = head - tail
+    square = (edge * edge).sum(axis=1)
+    along = ((opposite - tail) * edge).sum(axis=1) / np.where(square > 0.0, square, 1.0)
+    mirrored: Array = 2.0 * (tail + along[:, None] * edge) - opposite
+    return mirrored
+
+
 class Clamp(Elastic):
     """Half hinges of all clamped handles.
 
@@ -78,50 +104,41 @@ class Clamp(Elastic):
     handles : mapping of handle number → (Motion, Window)
     """
 
-    name = "clamp"
-
     def __init__(self, elements: Elements, handles: dict[int, tuple[Motion, Window]]) -> None:
         super().__init__(elements)
         self._handle = elements.data["handle"].astype(np.int64)
         self._handles = handles
-        self._start = np.zeros((self.n_elements, 3))
-        self._mirror = np.zeros((self.n_elements, 3))
-        self._k = np.zeros(self.n_elements)
         self._rest, self._limit = elements.data["rest_angle"], elements.data["limit"]
 
-    def begin(self, time: float, x: Array) -> None:
-        for number, (_, window) in self._handles.items():
-            if window.start != time:
-                continue
-            mine = self._handle == number
-            tail, head, opposite = x[self.stencil[mine].T]
-            edge = head - tail
-            square = (edge * edge).sum(axis=1)
-            along = ((opposite - tail) * edge).sum(axis=1) / np.where(square > 0.0, square, 1.0)
-            self._start[mine] = 2.0 * (tail + along[:, None] * edge) - opposite
+    @property
+    def reference_rows(self) -> NDArray[np.int64]:
+        return self.stencil.ravel().astype(np.int64)
 
-    def prepare(self, t0: float, t1: float, at: float) -> None:
+    def freeze(self, step: Step) -> Mirrors:
+        mirror, k = np.zeros((self.n_elements, 3)), np.zeros(self.n_elements)
         for number, (motion, window) in self._handles.items():
             mine = self._handle == number
-            holds = window.holds(t0, t1)
-            self._k[mine] = self.elements.data["k"][mine] if holds else 0.0
+            if window.holds(step.start, step.end):
+                k[mine] = self.elements.data["k"][mine]
+            corners = self.stencil[mine].astype(np.int64)
+            tail, head, opposite = step.reference(window.start, corners.T.ravel()).reshape(3, -1, 3)
             # also while it does not hold: the angle of k = 0 must stay a number
-            self._mirror[mine] = motion.carried(self._start[mine], window.start, at)
+            mirror[mine] = motion.carried(_mirrored(tail, head, opposite), window.start, step.at)
+        return Mirrors(mirror, k)
 
-    def energies(self, x: Array) -> Array:
+    def energies(self, x: Array, frozen: Mirrors) -> Array:
         out = np.empty(self.n_owned)
-        energies(x, self.stencil, self._mirror, self._k, self._rest, self._limit, out)
-        return np.where(self._k[: self.n_owned] > 0.0, out, 0.0)
+        energies(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        return np.where(frozen.k[: self.n_owned] > 0.0, out, 0.0)
 
-    def add_gradient(self, x: Array, out: Array) -> None:
-        held = self._k > 0.0
-        constants = self._mirror[held], self._k[held], self._rest[held], self._limit[held]
+    def add_gradient(self, x: Array, frozen: Mirrors, out: Array) -> None:
+        held = frozen.k > 0.0
+        constants = frozen.mirror[held], frozen.k[held], self._rest[held], self._limit[held]
         add_gradient(x, self.stencil[held], *constants, out)
 
-    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        constants = self._mirror, self._k, self._rest, self._limit
-        hessians(x, self.stencil, lo, hi, blend, *constants, out)
-        out[self._k[lo:hi] == 0.0] = 0.0
+    def hessians(self, x: Array, frozen: Mirrors, lo: int, hi: int, blend: float, out: Array) -> None:
+        hessians(x, self.stencil, lo, hi, blend, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        out[frozen.k[lo:hi] == 0.0] = 0.0
 
     def force_scale(self, size: float) -> Array:
         # of the full stiffness: the scale is asked for before the first step

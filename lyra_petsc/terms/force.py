@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.handles.motion import Window
-from lyra_petsc.meshing.select import find_group, select_triangles, select_vertices
-from lyra_petsc.partition.elements import Elements
-from lyra_petsc.scene.schema import Load as LoadBlock
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import find_group, select_triangles, select_vertices
+from lyra_petsc.scene.schema import AppliedLoad, Scene
+from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
 
@@ -18,8 +17,6 @@ Array = NDArray[np.float64]
 
 class Force(Load):
     """Parameters: elements with stencil (E, 1), data ``force`` (E, 3) [N] and ``load`` (E,)."""
-
-    name = "force"
 
     def __init__(self, elements: Elements, windows: list[Window]) -> None:
         super().__init__(elements)
@@ -31,7 +28,7 @@ class Force(Load):
         np.add.at(out, self.stencil[:, 0], self.elements.data["force"] * strength[self._load, None])
 
 
-def _shares(rest: RestShape, load: LoadBlock, key: str) -> tuple[NDArray[np.int64], Array]:
+def _shares(rest: RestShape, load: AppliedLoad, key: str) -> tuple[NDArray[np.int64], Array]:
     """Vertices of a total force and the part of it that each carries (their sum is 1).
 
     Surface groups share by rest area, curve groups by length, everything else equally.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
@@ -15,8 +15,6 @@ Array = NDArray[np.float64]
 
 class Gravity(Load):
     """Parameters: ``mass`` (n_owned,) [kg] of the owned vertices, ``acceleration`` (3,) [m/s²]."""
-
-    name = "gravity"
 
     def __init__(self, mass: Array, acceleration: Array) -> None:
         super().__init__(Elements(np.empty((0, 1), dtype=np.int32)))

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernel_cache import Index
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
 
 
 @kernel(inline="always")

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms.hinge import add_angle_hessian, angle_slopes, cross, dot, minus
-from lyra_petsc.terms.kernel import kernel
 
 FADES_BELOW = 0.1
 """Part of a triangle's rest area below which the hinges on its edges fade."""

@@ -1,4 +1,4 @@
-"""Energies of hinges and their gradients; element Hessians. Shapes of triangles are those of ``hinge_shape``.
+"""Energies of hinges and their gradients. Shapes of triangles are those of ``hinge_shape``.
 
 The gradient is put together triangle by triangle, along whose normal all forces of its hinges act.
 """
@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lyra_petsc.kernel_cache import Index
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms.hinge import angle_parts, point
-from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_hessian, hinge_weight
+from lyra_petsc.terms.hinge_energy import hinge_energy, hinge_gradient, hinge_weight
 from lyra_petsc.terms.hinge_shape import fades
-from lyra_petsc.terms.kernel import kernel
 
 
 @kernel(inline="always")
@@ -81,13 +81,3 @@ def add_gradient(corners, hinges, shape, pull, out):  # type: ignore[no-untyped-
             out[i0, i] -= (f1 + f2) * n
             out[i1, i] += f1 * n
             out[i2, i] += f2 * n
-
-
-@kernel()
-def hessians(x, s, sides, lo, hi, limit, theta, blend, k, rest, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N/m] of hinges lo..hi into out (hi − lo, 4, 4, 3, 3)."""
-    g = np.empty((4, 3))
-    for h in range(lo, hi):
-        x0, x1, x2, x3 = point(x, s[h, 0]), point(x, s[h, 1]), point(x, s[h, 2]), point(x, s[h, 3])
-        limits = limits_of(limit, sides, h)
-        hinge_hessian(x0, x1, x2, x3, theta[h], k[h], rest[h], limits, blend, g, out[h - lo])

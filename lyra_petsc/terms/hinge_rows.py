@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lyra_petsc.block_rows.scatter import AHEAD, add_element, fetch_ahead
-from lyra_petsc.block_rows.vectors import add_outer, add_six, fetch
-from lyra_petsc.kernel_cache import Index
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.kernels.vectors import add_outer, add_six, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.hinge_forces import limits_of
 from lyra_petsc.terms.hinge_shape import fades, triangles_at
-from lyra_petsc.terms.kernel import kernel
 
 
 @kernel(inline="always")
@@ -58,13 +58,6 @@ def hinge_offsets(h, s, sides, within, across, out):  # type: ignore[no-untyped-
     out[7] = within[one, _pair(p, p)]
     out[8] = across[h]
     out[9] = within[two, _pair(q, q)]
-
-
-@kernel()
-def all_offsets(s, sides, within, across, out):  # type: ignore[no-untyped-def]
-    """``hinge_offsets`` of all hinges into out (E, 10)."""
-    for h in range(s.shape[0]):
-        hinge_offsets(h, s, sides, within, across, out[h])
 
 
 @kernel()

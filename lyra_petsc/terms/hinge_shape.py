@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from lyra_petsc.kernel_cache import Index
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms import hinge
 from lyra_petsc.terms.hinge import cross, dot, minus, point
-from lyra_petsc.terms.kernel import kernel
 
 
 @kernel()

@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.handles.motion import Window
-from lyra_petsc.meshing.select import select_triangles
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import select_triangles
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
 
@@ -39,7 +39,6 @@ def add_force(x, s, pressure, out):  # type: ignore[no-untyped-def]
 class Pressure(Load):
     """Parameters: elements with stencil (E, 3) and data ``load`` (E,), the number of the scene's load."""
 
-    name = "pressure"
     follows = True
 
     def __init__(self, elements: Elements, pressures: Array, windows: list[Window]) -> None:

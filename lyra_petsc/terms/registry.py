@@ -1,55 +1,123 @@
-"""Every term, and when a scene needs it. A term is one module here and one line in ``REGISTRY``.
+"""Every term: when a scene needs it, and what it is to the rest of the program.
 
-A term's module offers ``elements(rest)`` (rank 0: its stencil and constants on the whole mesh, or
-None) and ``make(elements, scene, mass)`` (each rank: the term on its own part). A module is imported,
-hence its kernels compiled, only when a scene needs the term.
+A term is one module and one entry in ``REGISTRY``. The module offers ``elements(rest)`` (rank 0: its stencil
+and constants on the whole mesh, or None) and ``make(elements, scene, mass)`` (each rank: the term on its own
+part). A module is imported, hence its kernels compiled, only when a scene needs the term.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
 from importlib import import_module
 from types import ModuleType
 
-from lyra_petsc.materials.shell import ShellMaterial
+from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import Scene
 
 Need = Callable[[Scene, Sequence[ShellMaterial]], bool]
 
 
+class Role(Enum):
+    """What a term is in the equations of motion."""
+
+    ELASTIC = "elastic energy of the sheet"
+    CONSTRAINT = "elastic energy by which handles pull: its work comes from outside"
+    VISCOUS = "potential of the velocities"
+    LOAD = "force that is constant in a step"
+
+
 @dataclass(frozen=True)
 class Registration:
-    """A term's name (also its module) and whether a scene needs it."""
+    """A term, and what the rest of the program needs to know of it.
+
+    Attributes
+    ----------
+    name : str
+        Also that of its module in ``lyra_petsc.terms``, unless ``home`` names another.
+    needed : callable
+        Whether a scene with these materials needs it.
+    role : Role
+    energy : str
+        Column of history.csv that its energy [J] is added to; a new one comes after the present columns.
+        Empty where it is not stored in the sheet (constraints) or there is none.
+    columns : mapping of str to str
+        Further columns of history.csv, and how the ranks' parts of ``Term.history`` become one number:
+        ``sum``, ``min`` or ``max``.
+    damped : bool
+        Stiffness-proportional damping acts through it.
+    moving : bool
+        Its energy depends on where moving handles stand, which thereby do work on the sheet.
+    neighbours : bool
+        Its stencils change as points come near to each other.
+    limits_step : bool
+        It limits how far a Newton iteration may go.
+    state : tuple of str
+        Names of the vertex arrays that a checkpoint must hold for it.
+    home : str
+        Full name of its module, where that is elsewhere.
+    """
 
     name: str
     needed: Need
+    role: Role
+    energy: str = ""
+    columns: Mapping[str, str] = field(default_factory=dict)
+    damped: bool = False
+    moving: bool = False
+    neighbours: bool = False
+    limits_step: bool = False
+    state: tuple[str, ...] = ()
+    home: str = ""
 
     def module(self) -> ModuleType:
         """The term's module, imported now."""
-        return import_module(f"lyra_petsc.terms.{self.name}")
+        return import_module(self.home or f"lyra_petsc.terms.{self.name}")
 
 
 def _bends(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(max(shell.bending) > 0.0 for shell in shells)
 
 
-REGISTRY = (
-    Registration("membrane", lambda scene, shells: True),
-    Registration("bending", _bends),
+def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+    return _bends(scene, shells) and any(handle.clamp for handle in scene.handles)
+
+
+REGISTRY: list[Registration] = [
+    Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
+    Registration("bending", _bends, Role.ELASTIC, "bending_energy", damped=True),
+    Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, moving=True),
     Registration(
-        "clamp", lambda scene, shells: _bends(scene, shells) and any(h.clamp for h in scene.handles)
+        "spring",
+        lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),
+        Role.CONSTRAINT,
     ),
     Registration(
-        "spring", lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles)
+        "gravity",
+        lambda scene, shells: scene.gravity is not None and any(scene.gravity),
+        Role.LOAD,
+        "potential_energy",
     ),
-    Registration("gravity", lambda scene, shells: scene.gravity is not None and any(scene.gravity)),
-    Registration("wind", lambda scene, shells: bool(scene.wind and (scene.wind.density or scene.wind.drag))),
-    Registration("pressure", lambda scene, shells: any(load.pressure is not None for load in scene.loads)),
-    Registration("force", lambda scene, shells: any(load.force or load.traction for load in scene.loads)),
-)
+    Registration(
+        "wind",
+        lambda scene, shells: bool(scene.wind and (scene.wind.density or scene.wind.drag)),
+        Role.VISCOUS,
+    ),
+    Registration(
+        "pressure", lambda scene, shells: any(load.pressure is not None for load in scene.loads), Role.LOAD
+    ),
+    Registration(
+        "force", lambda scene, shells: any(load.force or load.traction for load in scene.loads), Role.LOAD
+    ),
+]
 
 
 def active(scene: Scene, shells: Sequence[ShellMaterial]) -> list[Registration]:
     """The terms a scene needs, in the order of the registry."""
     return [entry for entry in REGISTRY if entry.needed(scene, shells)]
+
+
+def registered(name: str) -> Registration:
+    """The entry of a term."""
+    return next(entry for entry in REGISTRY if entry.name == name)

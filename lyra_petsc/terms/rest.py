@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.materials.library import resolve
-from lyra_petsc.materials.shell import ShellMaterial
-from lyra_petsc.meshing.measure import rest_matrices
-from lyra_petsc.meshing.mesh import Mesh
-from lyra_petsc.meshing.select import select_triangles
-from lyra_petsc.meshing.topology import Hinges, hinges
+from lyra_petsc.mesh.measures import rest_matrices
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.select import select_triangles
+from lyra_petsc.mesh.topology import Hinges, hinges, unique_edges
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve
 from lyra_petsc.scene.schema import Scene
 
 
@@ -79,6 +78,11 @@ class RestShape:
         corners = self.mesh.triangles.ravel()
         lumped = np.bincount(corners, weights=shares, minlength=self.mesh.n_vertices)
         return np.asarray(lumped, dtype=np.float64)
+
+    @cached_property
+    def edges(self) -> NDArray[np.int64]:
+        """Vertices (N, 2) of all edges, the smaller first: what `Elements.edges` refers to."""
+        return unique_edges(self.mesh.triangles)
 
     @cached_property
     def hinges(self) -> Hinges:

@@ -8,20 +8,37 @@ and fades becomes such a spring while it fades.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.handles.motion import Motion, Window, motion_of
-from lyra_petsc.meshing.select import select_vertices
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Pulling
+from lyra_petsc.terms.term import Pulling, Step
 
 Array = NDArray[np.float64]
 
 ORIGINAL_STIFFNESS = 1000.0
 """[N/m], of the original program; what a fading exact handle takes."""
+
+
+class Springs(NamedTuple):
+    """Springs in one step.
+
+    Attributes
+    ----------
+    target : (E, 3)
+        Where they pull to [m].
+    stiffness : (E, 3)
+        Per axis [N/m]; 0 where they do not act.
+    """
+
+    target: Array
+    stiffness: Array
 
 
 class Spring(Pulling):
@@ -34,52 +51,48 @@ class Spring(Pulling):
     handles : mapping of handle number → (Motion, Window, only while fading)
     """
 
-    name = "spring"
-    damped = False
-
     def __init__(self, elements: Elements, handles: dict[int, tuple[Motion, Window, bool]]) -> None:
         super().__init__(elements)
         self._handle = elements.data["handle"].astype(np.int64)
         self._handles = handles
-        self._start = np.zeros((self.n_elements, 3))
-        self._target = np.zeros((self.n_elements, 3))
-        self._k = np.zeros((self.n_elements, 3))
 
-    def begin(self, time: float, x: Array) -> None:
-        for number, (_, window, _) in self._handles.items():
-            if window.start == time:
-                mine = self._handle == number
-                self._start[mine] = x[self.stencil[mine, 0]]
+    @property
+    def reference_rows(self) -> NDArray[np.int64]:
+        return self.stencil[:, 0].astype(np.int64)
 
-    def prepare(self, t0: float, t1: float, at: float) -> None:
+    def freeze(self, step: Step) -> Springs:
+        target, stiffness = np.zeros((self.n_elements, 3)), np.zeros((self.n_elements, 3))
         for number, (motion, window, fading_only) in self._handles.items():
             mine = self._handle == number
-            strength = 0.0 if fading_only and window.holds(t0, t1) else window.strength(t0, t1, at)
-            self._k[mine] = strength * self.elements.data["stiffness"][mine]
+            holds = window.holds(step.start, step.end)
+            strength = 0.0 if fading_only and holds else window.strength(step.start, step.end, step.at)
             if strength > 0.0:
-                self._target[mine] = motion.carried(self._start[mine], window.start, at)
+                stiffness[mine] = strength * self.elements.data["stiffness"][mine]
+                start = step.reference(window.start, self.stencil[mine, 0].astype(np.int64))
+                target[mine] = motion.carried(start, window.start, step.at)
+        return Springs(target, stiffness)
 
-    def _pull(self, x: Array) -> Array:
-        change: Array = x[self.stencil[:, 0]] - self._target
+    def _pull(self, x: Array, frozen: Springs) -> Array:
+        change: Array = x[self.stencil[:, 0]] - frozen.target
         return change
 
-    def energies(self, x: Array) -> Array:
-        energy: Array = 0.5 * (self._k * self._pull(x) ** 2).sum(axis=1)[: self.n_owned]
+    def energies(self, x: Array, frozen: Springs) -> Array:
+        energy: Array = 0.5 * (frozen.stiffness * self._pull(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
         return energy
 
-    def handle_forces(self, x: Array, count: int) -> Array:
+    def handle_forces(self, x: Array, frozen: Springs, count: int) -> Array:
         forces = np.zeros((count, 3))
         n = self.n_owned
-        np.add.at(forces, self._handle[:n], -(self._k * self._pull(x))[:n])
+        np.add.at(forces, self._handle[:n], -(frozen.stiffness * self._pull(x, frozen))[:n])
         return forces
 
-    def add_gradient(self, x: Array, out: Array) -> None:
-        np.add.at(out, self.stencil[:, 0], self._k * self._pull(x))
+    def add_gradient(self, x: Array, frozen: Springs, out: Array) -> None:
+        np.add.at(out, self.stencil[:, 0], frozen.stiffness * self._pull(x, frozen))
 
-    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: Springs, lo: int, hi: int, blend: float, out: Array) -> None:
         out[:] = 0.0
         for axis in range(3):
-            out[:, 0, 0, axis, axis] = self._k[lo:hi, axis]
+            out[:, 0, 0, axis, axis] = frozen.stiffness[lo:hi, axis]
 
     def force_scale(self, size: float) -> Array:
         # of the full stiffness: the scale is asked for before the first step

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.kernel import kernel
+from lyra_petsc.kernels.element import kernel
 
 Array = NDArray[np.float64]
 

@@ -1,77 +1,189 @@
 """What every term offers: pure functions on arrays. It knows neither PETSc, MPI nor files.
 
-Arrays over the points of a rank (owned first, then ghosts) have shape (n_local, 3). Gradients are
-added to all points of a stencil; what lands on ghosts is never read, since each rank has every
-element that touches a point it owns.
+Arrays over the block rows of a rank (owned first, then ghosts) have shape (n_local, 3): vertex positions,
+and the unknowns of edges, three to a row (`lyra_petsc.mesh.points.Layout`). Gradients are added to all rows
+of a stencil; what lands on ghosts is never read, since each rank has every element that touches a row it
+owns.
+
+What stays as it is during a step (targets of handles, frozen normals) a term returns from ``freeze`` and is
+given back with every call, so that no result depends on the order of calls.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
+from lyra_petsc.mesh.elements import Elements
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.registry import Registration
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
-Couplings = Mapping[str, NDArray[np.int32]]
+
+CHUNK_VALUES = 32_768
+"""Scalars of element Hessians computed before they are added to the matrix: they stay in cache."""
+
+
+class Across(NamedTuple):
+    """Pairs of rows (E, 2) of which only the coupling of one with the other is stored."""
+
+    stencil: NDArray[np.int32]
+
+
+Coupling = NDArray[np.int32] | Across
+Couplings = Mapping[str, Coupling]
+"""Rows (E, n) that the element Hessians couple, by the names of their offsets in a pattern."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a term may know of a step before it is computed.
+
+    Attributes
+    ----------
+    start, end : float
+        [s]
+    at : float
+        Time [s] at which moving targets shall stand: that of the integrator's stage.
+    x : (n_local, 3)
+        Positions [m] whose geometry stays as it is during the step.
+    reference : callable
+        Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time: where handles that
+        begin then set out from.
+    """
+
+    start: float
+    end: float
+    at: float
+    x: Array
+    reference: Callable[[float, Ints], Array]
 
 
 class Term(ABC):
-    """A sum over elements; ``name`` as in the registry."""
+    """A sum over elements; what it is to the rest of the program stands in its registration.
 
-    name: ClassVar[str]
+    Attributes
+    ----------
+    stencil : (E, n) int32
+        Vertices of each element, local rows.
+    edges : (E, m) int64 or None
+        Places of the edge unknowns of each element in the flat form of arrays over local rows.
+    n_elements, n_owned : int
+        E, and how many of them this rank counts (energies); those come first.
+    """
+
+    registration: Registration
 
     def __init__(self, elements: Elements) -> None:
+        self.take(elements)
+
+    def take(self, elements: Elements) -> None:
+        """Work on these elements from here on."""
         self.elements = elements.once("damping")
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
+        self.edges = None if elements.edges is None else np.ascontiguousarray(elements.edges, dtype=np.int64)
         self.n_elements = len(self.stencil)
         self.n_owned = elements.n_owned
 
     @property
-    def couplings(self) -> Couplings:
-        """Stencils (E, n) whose points the Hessians couple, by the names of their offsets in a pattern."""
-        return {self.name: self.stencil}
+    def name(self) -> str:
+        """As in the registry."""
+        return self.registration.name
 
-    def offsets_of_elements(self, offsets: Mapping[str, Offsets]) -> Offsets:
-        """Where in block rows the ``hessians`` go, (E, n (n + 1) / 2)."""
-        return offsets[self.name]
+    @property
+    def couplings(self) -> Couplings:
+        """What the Hessians couple."""
+        if self.edges is None:
+            return {self.name: self.stencil}
+        rows = (self.edges // 3).astype(np.int32)
+        return {self.name: np.ascontiguousarray(np.concatenate([self.stencil, rows], axis=1))}
+
+    @property
+    def reference_rows(self) -> Ints:
+        """Local rows (n,) whose positions at the start of handles ``freeze`` asks for."""
+        return np.empty(0, dtype=np.int64)
+
+    def freeze(self, step: Step) -> Any:
+        """What stays as it is during the step; every call in the step gets it as ``frozen``."""
+        return None
+
+    def _scatter(
+        self,
+        fill: Callable[[int, int, Array], None],
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+    ) -> None:
+        """Add weight (E,) × element Hessians to block rows; ``fill`` computes those of elements lo..hi."""
+        at, n = offsets[self.name], self.stencil.shape[1]
+        m = 0 if self.edges is None else self.edges.shape[1]
+        shape = (n, n, 3, 3) if self.edges is None else (3 * n + m, 3 * n + m)
+        chunk = max(1, CHUNK_VALUES // int(np.prod(shape)))
+        buffer = np.empty((min(chunk, self.n_elements), *shape))
+        for lo in range(0, self.n_elements, chunk):
+            hi = min(lo + chunk, self.n_elements)
+            blocks = buffer[: hi - lo]
+            fill(lo, hi, blocks)
+            if self.edges is None:
+                add_elements(weight[lo:hi], blocks, at[lo:hi], values)
+            else:
+                places = self.stencil[lo:hi], self.edges[lo:hi]
+                add_mixed_elements(weight[lo:hi], blocks, *places, at[lo:hi], values)
 
 
 class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
-    #: whether stiffness-proportional damping acts through this term
-    damped: ClassVar[bool] = True
+    search_distance: float = 0.0
+    """Distance [m] within which ``neighbours`` looks for elements; 0 where stencils never change."""
+
+    skin: float = 0.0
+    """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
 
     @abstractmethod
-    def energies(self, x: Array) -> Array:
+    def energies(self, x: Array, frozen: Any) -> Array:
         """Energy [J] of each owned element, (n_owned,)."""
 
     @abstractmethod
-    def add_gradient(self, x: Array, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
         """Add the gradient [N] to ``out`` (n_local, 3)."""
 
-    @abstractmethod
-    def hessians(self, x: Array, lo: int, hi: int, blend: float, out: Array) -> None:
-        """Hessian blocks [N/m] of elements lo..hi into ``out`` (hi − lo, n, n, 3, 3).
+    def hessians(self, x: Array, frozen: Any, lo: int, hi: int, blend: float, out: Array) -> None:
+        """Hessians [N/m] of elements lo..hi into ``out``; what a term has that does not add them itself.
 
-        ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one.
+        ``blend`` 0 gives the exact one, 1 the regularised, positive-semidefinite one, and what lies between
+        their mixture. ``out`` is (hi − lo, n, n, 3, 3), where elements couple edges (hi − lo, 3 n + m, 3 n +
+        m): the coordinates of the vertices, then the unknowns of the edges.
         """
+        raise NotImplementedError
 
-    def add_hessians(
-        self, x: Array, blend: float, weight: Array, offsets: Mapping[str, Offsets], values: Array
-    ) -> bool:
-        """Add weight (E,) × Hessian blocks [N/m] to block rows (n_blocks, 3, 3) at once; whether it did.
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: Any,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        before: Array | None = None,
+    ) -> None:
+        """Add weight (E,) × element Hessians [N/m] to block rows (n_blocks, 3, 3).
 
-        ``offsets`` are a pattern's, by the names of ``couplings``. What a term cannot add so goes by
-        ``hessians`` and ``offsets_of_elements``.
+        ``offsets`` are a pattern's, by the names of ``couplings``. ``before`` (n_local, 3) is the Newton
+        iterate before x: an exact Hessian may take the stress that its linearised strain predicts at x.
         """
-        return False
+        self._scatter(
+            lambda lo, hi, out: self.hessians(x, frozen, lo, hi, blend, out), weight, offsets, values
+        )
 
     @abstractmethod
     def force_scale(self, size: float) -> Array:
@@ -80,24 +192,42 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
-    def linearise_from(self, y: Array | None) -> None:
-        """Let exact Hessians at x have the stress that y's linearised strain predicts there; None: x's own.
+    # -- terms whose stencils change ---------------------------------------------------------------
 
-        ``y`` (n_local, 3) is the Newton iterate before x.
+    def neighbours(self, x: Array, numbers: Ints) -> NDArray[np.int64]:
+        """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
+
+        ``numbers`` (N,) are the points' global numbers. Ranks that see the same points must name them in the
+        same order within an element; the owner of the first counts it.
         """
+        raise NotImplementedError
 
-    def begin(self, time: float, x: Array) -> None:
-        """Take the shape x (n_local, 3) from which what starts to act at ``time`` [s] sets out."""
+    def largest_step(self, x: Array, way: Array, frozen: Any) -> float:
+        """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
+        return 1.0
 
-    def prepare(self, t0: float, t1: float, at: float) -> None:
-        """Let moving targets stand where they are at time ``at`` of the step from t0 to t1 [s]."""
+    # -- state and history -------------------------------------------------------------------------
+
+    def accept(self, x: Array, frozen: Any) -> None:
+        """The step to positions x (n_local, 3) is accepted; for terms that have a state."""
+
+    def state(self) -> dict[str, Array]:
+        """What a checkpoint must hold, by the registration's names: (n_vertices, 3) of owned vertices."""
+        return {}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """Go on with a state."""
+
+    def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
+        """This rank's part of each further column of history.csv that the registration names."""
+        return {}
 
 
 class Pulling(Elastic):
     """An elastic term by which handles pull."""
 
     @abstractmethod
-    def handle_forces(self, x: Array, count: int) -> Array:
+    def handle_forces(self, x: Array, frozen: Any, count: int) -> Array:
         """Force [N] of each of a scene's handles on this rank's elements, (count, 3)."""
 
 
@@ -105,31 +235,23 @@ class Viscous(Term):
     """A potential of the velocities, with the geometry frozen at the start of the step."""
 
     @abstractmethod
-    def freeze(self, x: Array, v: Array) -> None:
-        """Take the geometry from the positions (n_local, 3) at the start of the step."""
-
-    @abstractmethod
-    def potentials(self, v: Array) -> Array:
+    def potentials(self, v: Array, frozen: Any) -> Array:
         """Potential [W] of each owned element, (n_owned,); its gradient is minus the force."""
 
     @abstractmethod
-    def add_gradient(self, v: Array, out: Array) -> None:
+    def add_gradient(self, v: Array, frozen: Any, out: Array) -> None:
         """Add the gradient with respect to velocity [N] to ``out``."""
 
     @abstractmethod
-    def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
-        """Hessian blocks [N s/m] with respect to velocity into ``out`` (hi − lo, n, n, 3, 3)."""
-
-    def add_hessians(self, v: Array, offsets: Mapping[str, Offsets], values: Array) -> bool:
-        """Add Hessian blocks [N s/m] to block rows as `Elastic.add_hessians` does; whether it did."""
-        return False
+    def add_hessian(self, v: Array, frozen: Any, offsets: Mapping[str, Offsets], values: Array) -> None:
+        """Add Hessians [N s/m] with respect to velocity to block rows (n_blocks, 3, 3)."""
 
 
 class Load(Term):
     """A force that does not change within a step."""
 
-    #: whether it depends on the positions at the start of the step
     follows: ClassVar[bool] = False
+    """Whether it depends on the positions at the start of the step."""
 
     @abstractmethod
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:

@@ -17,13 +17,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.block_rows.scatter import fetch_ahead
-from lyra_petsc.block_rows.vectors import add_outer
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.scatter import fetch_ahead
+from lyra_petsc.kernels.vectors import add_outer
+from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.kernel import kernel
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, Viscous
+from lyra_petsc.terms.term import Offsets, Step, Viscous
 
 Array = NDArray[np.float64]
 
@@ -89,23 +89,8 @@ def _slopes(v, s, e, area, n, wind, density, drag):  # type: ignore[no-untyped-d
 
 
 @kernel()
-def hessians(v, s, lo, hi, area, n, wind, density, drag, out):  # type: ignore[no-untyped-def]
-    """Hessian blocks [N s/m] of triangles lo..hi into out (hi − lo, 3, 3, 3, 3)."""
-    for e in range(lo, hi):
-        along, across = _slopes(v, s, e, area, n, wind, density, drag)
-        for i in range(3):
-            for j in range(3):
-                value = along * n[e, i] * n[e, j]
-                if i == j:
-                    value += across
-                for a in range(3):
-                    for b in range(3):
-                        out[e - lo, a, b, i, j] = value
-
-
-@kernel()
-def add_hessians(v, s, area, n, wind, density, drag, offsets, values):  # type: ignore[no-untyped-def]
-    """Add the blocks of ``hessians`` to the block rows, where ``offsets`` say."""
+def add_hessian(v, s, area, n, wind, density, drag, offsets, values):  # type: ignore[no-untyped-def]
+    """Add Hessian blocks [N s/m] to the block rows, where ``offsets`` say."""
     for e in range(s.shape[0]):
         fetch_ahead(e, offsets, values, 6)
         along, across = _slopes(v, s, e, area, n, wind, density, drag)
@@ -129,31 +114,27 @@ class Wind(Viscous):
         [kg/(m² s)]
     """
 
-    name = "wind"
-
     def __init__(self, elements: Elements, velocity: Array, density: float, drag: float) -> None:
         super().__init__(elements)
         self._area = elements.data["area"]
-        self._normals = np.zeros((self.n_elements, 3))
         self._law = (np.asarray(velocity, dtype=np.float64), float(density), float(drag))
 
-    def freeze(self, x: Array, v: Array) -> None:
-        normals(x, self.stencil, self._normals)
-
-    def potentials(self, v: Array) -> Array:
-        out = np.empty(self.n_owned)
-        potentials(v, self.stencil, self._area, self._normals, *self._law, out)
+    def freeze(self, step: Step) -> Array:
+        """Unit normals (E, 3)."""
+        out = np.empty((self.n_elements, 3))
+        normals(step.x, self.stencil, out)
         return out
 
-    def add_gradient(self, v: Array, out: Array) -> None:
-        add_gradient(v, self.stencil, self._area, self._normals, *self._law, out)
+    def potentials(self, v: Array, frozen: Array) -> Array:
+        out = np.empty(self.n_owned)
+        potentials(v, self.stencil, self._area, frozen, *self._law, out)
+        return out
 
-    def hessians(self, v: Array, lo: int, hi: int, out: Array) -> None:
-        hessians(v, self.stencil, lo, hi, self._area, self._normals, *self._law, out)
+    def add_gradient(self, v: Array, frozen: Array, out: Array) -> None:
+        add_gradient(v, self.stencil, self._area, frozen, *self._law, out)
 
-    def add_hessians(self, v: Array, offsets: Mapping[str, Offsets], values: Array) -> bool:
-        add_hessians(v, self.stencil, self._area, self._normals, *self._law, offsets[self.name], values)
-        return True
+    def add_hessian(self, v: Array, frozen: Array, offsets: Mapping[str, Offsets], values: Array) -> None:
+        add_hessian(v, self.stencil, self._area, frozen, *self._law, offsets[self.name], values)
 
 
 def elements(rest: RestShape) -> Elements:

@@ -16,10 +16,10 @@ from peers import parse
 from processes import Failed, Limits
 from tables import document
 
+from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.study.launch import find_launcher
 
 DEFAULT = {"vertices": [1024, 10201, 50176], "weak": 25_000, "output": 200_000}
 QUICK = {"vertices": [1024, 4900], "weak": 2_500, "output": 10_201}

@@ -17,10 +17,9 @@ from peers import measure_peer
 from processes import Limits, measure, run
 from tables import growth
 
-from lyra_petsc.errors import InputError
-from lyra_petsc.nearest import nearest
-from lyra_petsc.solvers.presets import PRESETS
-from lyra_petsc.study.launch import find_launcher
+from lyra_petsc.api.mpirun import find_launcher
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.linear.presets import PRESETS
 
 __all__ = ["METHODS", "growth", "square_number"]
 

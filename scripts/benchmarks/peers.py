@@ -18,8 +18,8 @@ from cases import CLOTH, DAMPING, GRAVITY, STEP, corners, hanging_square
 from processes import Limits, Spent, run
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.materials.tables import ClothTable, entries
-from lyra_petsc.meshing.build import build_mesh
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.scene.materials.library import ClothTable, entries
 from lyra_petsc.scene.schema import Scene
 
 OBJ_FILE = "square.obj"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lyra_petsc.study.launch import environment, find_launcher
+from lyra_petsc.api.mpirun import environment, find_launcher
 
 GRACE = 10.0
 """Seconds [s] that a process gets to leave before it is killed."""

@@ -16,13 +16,11 @@ import click
 from pydantic_core import PydanticUndefined
 
 from lyra_petsc.cli.verbs import verbs
-from lyra_petsc.materials.tables import ClothTable, entries, names
-from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.control import FIELDS
-from lyra_petsc.scene.describe import attributes, summary
-from lyra_petsc.scene.schema import Scene
-from lyra_petsc.solvers.options import Value
-from lyra_petsc.solvers.presets import DIRECT_UNTIL, PRESETS
+from lyra_petsc.linear.petsc_options import Value
+from lyra_petsc.linear.presets import DIRECT_UNTIL, PRESETS
+from lyra_petsc.scene.block import Block, attributes, summary
+from lyra_petsc.scene.materials.library import ClothTable, entries, names
+from lyra_petsc.scene.schema import FIELDS, Scene
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "reference"
@@ -35,10 +33,12 @@ OPTIONS = {
     "ts_adapt_dt_min": "Smallest Δt [s], of steps of automatic length and of repeated ones.",
     "ts_adapt_dt_max": "Largest Δt [s] of steps of automatic length.",
     "ts_alpha_radius": "Spectral radius of `alpha2` instead of `time.spectral_radius`.",
-    "ts_type": "Refused: choose `time.integrator`.",
-    "ts_adapt_type": "Refused but for `none`: the steps are controlled by `time.tolerance`.",
-    "ts_theta_endpoint": "Refused: it has no meaning for the reduced form.",
-    "ts_theta_theta": "Refused: it has no meaning for the reduced form.",
+    "ts_type": "Integrator instead of `time.integrator`: `beuler`, `theta`, `bdf`, `alpha2`.",
+    "ts_theta_theta": "With `-ts_type theta`: 0.5 is `midpoint`, 1 is `beuler`.",
+    "ts_bdf_order": "With `-ts_type bdf`: 2.",
+    "ts_adapt_type": "`none`: fixed steps; `basic`: steps by `time.tolerance` (1e-3).",
+    "ts_theta_endpoint": "Refused: it has no meaning for the stage equations.",
+    "vec_type": "Type of every vector.",
     "snes_max_it": "Newton iterations of a step instead of `solver.max_iterations`.",
     "snes_rtol": "Relative residual at which a step stops, where given, before `solver` says so.",
     "snes_atol": "Residual [N] at which a step stops, likewise.",
@@ -49,15 +49,16 @@ OPTIONS = {
     "ksp_max_it": "Iterations of a linear solve (5000).",
     "ksp_type": "Krylov method (`cg`: the systems are symmetric).",
     "ksp_norm_type": "Norm in which a linear solve converges (`unpreconditioned` for methods that can).",
-    "snes_lag_preconditioner": "How often the preconditioner is set up (1: for each matrix); with another "
-    "number incomplete factors have a matrix of their own.",
     "pc_type": "Preconditioner; replaces the named linear solvers below, and nothing takes over from it.",
     "pc_python_type": "Class of `-pc_type python`; without it the program's own multigrid.",
     "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on three are visited twice in a cycle "
     "(1: the next coarser than the mesh; without it none).",
     "pc_mg_levels": "Most levels of multigrid (`-pc_type python`, `mg`), on coarse meshes of the program's.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
-    "mat_type": "Storage of the matrix: `aij`, `baij`, `sbaij`; by default as the preconditioner needs.",
+    "mat_type": "Type of the operator and of what the preconditioner is built from: `aij`, `baij`, `sbaij`. "
+    "By default the operator is block rows of the program's (`python`), the other as the preconditioner "
+    "needs.",
+    "mg_coarse_mat_type": "Type of the matrix of multigrid's coarsest level (`aij`).",
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
     "without any of "
     "these `average`.",
@@ -87,7 +88,7 @@ _DEFAULTS = {
     ("Time", "tolerance"): "1e-3",
     ("Time", "spectral_radius"): "0.5",
     ("Handle", "until"): "end",
-    ("Load", "until"): "end",
+    ("AppliedLoad", "until"): "end",
 }
 """Defaults that depend on other keys."""
 
@@ -119,7 +120,7 @@ def scene_page() -> str:
         + _listed(name for name in names() if isinstance(entries()[name], ClothTable))
         + ".\n\nEngineering materials: "
         + _listed(name for name in names() if not isinstance(entries()[name], ClothTable))
-        + ".\n\nTheir numbers are in `lyra_petsc/materials/`.",
+        + ".\n\nTheir numbers are in `lyra_petsc/scene/materials/`.",
         "## Names of `output.fields`",
         _listed(FIELDS) + ".",
     ]

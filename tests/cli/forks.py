@@ -8,6 +8,8 @@ and ends in no other way.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import importlib
 import json
 import os
@@ -18,8 +20,31 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 
-EARLY = ("cli.app", "kernel_cache", "scene.load", "scene.dump")
+EARLY = ("cli.app", "kernels.cache", "scene.load", "scene.dump")
 """Modules that take long to load, and know nothing of MPI."""
+
+DRAWING = (
+    "jinja2",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_svg",
+    "scipy.spatial",
+    "scipy.special",
+)
+"""What verbs that write a report take longest to load."""
+
+REPORTING = ("report", "stress", "study", "verify")
+
+
+def load(*modules: str) -> None:
+    """Import modules, where they are installed, for all processes that are forked from now on."""
+    if set(modules) <= set(sys.modules):
+        return
+    for module in modules:
+        with contextlib.suppress(ModuleNotFoundError):
+            importlib.import_module(module)
+    # a third of a forked process's time went into copies of what the collector looked at as it ended
+    gc.collect()
+    gc.freeze()
 
 
 def become(asked: dict[str, Any], out: int, err: int) -> None:
@@ -52,6 +77,8 @@ def serve() -> None:
     """Fork for each line; returns in the forked processes alone."""
     for line in sys.stdin:
         asked = json.loads(line)
+        if asked["arguments"][:1] and asked["arguments"][0] in REPORTING:
+            load(*DRAWING)
         (out, to_out), (err, to_err) = os.pipe(), os.pipe()
         pid = os.fork()
         if pid == 0:
@@ -67,8 +94,7 @@ def serve() -> None:
     os._exit(0)
 
 
-for room in EARLY:
-    importlib.import_module(f"lyra_petsc.{room}")
+load(*(f"lyra_petsc.{name}" for name in EARLY))
 assert not {"mpi4py.MPI", "petsc4py.PETSc"} & set(sys.modules)
 serve()
 

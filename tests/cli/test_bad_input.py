@@ -89,6 +89,16 @@ Path(sys.argv[1], f"left-{MPI.COMM_WORLD.rank}.json").write_text(json.dumps(left
 """
 
 
+QUICK = (
+    "unknown key",
+    "missing mesh",
+    "unknown group",
+    "no number for PETSc",
+    "folder in use",
+    "runn scene.yaml",
+)
+"""One mistake of each kind: in the scene, its files and its mesh, PETSc's options, ours, and the verb."""
+
 Listing = dict[Path, int]
 
 
@@ -120,7 +130,9 @@ def test_every_case_makes_a_mistake() -> None:
     assert all(change is None or change[0] in SCENE for change, _, _ in CASES.values())
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.quick) if name in QUICK else name for name in MISTAKES]
+)
 def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
     before = listing(tmp_path)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.cli import info as module
-from lyra_petsc.cli.fit import Facts, misfits
 from lyra_petsc.cli.info import info, launched_ranks
+from lyra_petsc.cli.installation_checks import Installation, misfits
 
 
 def test_names_the_versions_in_use(comm):
@@ -58,19 +58,19 @@ def test_a_broken_part_is_told_in_one_line(comm, monkeypatch):
 
 
 def test_all_fits_when_nothing_is_wrong():
-    facts = Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
+    facts = Installation(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=2, petsc=(3, 18, 5))
     assert misfits(facts) == []
 
 
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
-        (Facts(ranks=1, launched=4), "started 4 ranks but each of them sees 1"),
-        (Facts(mpi_libraries=("/a/libmpi.so.12", "/b/libmpi.so.40")), "Two MPI libraries"),
-        (Facts(petsc=(3, 17, 4)), "PETSc 3.17.4 is too old: 3.18"),
-        (Facts(petsc=(3, 20, 0), complex_scalars=True), "complex scalars"),
-        (Facts(ranks=2, launched=2, ranks_per_host={"a": 2}, cores=4, threads="4"), "OMP_NUM_THREADS=4"),
-        (Facts(missing=["numba"]), "numba is missing: pip install numba"),
+        (Installation(ranks=1, launched=4), "started 4 ranks but each of them sees 1"),
+        (Installation(mpi_libraries=("/a/libmpi.so.12", "/b/libmpi.so.40")), "Two MPI libraries"),
+        (Installation(petsc=(3, 17, 4)), "PETSc 3.17.4 is too old: 3.18"),
+        (Installation(petsc=(3, 20, 0), complex_scalars=True), "complex scalars"),
+        (Installation(ranks_per_host={"a": 2}, cores=4, threads="4"), "OMP_NUM_THREADS=4"),
+        (Installation(missing=["numba"]), "numba is missing: pip install numba"),
     ],
 )
 def test_each_misfit_is_one_line(facts, words):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from launch import ROOT, done, lyra
 
-from lyra_petsc.scene.json_schema import SCHEMA_FILE
+from lyra_petsc.scene.json_schema import FILE
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_yaml
@@ -38,13 +38,15 @@ def uncommented(text: str) -> str:
 
 
 def test_the_starter_runs_as_it_stands(tmp_path: Path) -> None:
-    left = done(["new", "kite"], tmp_path)
+    left = done(["new", "kite"], tmp_path, extra={"XDG_CACHE_HOME": str(tmp_path)})
     assert "kite.yaml written" in left.out
     done(["check", "kite.yaml"], tmp_path)
     done(["run", "kite.yaml", *SHORT, "--out", "kite"], tmp_path, ranks=2)
     assert (tmp_path / "kite" / "states.xdmf").is_file()
     text = (tmp_path / "kite.yaml").read_text(encoding="utf-8")
-    assert text.startswith(f"# yaml-language-server: $schema={SCHEMA_FILE}\n")
+    schema = tmp_path / "lyra_petsc" / FILE
+    assert text.startswith(f"# yaml-language-server: $schema={schema}\n")
+    assert schema.is_file()
 
 
 def test_what_it_offers_in_comments_is_right_too(tmp_path: Path) -> None:

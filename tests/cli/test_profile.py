@@ -24,8 +24,9 @@ def column(folder: Path, name: str) -> list[int]:
         return [int(row[name]) for row in csv.DictReader(file)]
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint"])
+@pytest.mark.parametrize(
+    ("integrator", "ranks"), [("beuler", 1), ("semi-implicit", 1), ("midpoint", 1), ("beuler", 2)]
+)
 def test_stages_and_events(tmp_path: Path, integrator: str, ranks: int) -> None:
     scene = write_scene(tmp_path, SCENE.replace("step: 0.01}", f"step: 0.01, integrator: {integrator}}}"))
     left = done(["run", scene, "--out", "out", "-log_view"], tmp_path, ranks)
@@ -45,8 +46,8 @@ def test_stages_and_events(tmp_path: Path, integrator: str, ranks: int) -> None:
 def test_stages_are_balanced_when_exceptions_pass(tmp_path: Path) -> None:
     program = """
 from petsc4py import PETSc
-from lyra_petsc.output.phases import Phases
-from lyra_petsc.profiling import STAGES, logged
+from lyra_petsc.phases import Phases
+from lyra_petsc.phases import STAGES, logged
 PETSc.Log.begin()
 
 @logged("Marker")

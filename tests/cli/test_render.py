@@ -6,17 +6,17 @@ import io
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
-import numpy as np
 import pytest
 from launch import SCENE, lyra, start, write_scene
 from mpi4py import MPI
 from written_run import Writer, written
 
-from lyra_petsc.cli.render import FrameProgress
+from lyra_petsc.cli.progress import FrameProgress
 from lyra_petsc.errors import InputError
-from lyra_petsc.render.paraview import SCRIPT, write_script
-from lyra_petsc.render.plan import Asked, make_plan
+from lyra_petsc.show.render.paraview_script import SCRIPT, write_script
+from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
 
 MISTAKES = [
     ({"at": "5"}, "--at: 5 s is outside the run, whose states go from 0 to 0.2 s"),
@@ -60,7 +60,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(options, words, tmp_path, monk
     (tmp_path / "text.png").write_text("no picture")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match=words) as caught:
-        make_plan(Asked(**{"run": Path("run"), **options}))
+        make_plan(RenderOptions(**{"run": Path("run"), **options}))
     assert "\n" not in str(caught.value)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -128,10 +128,10 @@ def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
     writer = Writer(tmp_path / "run")
     for _ in range(3):
         writer.write()
-    plan = make_plan(Asked(tmp_path / "run"))
+    plan = make_plan(RenderOptions(tmp_path / "run"))
     assert plan.states == [0, 1, 2]
     writer.write()
-    assert make_plan(Asked(tmp_path / "run")).states == [0, 1, 2, 3]
+    assert make_plan(RenderOptions(tmp_path / "run")).states == [0, 1, 2, 3]
 
 
 def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
@@ -170,40 +170,11 @@ def test_the_script_for_paraview_is_python_and_names_what_is_there(tmp_path, fie
     path = write_script(written(tmp_path / "run with 'quotes'", fields=fields))
     text = path.read_text(encoding="utf-8")
     tree = compile(text, str(path), "exec")
-    # with ParaView's functions replaced by ones that note their calls
-    calls: list[tuple[str, tuple, dict]] = []
-    monkeypatch.setitem(sys.modules, "paraview", SimpleNamespace(simple=_Recorder(calls)))
+    simple = MagicMock()  # stands for ParaView's functions
+    simple.GenerateSurfaceNormals().PointData = simple.SurfaceNormals().PointData = {"velocity": None}
+    monkeypatch.setitem(sys.modules, "paraview", SimpleNamespace(simple=simple))
     exec(tree, {"__file__": str(path)})
-    reader = next(keywords for name, _, keywords in calls if name == "Xdmf3ReaderS")
-    assert reader["FileName"] == [str(path.parent / "states.xdmf")]
-    colour = next(arguments for name, arguments, _ in calls if name == "ColorBy")[1]
+    assert simple.Xdmf3ReaderS.call_args.kwargs["FileName"] == [str(path.parent / "states.xdmf")]
+    colour = simple.ColorBy.call_args.args[1]
     assert colour == (("POINTS", "velocity", "Magnitude") if fields else None)
-    assert np.array_equal(
-        next(k for n, _, k in calls if n == "Calculator")["registrationName"], "displacement"
-    )
-
-
-class _Thing:
-    """Stands for whatever ParaView returns."""
-
-    TimestepValues = (0.0, 0.1)
-    CameraFocalPoint = (0.0, 0.0, 0.0)
-
-    def __getattr__(self, name: str) -> object:
-        if name == "PointData":
-            return {"velocity": None}
-        return lambda *arguments, **keywords: _Thing()
-
-
-class _Recorder:
-    """Stands for paraview.simple."""
-
-    def __init__(self, calls: list) -> None:
-        self._calls = calls
-
-    def __getattr__(self, name: str) -> object:
-        def call(*arguments: object, **keywords: object) -> _Thing:
-            self._calls.append((name, arguments, keywords))
-            return _Thing()
-
-        return call
+    assert simple.Calculator.call_args.kwargs["registrationName"] == "displacement"

@@ -20,6 +20,8 @@ from launch import SCENE, command, done, environment, write_scene
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.scene.load import load_scene
 
+pytestmark = pytest.mark.quick
+
 ALL_FIELDS = "[velocity, green_strain, stress, membrane_energy, bending_energy, curvature, rank]"
 FULL = SCENE.replace("{every: 0.02}", "{every: 0.02, reactions: true, fields: " + ALL_FIELDS + "}")
 FULL += "probes: {corner: {nodes: [20]}, edge: {nodes: [20, 24]}}\n"

@@ -29,6 +29,9 @@ probes: {middle: {nodes: [24]}}
 """
 
 
+HALF = ("--set", "time.end=0.4")
+
+
 def history(folder: Path, name: str = "history.csv") -> list[dict[str, str]]:
     with (folder / name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
@@ -68,10 +71,17 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "whole"
 
 
-def equal_runs(left: Path, whole: Path) -> None:
+@pytest.fixture(scope="module")
+def first_half(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("half")
+    done(["run", write_scene(folder, LONG), "--out", "half", *HALF, *DIRECT], folder)
+    return folder / "half"
+
+
+def equal_runs(left: Path, whole: Path, end: float = 0.8) -> None:
     """Same last state, and each step, probe and reaction once."""
     (time_a, a), (time_b, b) = final_state(left), final_state(whole)
-    assert time_a == time_b == pytest.approx(0.8, abs=1e-12)
+    assert time_a == time_b == pytest.approx(end, abs=1e-12)
     np.testing.assert_allclose(a, b, atol=1e-9)
     for name in ("history.csv", "probes.csv", "reactions.csv"):
         steps = [int(row["step"]) for row in history(left, name)]
@@ -117,16 +127,16 @@ def test_a_killed_run_goes_on_from_its_newest_checkpoint(tmp_path: Path, uninter
     equal_runs(tmp_path / "out", uninterrupted)
 
 
-@pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 3), (3, 1)])
+@pytest.mark.parametrize(("before", "after"), [pytest.param(1, 2, marks=pytest.mark.quick), (2, 3), (3, 1)])
 def test_goes_on_with_another_number_of_ranks(
-    tmp_path: Path, uninterrupted: Path, before: int, after: int
+    tmp_path: Path, first_half: Path, before: int, after: int
 ) -> None:
     scene = write_scene(tmp_path, LONG)
     direct = [*DIRECT, "-pc_factor_mat_solver_type", "mumps"]
-    done(["run", scene, "--out", "out", "-ts_max_steps", "61", *direct], tmp_path, before)
+    done(["run", scene, "--out", "out", "-ts_max_steps", "61", *HALF, *direct], tmp_path, before)
     assert len(history(tmp_path / "out")) == 62
-    done(["run", scene, "--out", "out", "--resume", *direct], tmp_path, after)
-    equal_runs(tmp_path / "out", uninterrupted)
+    done(["run", scene, "--out", "out", "--resume", *HALF, *direct], tmp_path, after)
+    equal_runs(tmp_path / "out", first_half, 0.4)
     assert json.loads((tmp_path / "out/summary.json").read_text())["ranks"] == after
 
 
@@ -163,9 +173,9 @@ sys.exit(run_command_line(sys.argv))
 @pytest.mark.parametrize(
     ("module", "name", "after"),
     [
-        ("simulation", "build_model", 0),
-        ("stepping.system", "ReducedSystem.residual", 7),
-        ("stepping.system", "ReducedSystem.jacobian", 3),
+        ("stepping.simulation", "build_model", 0),
+        ("stepping.stage_equations", "StageEquations.residual", 7),
+        ("stepping.stage_equations", "StageEquations.jacobian", 3),
     ],
     ids=str,
 )

@@ -9,8 +9,8 @@ import pytest
 from launch import done, write_scene
 from vtkhdf_reader import read
 
-from lyra_petsc.results.run import Run
-from lyra_petsc.scene.control import FIELDS
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.scene.schema import FIELDS
 
 ON = ["--set", "output.vtkhdf=true", "--set", f"output.fields=[{', '.join(FIELDS)}]"]
 

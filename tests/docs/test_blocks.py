@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -163,6 +164,20 @@ def test_verbs_and_options_that_are_named_exist(page: Path) -> None:
                 pytest.fail(f"{shown(page)}: {command}: {error.format_message()}")
             except click.UsageError:  # a verb by itself is named, or a script's variables stand for words
                 pass
+
+
+NAMED = re.compile(
+    r"`((?:lyra_petsc|tests|scripts|configs|scene|mesh|terms|linear|stepping|output|api|show|experiments|cli"
+    r"|kernels)/[\w/]*(?:\.py)?)`"
+)
+
+
+def test_files_that_are_named_exist() -> None:
+    """Paths from the checkout, or below the package."""
+    for page in PAGES:
+        for name in NAMED.findall(page.read_text(encoding="utf-8")):
+            places = ROOT / name, ROOT / "lyra_petsc" / name
+            assert any(place.exists() for place in places), f"{shown(page)}: {name}"
 
 
 def test_the_blocks_are_found() -> None:

@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 
 from lyra_petsc.cli.verbs import verbs
-from lyra_petsc.solvers.presets import PRESETS
+from lyra_petsc.linear.presets import PRESETS
 
 ROOT = Path(__file__).parents[2]
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
@@ -47,10 +47,9 @@ def test_every_verb_and_linear_solver_is_there(reference: ModuleType) -> None:
     assert all(f"`{name}`" in petsc for name in PRESETS)
 
 
-def test_readme_has_a_row_for_every_verb() -> None:
+def test_readme_names_every_verb() -> None:
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    missing = [name for name in verbs.commands if not re.search(rf"^\| `{name}\b", readme, re.MULTILINE)]
-    assert missing == []
+    assert [name for name in verbs.commands if f"`{name}`" not in readme] == []
 
 
 def test_links_of_the_readme_lead_somewhere() -> None:

@@ -7,6 +7,7 @@ a signal, a warning of numpy's, CPU time or memory without end, more than one li
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import resource
@@ -119,7 +120,7 @@ def warm(folder: Path) -> None:
     scene.write_text(WARM)
     from lyra_petsc.cli.app import run_command_line
 
-    for module in ("scene.original", "meshing.obj", "meshing.msh", "meshing.geo"):
+    for module in ("scene.original", "mesh.obj_file", "mesh.msh_file", "mesh.geo_file"):
         importlib.import_module(f"lyra_petsc.{module}")
     with (
         (folder / "warm.txt").open("w") as words,
@@ -130,6 +131,8 @@ def warm(folder: Path) -> None:
             out = str(folder / f"warm-{integrator}")
             arguments = ["run", str(scene), "--set", f"time.integrator={integrator}", "--out", out]
             assert run_command_line(["lyra-petsc", *arguments]) == 0
+    gc.collect()
+    gc.freeze()  # else the collector of each forked process has all of it copied
 
 
 def judge(case: Case, folder: Path) -> Outcome:
@@ -203,7 +206,7 @@ def _run(case: Case) -> int:
     from petsc4py import PETSc
 
     from lyra_petsc.cli.app import run_command_line
-    from lyra_petsc.meshing import geo
+    from lyra_petsc.mesh import geo_file as geo
 
     os.environ["LYRA_TRACEBACK"] = "1"
     geo.SCRIPT_SECONDS, geo.MESH_SECONDS = 2, 3

@@ -23,29 +23,41 @@ from odd_values import (
 )
 from text_damage import damaged
 
-from lyra_petsc.scene.control import FIELDS, INTEGRATORS
 from lyra_petsc.scene.schema import (
+    FIELDS,
+    INTEGRATORS,
+    AppliedLoad,
     Grid,
     Handle,
     Initial,
     Keyframe,
-    Load,
     Material,
-    Membrane,
+    MembraneStiffness,
     MeshSource,
     Output,
     Scene,
     Solver,
     Time,
     Transform,
-    Wind,
+    UniformWind,
 )
 
 ROOT = Path(__file__).parents[2]
 KEYS = sorted(
     {
         key
-        for block in (Scene, MeshSource, Grid, Transform, Material, Membrane, Wind, Handle, Keyframe, Load)
+        for block in (
+            Scene,
+            MeshSource,
+            Grid,
+            Transform,
+            Material,
+            MembraneStiffness,
+            UniformWind,
+            Handle,
+            Keyframe,
+            AppliedLoad,
+        )
         + (Initial, Time, Output, Solver)
         for key in block.keys()  # noqa: SIM118
     }

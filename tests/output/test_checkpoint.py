@@ -8,7 +8,7 @@ from lyra_petsc.output.checkpoint import CHECKPOINT, NEXT, PREVIOUS, checkpoint_
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.ordering import FileOrder
 
-pytestmark = pytest.mark.parallel
+pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 
 N = 101
 X = np.random.default_rng(3).normal(size=(N, 3))

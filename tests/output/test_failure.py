@@ -10,11 +10,18 @@ from mpi4py import MPI
 from test_states import announced, on_first
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.meshing.mesh import Mesh
-from lyra_petsc.output.failure import DATA_FILE, TEXT_FILE, XDMF_FILE, Moment, remove_failure, write_failure
-from lyra_petsc.output.folder import RESULT
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output.failure_files import (
+    DATA_FILE,
+    TEXT_FILE,
+    XDMF_FILE,
+    Moment,
+    remove_failure,
+    write_failure,
+)
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.run_folder import RESULT
 
 pytestmark = pytest.mark.parallel
 

@@ -4,9 +4,7 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.claim import Claim
-from lyra_petsc.output.folder import choose
-from lyra_petsc.output.lock import LOCK_FILE, Busy, FolderLock
+from lyra_petsc.output.run_folder import LOCK_FILE, Busy, FolderLock, RunDirectory, choose
 
 pytestmark = pytest.mark.parallel
 
@@ -30,13 +28,13 @@ def here(comm, shared_tmp, monkeypatch):
 
 def create(comm, choice, *names):
     """The folder of a run that begins, leaves files of these names, and ends."""
-    with Claim(comm, choice) as claim:
-        claim.clear()
+    with RunDirectory(comm, choice) as directory:
+        directory.clean()
         if comm.rank == 0:
             for name in names:
-                (claim.path / name).write_text("x")
+                (directory.path / name).write_text("x")
     comm.Barrier()
-    return claim.path
+    return directory.path
 
 
 def test_default_folder_is_the_first_free_one_and_choosing_touches_nothing(comm, here):
@@ -141,8 +139,8 @@ def test_no_permission(comm, here, monkeypatch):
 
 def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
     here("mine/notes.txt")
-    with Claim(comm, choose(comm, "flag", "mine/deep/out")) as claim:
-        assert claim.path.is_dir()
+    with RunDirectory(comm, choose(comm, "flag", "mine/deep/out")) as directory:
+        assert directory.path.is_dir()
         comm.Barrier()  # one rank takes it away again
     comm.Barrier()
     assert os.listdir("mine") == ["notes.txt"]
@@ -154,21 +152,21 @@ def test_a_run_that_writes_nothing_leaves_nothing(comm, here):
 @pytest.mark.parametrize("way", [{}, {"force": True}, {"resume": True}], ids=str)
 def test_a_second_run_into_a_folder_is_refused(comm, here, way):
     here("out/checkpoint.h5")
-    with Claim(comm, choose(comm, "flag", "out", force=True)):
+    with RunDirectory(comm, choose(comm, "flag", "out", force=True)):
         with pytest.raises(InputError, match=r"another run is at work|exists; name another") as caught:
-            Claim(comm, choose(comm, "flag", "out", **way))
+            RunDirectory(comm, choose(comm, "flag", "out", **way))
         assert "\n" not in str(caught.value)
     comm.Barrier()
     assert os.listdir("out") == ["checkpoint.h5"]
 
 
 def test_a_second_run_is_refused_while_the_first_sets_up(comm, here):
-    with Claim(comm, choose(comm, "flag", "out")):
+    with RunDirectory(comm, choose(comm, "flag", "out")):
         for _ in range(2):
             with pytest.raises(
                 InputError, match=rf"another run.*process {os.getpid() if comm.size == 1 else ''}"
             ):
-                Claim(comm, choose(comm, "flag", "out"))
+                RunDirectory(comm, choose(comm, "flag", "out"))
         comm.Barrier()
         assert create(comm, choose(comm, "flag")) == Path("runs/flag")
     comm.Barrier()
@@ -177,7 +175,7 @@ def test_a_second_run_is_refused_while_the_first_sets_up(comm, here):
 
 def test_two_runs_without_a_name_get_two_folders(comm, here):
     both = [choose(comm, "flag"), choose(comm, "flag")]
-    with Claim(comm, both[0]) as first, Claim(comm, both[1]) as second:
+    with RunDirectory(comm, both[0]) as first, RunDirectory(comm, both[1]) as second:
         assert (first.path.name, second.path.name) == ("flag", "flag-2")
 
 
@@ -198,8 +196,8 @@ def test_a_file_system_without_locks_is_said(comm, here, monkeypatch):
         raise OSError(95, "Operation not supported")
 
     monkeypatch.setattr("fcntl.flock", refuse)
-    with Claim(comm, choose(comm, "flag", "out")) as claim:
-        assert "no locks" in claim.note
+    with RunDirectory(comm, choose(comm, "flag", "out")) as directory:
+        assert "no locks" in directory.note
     comm.Barrier()
 
 

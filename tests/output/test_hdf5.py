@@ -6,7 +6,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output import slabs
+from lyra_petsc.output import hdf5
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.ordering import FileOrder
@@ -22,8 +22,8 @@ WAYS = {"one machine": "_write_alone", "MPI-IO": "_write_through_mpi", "in turn"
 @pytest.fixture(params=WAYS)
 def way(request, monkeypatch):
     """How slabs are written, with the name of the function that does it."""
-    monkeypatch.setattr(slabs, "on_one_machine", lambda comm: request.param == "one machine")
-    monkeypatch.setenv(slabs.TURNS_VARIABLE, "1" if request.param == "in turn" else "0")
+    monkeypatch.setattr(hdf5, "on_one_machine", lambda comm: request.param == "one machine")
+    monkeypatch.setenv(hdf5.TURNS_VARIABLE, "1" if request.param == "in turn" else "0")
     return WAYS[request.param]
 
 
@@ -46,13 +46,13 @@ def everything(path):
 def test_the_way_under_test_is_the_one_taken(comm, shared_tmp, way, monkeypatch):
     taken = set()
     for name in WAYS.values():
-        work = getattr(slabs, name)
+        work = getattr(hdf5, name)
 
         def noted(*given, work=work, name=name, **keywords):
             taken.add(name)
             return work(*given, **keywords)
 
-        monkeypatch.setattr(slabs, name, noted)
+        monkeypatch.setattr(hdf5, name, noted)
     write_collective([NewFile(shared_tmp / "a.h5", {"x": slab_of(comm, whole(10))}, {})], comm)
     assert taken == {way}
 
@@ -64,8 +64,8 @@ def test_ranks_take_turns_where_mpi_io_opens_nothing(comm, shared_tmp, monkeypat
             raise MPI.Exception(MPI.ERR_FILE)
 
     x = whole(10)
-    monkeypatch.setattr(slabs, "on_one_machine", lambda comm: False)
-    monkeypatch.setattr(slabs.MPI, "File", Closed)
+    monkeypatch.setattr(hdf5, "on_one_machine", lambda comm: False)
+    monkeypatch.setattr(hdf5.MPI, "File", Closed)
     write_collective([NewFile(shared_tmp / "a.h5", {"x": slab_of(comm, x)}, {})], comm)
     np.testing.assert_array_equal(everything(shared_tmp / "a.h5")["x"], x)
 
@@ -134,14 +134,14 @@ def test_a_failed_write_on_one_rank_leaves_the_old_file(comm, shared_tmp, way, m
     path = shared_tmp / "a.h5"
     write_collective([NewFile(path, {"x": slab_of(comm, whole(4))}, {})], comm)
     name = "_write_rows_together" if way == "_write_through_mpi" else "_write_rows"
-    right = getattr(slabs, name)
+    right = getattr(hdf5, name)
 
     def write_and_fail(*arguments):
         right(*arguments)
         if comm.rank == comm.size - 1:
             raise OSError(errno.ENOSPC, "as the library words it")
 
-    monkeypatch.setattr(slabs, name, write_and_fail)
+    monkeypatch.setattr(hdf5, name, write_and_fail)
     with pytest.raises(OutputError, match=r"a\.h5: cannot be written: No space left on device"):
         write_collective(
             [NewFile(path, {"x": slab_of(comm, whole(100)), "y": slab_of(comm, whole(7))}, {})], comm

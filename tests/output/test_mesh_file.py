@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.meshing.mesh import Group, Mesh
-from lyra_petsc.output.mesh_file import MESH_FILE, check_same_mesh, write_mesh
+from lyra_petsc.mesh.mesh import Group, Mesh
+from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
+from lyra_petsc.output.xdmf import MESH_FILE
 
 pytestmark = pytest.mark.parallel
 

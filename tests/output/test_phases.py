@@ -1,6 +1,6 @@
 import pytest
 
-from lyra_petsc.output.phases import Phases
+from lyra_petsc.phases import Phases
 
 
 class Clock:

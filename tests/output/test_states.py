@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.meshing.mesh import Mesh
-from lyra_petsc.output import slabs
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.output import hdf5
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import XDMF_FILE, StateWriter
+from lyra_petsc.output.states import StateWriter
+from lyra_petsc.output.xdmf import XDMF_FILE
 
-pytestmark = pytest.mark.parallel
+pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 
 h5py = import_h5py()
 
@@ -90,7 +91,7 @@ def on_first(comm, check):
 
 @pytest.mark.parametrize("one_machine", [True, False])
 def test_states_read_back_as_a_time_series(comm, shared_tmp, monkeypatch, one_machine):
-    monkeypatch.setattr("lyra_petsc.output.slabs.on_one_machine", lambda comm: one_machine)
+    monkeypatch.setattr("lyra_petsc.output.hdf5.on_one_machine", lambda comm: one_machine)
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     run = Run(comm, shared_tmp)
     assert [run.write(step) for step in (0, 4, 9)] == [0, 1, 2]
@@ -152,14 +153,14 @@ def test_a_state_cut_short_is_never_announced(comm, shared_tmp, monkeypatch):
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     run = Run(comm, shared_tmp)
     run.write(0)
-    write_rows = slabs._write_rows
+    write_rows = hdf5._write_rows
 
     def write_and_fail(*arguments):
         write_rows(*arguments)
         raise OSError(28, "disk full")
 
     with monkeypatch.context() as broken:
-        broken.setattr(slabs, "_write_rows", write_and_fail)
+        broken.setattr(hdf5, "_write_rows", write_and_fail)
         with pytest.raises(OutputError, match=r"states-0001\.h5: cannot be written: No space left"):
             run.write(1)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0]))

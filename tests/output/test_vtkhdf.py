@@ -11,7 +11,7 @@ from lyra_petsc.output import states as states_module
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter, state_files
-from lyra_petsc.output.vtkhdf import CELLS_FILE, VTKHDF_FILE
+from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE
 
 pytestmark = pytest.mark.parallel
 

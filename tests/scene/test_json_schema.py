@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from test_scene_mistakes import CASES, scene_text
 
-from lyra_petsc.scene.json_schema import SCHEMA_FILE, schema_text
+from lyra_petsc.scene.json_schema import schema_file, schema_text
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_yaml
 
@@ -35,7 +35,7 @@ BEYOND_SCHEMA = (
 
 @pytest.fixture(scope="module")
 def validator() -> Any:
-    schema = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
+    schema = json.loads(schema_text())
     jsonschema.Draft7Validator.check_schema(schema)
     return jsonschema.Draft7Validator(schema)
 
@@ -60,10 +60,16 @@ def judgement(validator: Any, data: Any) -> str:
     return "accepted" if valid else f"too strict: {next(validator.iter_errors(data)).message}: {data}"
 
 
-def test_the_file_in_the_package_is_up_to_date() -> None:
-    assert SCHEMA_FILE.read_text(encoding="utf-8") == schema_text(), (
-        "run: python -m lyra_petsc.scene.json_schema"
-    )
+def test_the_file_for_editors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path = schema_file()
+    assert path.parent == tmp_path / "cache" / "lyra_petsc"
+    assert path.read_text(encoding="utf-8") == schema_text()
+    path.write_text("of an older checkout", encoding="utf-8")
+    assert schema_file().read_text(encoding="utf-8") == schema_text()
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert schema_file() == Path("scene.schema.json")
 
 
 def test_every_key_is_described() -> None:

@@ -10,6 +10,8 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.load import load_scene
 
+pytestmark = pytest.mark.quick
+
 GRID = "mesh: {grid: {width: 1, height: 1, nx: 2, ny: 2}}"
 BASE = {"mesh": GRID, "material": "material: {cloth: paper}", "time": "time: {end: 1, step: 0.01}"}
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from physics import reference
 
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[2]
 ANSWERS = reference("paper")

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = ("drape", "flag", "paper", "plate", "sail", "spin", "swing")

@@ -14,11 +14,11 @@ from peers import write_files, write_scene
 from processes import Failed, run
 from tables import COLUMNS, document, exponent, growth, number, spread
 
-from lyra_petsc.materials.library import resolve
-from lyra_petsc.meshing.build import build_mesh
+from lyra_petsc.api.mpirun import environment
+from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.materials.library import resolve
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.study.launch import environment
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
-from lyra_petsc.simulation import Simulation
-from lyra_petsc.stepping.control import ToleranceControl
+from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.step_control import ToleranceControl
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import pytest
 from petsc4py import PETSc
 from physics import grid, scene_of
 
-from lyra_petsc.stepping.advice import Circumstances, advice, trouble
-from lyra_petsc.stepping.diagnosis import Diagnosis, Triangle, Vertex
-from lyra_petsc.stepping.trace import Iteration, Stuck
+from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
+from lyra_petsc.stepping.failure_diagnosis import Diagnosis, Triangle, Vertex
+from lyra_petsc.stepping.newton_trace import Iteration, Stuck
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason

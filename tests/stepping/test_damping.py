@@ -19,13 +19,13 @@ MATERIAL = {
 def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.model.system
-        damping, blocks = system._damping, system._blocks
+        damping, blocks = system._damping, system.discretisation.rows
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
-        damping.freeze(x)
+        damping.freeze(x, system.frozen)
         expected, found = blocks.zeros(), blocks.zeros()
         damping.into(expected, diagonal := 1.0 + np.arange(len(system.mass)))
         for term in system.elastic:
-            blocks.add_stiffness(term, x, 1.0, 0.3, expected)
+            blocks.add_stiffness(term, x, system.frozen[term], 1.0, 0.3, expected)
         none = np.empty(0, dtype=np.int64)
         if damping.with_stiffness_into(x, 0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
@@ -42,8 +42,8 @@ def test_two_factors_are_no_multiple() -> None:
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.model.system
-        system._damping.freeze(system.x)
-        values = system._blocks.zeros()
+        system._damping.freeze(system.x, system.frozen)
+        values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
         assert not system._damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
 
@@ -52,12 +52,12 @@ def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> 
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.model.system
         v = np.cos(5.0 * system.x)
-        system._damping.freeze(system.x)
+        system._damping.freeze(system.x, system.frozen)
         once = system._damping.product(v)
         np.testing.assert_array_equal(system._damping.product(v), once)
         assert not system._damping.product(0.0 * v).any()
         np.testing.assert_allclose(system._damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
-        system._damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]))
+        system._damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.frozen)
         assert np.abs(system._damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
 
 
@@ -74,12 +74,14 @@ def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None
         system = simulation.model.system
         for _ in range(3):
             simulation.step(0.01)
-        matrix = simulation.stepper.matrix.rows.copy()
+        matrix = simulation.stepper.linear.operator.rows.copy()
         damping, v = system._damping, np.cos(3.0 * system.x)
         found = damping.product(v)
         assert (damping._values is None) == (damping._multiple is not None)
         assert damping._multiple is not None or comm.size > 1
-        assert np.array_equal(matrix, simulation.stepper.matrix.rows)  # as a lagged Jacobian needs it
+        assert np.array_equal(
+            matrix, simulation.stepper.linear.operator.rows
+        )  # as a lagged Jacobian needs it
         system.forget_rows()
         damping.product.forget()
         expected = damping.product(v)
@@ -95,8 +97,8 @@ def test_rows_that_become_another_matrix_are_let_go() -> None:
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.model.system
-        damping, rows, none = system._damping, system._blocks.zeros(), np.empty(0, dtype=np.int64)
-        damping.freeze(system.x)
+        damping, rows, none = system._damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
+        damping.freeze(system.x, system.frozen)
         assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)
         once = damping.product(v := np.cos(3.0 * system.x))
         damping.into(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may

@@ -15,10 +15,10 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.simulation import Simulation
 from lyra_petsc.stepping import equilibrium
-from lyra_petsc.stepping.diagnosis import worst
-from lyra_petsc.stepping.failure import Failure
+from lyra_petsc.stepping.failure_diagnosis import worst
+from lyra_petsc.stepping.failure_report import Failure
+from lyra_petsc.stepping.simulation import Simulation
 
 pytestmark = pytest.mark.parallel
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from physics import CLOTH, Simulation, grid, rotation
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.handles.motion import Motion, Window, motion_of
-from lyra_petsc.scene.forcing import Keyframe
+from lyra_petsc.scene.schema import Keyframe
+from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.spring import Spring
 
 Array = NDArray[np.float64]
@@ -278,7 +278,7 @@ def test_a_fading_handle_weakens_as_the_fourth_power_and_then_is_gone(soft: bool
             simulation.step(DT)
             t = step * DT
             block = np.empty((1, 1, 1, 3, 3))
-            spring.hessians(simulation.system.x, 0, 1, 0.0, block)
+            spring.hessians(simulation.system.x, simulation.system.frozen[spring], 0, 1, 0.0, block)
             share = 1.0 if t <= 0.1 + 1e-12 else max(0.0, 1.0 - (t - 0.1) / 0.2) ** 4
             if not soft and t <= 0.1 + 1e-12:
                 share = 0.0  # held exactly: no spring yet

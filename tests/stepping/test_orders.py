@@ -12,7 +12,7 @@ from physics import Simulation, grid
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 END = 0.16
 
@@ -49,7 +49,9 @@ def at_end(integrator: str, steps: int, comm: MPI.Comm, **time: float) -> Array:
         return simulation.run(END / steps, steps)
 
 
-@pytest.mark.parametrize("integrator", ORDERS)
+@pytest.mark.parametrize(
+    "integrator", [name if name != "bdf2" else pytest.param(name, marks=pytest.mark.quick) for name in ORDERS]
+)
 def test_observed_order(integrator: str, comm: MPI.Comm) -> None:
     shapes = [at_end(integrator, steps, comm) for steps in (40, 80, 160)]
     first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     return x, rejected
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "alpha2", "bdf2"])
 def test_a_failed_step_is_repeated_and_does_no_harm(integrator: str, comm: MPI.Comm) -> None:
     smooth, none = journey(integrator, 0.004, comm)

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 pytestmark = pytest.mark.parallel
 

@@ -11,9 +11,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import CLOTH, Simulation, equilateral, grid
 
-from lyra_petsc.scene.control import INTEGRATORS
-from lyra_petsc.stepping.schemes.alpha2 import GeneralisedAlpha
-from lyra_petsc.stepping.schemes.bdf2 import Bdf2
+from lyra_petsc.scene.schema import INTEGRATORS
+from lyra_petsc.stepping.integrators.alpha2 import GeneralisedAlpha
+from lyra_petsc.stepping.integrators.bdf2 import Bdf2
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def test_handles_are_where_their_motion_says(integrator: str, comm: MPI.Comm) ->
         held = simulation.system.held
         points = simulation.model.points
         goal = start[points.original].copy()
-        held.targets(simulation.time, simulation.time, simulation.time, goal)
+        simulation.system.prescribed.targets(simulation.time, simulation.time, simulation.time, goal)
         for number in held.active(simulation.time, simulation.time):
             rows = held.vertices(number)
             np.testing.assert_allclose(simulation.system.x[rows], goal[rows], rtol=0, atol=1e-14)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
+from oracle import blocks_of, gradient, summed
 from physics import CLOTH, Simulation, grid
 
-from lyra_petsc.stepping.system import ReducedSystem
-from lyra_petsc.terms.term import Elastic, Load, Viscous
+from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
 
@@ -29,40 +29,22 @@ SPRINGS = {"handles": [{"nodes": [0, 2], "stiffness": 1000.0}]}
 HELD = {"handles": [{"nodes": [0, 2]}, {"nodes": [6], "axes": ["z"]}]}
 
 
-def dense_stiffness(term: Elastic, x: Array) -> Array:
-    """Regularised stiffness (3V, 3V) [N/m] at x."""
-    k = term.stencil.shape[1]
-    blocks = np.empty((term.n_elements, k, k, 3, 3))
-    term.hessians(x, 0, term.n_elements, 1.0, blocks)
-    out = np.zeros((len(x), 3, len(x), 3))
-    for stencil, block in zip(term.stencil, blocks, strict=True):
-        for a, i in enumerate(stencil):
-            for b, j in enumerate(stencil):
-                out[i, :, j, :] += block[a, b]
-    return out.reshape(3 * len(x), 3 * len(x))
-
-
-def paper_step(system: ReducedSystem, dt: float) -> Array:
+def paper_step(system: StageEquations, dt: float) -> Array:
     """Velocity (V, 3) after a step: (M + Δt (Δt + γ) K⁺ + Δt² k) v = M v_n + Δt f(x_n, v_n)."""
     x, v_old = system.x, system.v
     system.begin_step(0.0, dt)
     mass = np.repeat(system.mass, 3)
     a, force = np.diag(mass), np.zeros_like(x)
     for term in system.elastic:
-        gradient = np.zeros_like(x)
-        term.add_gradient(x, gradient)
-        force -= gradient
+        frozen = system.frozen[term]
+        force -= gradient(term, x, frozen)
         damping = GAMMA if term.name != "spring" else 0.0
-        a += dt * (dt + damping) * dense_stiffness(term, x)
+        stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
+        a += dt * (dt + damping) * stiffness.reshape(len(a), len(a))
     for load in system.loads:
-        assert isinstance(load, Load)
         load.add_force(x, 0.0, dt, force)
     for wind in system.viscous:
-        assert isinstance(wind, Viscous)
-        push = np.zeros_like(x)
-        wind.freeze(x, v_old)
-        wind.add_gradient(v_old, push)
-        force -= push
+        force -= gradient(wind, v_old, system.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()
     free = ~system.prescribed.mask.ravel()
     v = np.zeros(len(b))

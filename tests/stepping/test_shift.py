@@ -10,11 +10,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
-from lyra_petsc import profiling
-from lyra_petsc.simulation import Simulation
-from lyra_petsc.solvers.presets import INCOMPLETE
-from lyra_petsc.stepping import shift
-from lyra_petsc.stepping.shift import LARGEST, LEAST, Shift
+from lyra_petsc import phases as profiling
+from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
+from lyra_petsc.linear.presets import INCOMPLETE
+from lyra_petsc.stepping import diagonal_shift as shift
+from lyra_petsc.stepping.diagonal_shift import LARGEST, LEAST, DiagonalShift
+from lyra_petsc.stepping.simulation import Simulation
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
 """Positive definite, while its incomplete factors are not (Kershaw, J. Comput. Phys. 26, 1978, 43-65)."""
@@ -49,7 +50,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
     ksp, preconditioner = solver("ilu")
     b, y = preconditioner.createVecs()
     b.setArray([1.0, 2.0, -1.0, 3.0])
-    growing = Shift(ksp, acts=True)
+    growing = DiagonalShift(ksp, acts=True)
     assert growing.value == LEAST
     tries = 0
     while True:
@@ -75,7 +76,7 @@ def test_it_rises_until_there_are_factors_and_comes_down_again() -> None:
 @pytest.mark.parametrize(("kind", "acts"), [("ilu", False), ("jacobi", True)])
 def test_nothing_is_enlarged_where_it_has_no_sense(kind: str, acts: bool) -> None:
     ksp, _ = solver(kind)
-    idle = Shift(ksp, acts=acts)
+    idle = DiagonalShift(ksp, acts=acts)
     assert idle.value == 0.0
     assert not idle.raise_()
 
@@ -102,7 +103,7 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
     assert (notes, preset) == ([], incomplete)
     if comm.size == 1:
         monkeypatch.setattr(shift, "LEAST", 0.0)
-        monkeypatch.setattr(Shift, "raise_", lambda self: False)
+        monkeypatch.setattr(DiagonalShift, "raise_", lambda self: False)
         other, notes, preset = journey(comm, "semi-implicit")
         assert preset != "ilu"
         assert "linear solver 'ilu' broke down" in notes[0]
@@ -136,7 +137,9 @@ def test_factors_are_made_once_a_step_of_the_jacobian_itself(comm: MPI.Comm, lag
     try:
         simulation = Simulation(comm, scene_of(scene))
         assert simulation.stepper.preset in INCOMPLETE
-        assert (simulation.stepper.preconditioner is simulation.stepper.matrix) == (not lag)
+        linear = simulation.stepper.linear
+        assert isinstance(linear.operator, BlockMatrix)
+        assert isinstance(linear.preconditioner, AssembledMatrix)
         before = made.getPerfInfo(stage)["count"]
         for _ in range(4):
             simulation.step()

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.simulation import Simulation
+from lyra_petsc.stepping.simulation import Simulation
 
 Array = NDArray[np.float64]
 

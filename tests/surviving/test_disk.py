@@ -13,7 +13,7 @@ from leftovers import ENDLESS, SHEET, announced, ranks_in, steps, wait_for_state
 
 LIMITED = """
 import resource, sys
-import lyra_petsc.recorder as recorder
+import lyra_petsc.output.recorder as recorder
 from lyra_petsc.cli.app import run_command_line
 from lyra_petsc.output.history import History
 

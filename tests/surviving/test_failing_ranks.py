@@ -47,13 +47,13 @@ sys.exit(run_command_line(sys.argv))
 """
 
 PLACES = {
-    "meshing": ("model", "build_mesh", 0),
-    "distributing": ("model", "distribute", 0),
-    "assembly": ("model", "BlockPattern", 0),
-    "residual": ("stepping.system", "ReducedSystem.residual", 25),
-    "jacobian": ("stepping.system", "ReducedSystem.jacobian", 9),
+    "meshing": ("stepping.problem", "build_mesh", 0),
+    "distributing": ("stepping.problem", "distribute", 0),
+    "assembly": ("linear.discretisation", "BlockPattern", 0),
+    "residual": ("stepping.stage_equations", "StageEquations.residual", 25),
+    "jacobian": ("stepping.stage_equations", "StageEquations.jacobian", 9),
     "writing a state": ("output.hdf5", "write_slabs", 3),
-    "a row of the history": ("recorder", "Recorder._write_row", 4),
+    "a row of the history": ("output.recorder", "Recorder._write_row", 4),
 }
 
 

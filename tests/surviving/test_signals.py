@@ -17,7 +17,7 @@ from leftovers import ENDLESS, announced, ranks_in, steps, wait_for_states
 SLOW_STEPS = """
 import os, sys, time
 from pathlib import Path
-import lyra_petsc.simulation as simulation
+import lyra_petsc.stepping.simulation as simulation
 from lyra_petsc.cli.app import run_command_line
 
 step = simulation.Simulation.step

@@ -14,7 +14,7 @@ from leftovers import ENDLESS, SHEET, announced, wait_for_states
 SLOW_SET_UP = """
 import sys, time
 from pathlib import Path
-import lyra_petsc.model as model
+import lyra_petsc.stepping.problem as model
 from lyra_petsc.cli.app import run_command_line
 
 build = model.build_mesh

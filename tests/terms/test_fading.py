@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from oracle import bending_blocks, summed
+from oracle import gradient as gradient_of
+from oracle import hessian as hessian_of
 
-from lyra_petsc.handles.motion import STILL, Window
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.clamp import Clamp
 from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
-from lyra_petsc.terms.term import Elastic
+from lyra_petsc.terms.motion import STILL, Window
+from lyra_petsc.terms.registry import registered
+from lyra_petsc.terms.term import Elastic, Step
 
 Array = NDArray[np.float64]
 
@@ -49,7 +54,9 @@ def bending(part_of_limit: float = 1.0) -> Bending:
         "rest_height": np.array([1.0]),
         "places": np.array([[2.0, 2.0]]),
     }
-    return Bending(Elements(np.array([[0, 1, 2, 3]]), data))
+    term = Bending(Elements(np.array([[0, 1, 2, 3]]), data))
+    term.registration = registered("bending")
+    return term
 
 
 def clamp() -> Clamp:
@@ -61,29 +68,38 @@ def clamp() -> Clamp:
         "handle": np.array([0.0]),
     }
     term = Clamp(Elements(np.array([[0, 1, 2]]), data), {0: (STILL, Window(0.0, np.inf))})
-    turned = hinge(1.0, 1.0)
-    turned[2] += [0.1, 0.0, 0.5]
-    term.begin(0.0, turned)
-    term.prepare(0.0, 1.0, 1.0)
+    term.registration = registered("clamp")
     return term
 
 
-def total(term: Elastic) -> Callable[[Array], float]:
-    return lambda x: float(term.energies(x).sum())
+def turned() -> Array:
+    """Where the clamp sets out from."""
+    x = hinge(1.0, 1.0)
+    x[2] += [0.1, 0.0, 0.5]
+    return x
 
 
-def gradient(term: Elastic, x: Array) -> Array:
-    out = np.zeros_like(x)
-    term.add_gradient(x, out)
-    return out
+def frozen(term: Elastic, start: Array | None = None) -> Any:
+    """What a clamp that sets out from ``start`` freezes; nothing of a hinge."""
+    x = turned() if start is None else start
+    return term.freeze(Step(0.0, 1.0, 1.0, x, lambda time, rows: x[rows]))
 
 
-def hessian(term: Elastic, x: Array, blend: float = 0.0) -> Array:
+def total(term: Elastic, start: Array | None = None) -> Callable[[Array], float]:
+    return lambda x: float(term.energies(x, frozen(term, start)).sum())
+
+
+def gradient(term: Elastic, x: Array, start: Array | None = None) -> Array:
+    return gradient_of(term, x, frozen(term, start))
+
+
+def hessian(term: Elastic, x: Array, blend: float = 0.0, start: Array | None = None) -> Array:
     """(3 n, 3 n) of the single element."""
-    n = term.stencil.shape[1]
-    out = np.full((1, n, n, 3, 3), np.nan)
-    term.hessians(x, 0, 1, blend, out)
-    return np.asarray(out[0].transpose(0, 2, 1, 3).reshape(3 * n, 3 * n))
+    n = 3 * term.stencil.shape[1]
+    whole = hessian_of(term, x, frozen(term, start), blend).reshape(x.size, x.size)
+    assert not whole[n:].any()
+    assert not whole[:, n:].any()
+    return whole[:n, :n]
 
 
 def differences(f: Callable[[Array], Array | float], x: Array, n: int, h: float) -> Array:
@@ -142,6 +158,14 @@ def test_regularised_hessian_while_it_fades(make: Callable[[], Elastic], left: t
     assert np.abs(values[:-1]).max() <= 1e-12 * values[-1]
 
 
+@every_case
+@pytest.mark.parametrize("blend", [0.0, 0.3, 1.0])
+def test_hessian_is_that_of_four_points(left: tuple[float, float], blend: float) -> None:
+    term, x = bending(), hinge(*left)
+    plain = summed(term.stencil, bending_blocks(term, x, blend), 4).reshape(12, 12)
+    np.testing.assert_allclose(hessian(term, x, blend), plain, rtol=0.0, atol=1e-13 * np.abs(plain).max())
+
+
 def test_the_energy_is_the_angle_s_times_what_is_left() -> None:
     term = bending()
     k, rest = 0.7, -0.4
@@ -168,7 +192,7 @@ def test_nothing_fades_before(left: float) -> None:
     term, x = bending(), hinge(left, 0.5)
     full = bending(0.0)
     assert term.weights(x)[0] == 1.0
-    np.testing.assert_array_equal(term.energies(x), full.energies(x))
+    np.testing.assert_array_equal(term.energies(x, None), full.energies(x, None))
     np.testing.assert_array_equal(gradient(term, x), gradient(full, x))
     for blend in (0.0, 0.4, 1.0):
         np.testing.assert_array_equal(hessian(term, x, blend), hessian(full, x, blend))
@@ -243,18 +267,15 @@ def test_forces_of_a_fading_hinge_balance() -> None:
 
 def test_a_clamp_may_set_out_from_an_edge_without_length() -> None:
     term, x = clamp(), flattened()["no edge"]
-    term.begin(0.0, x)
-    term.prepare(0.0, 1.0, 1.0)
-    assert total(term)(x) == 0.0
-    assert not gradient(term, x).any()
-    assert not hessian(term, x).any()
+    assert total(term, x)(x) == 0.0
+    assert not gradient(term, x, x).any()
+    assert not hessian(term, x, start=x).any()
 
 
 def test_the_rigid_mirror_of_a_clamp_does_not_fade() -> None:
     term = clamp()
     full, small = hinge(1.0, 1.0), hinge(1.0, 1.0)
     small[2] = hinge(0.02, 1.0)[2]
-    term.begin(0.0, small)  # a mirror image of 2 % of the rest area
-    term.prepare(0.0, 1.0, 1.0)
     change = 0.7 * (0.0 - -0.4) ** 2
-    assert total(term)(full) == pytest.approx(change, rel=1e-12)
+    # a mirror image of 2 % of the rest area
+    assert total(term, small)(full) == pytest.approx(change, rel=1e-12)

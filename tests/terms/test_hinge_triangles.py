@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from oracle import bending_blocks, expanded, gradient, summed
 
-from lyra_petsc.assembly.blocks import BlockRows
-from lyra_petsc.assembly.pattern import BlockPattern
-from lyra_petsc.meshing.topology import hinges
-from lyra_petsc.partition.elements import Elements
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.hinge_triangles import triangles_of
+from lyra_petsc.terms.registry import registered
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -81,18 +82,24 @@ def bending(name: str, limit: float = 0.0) -> Bending:
         "places": places.astype(np.float64),
         "damping": np.zeros(n),
     }
-    return Bending(Elements(stencil.astype(np.int32), data))
+    return made(Elements(stencil.astype(np.int32), data))
+
+
+def made(elements: Elements) -> Bending:
+    term = Bending(elements)
+    term.registration = registered("bending")
+    return term
 
 
 def alone(name: str, limit: float = 0.0) -> list[Bending]:
     """A term for each hinge of ``bending``."""
     (stencil, places), data = SHEETS[name], bending(name, limit).elements.data
-    made = []
+    found = []
     for row, points in enumerate(stencil):
         own = {key: values[row : row + 1] for key, values in data.items()}
         own |= {"limit": np.full((1, 2), limit), "places": places[row : row + 1].astype(np.float64)}
-        made.append(Bending(Elements(points[None].astype(np.int32), own)))
-    return made
+        found.append(made(Elements(points[None].astype(np.int32), own)))
+    return found
 
 
 @every_sheet
@@ -143,10 +150,9 @@ def test_sums_over_triangles_are_sums_over_hinges(name: str, limit: float) -> No
     np.testing.assert_allclose(
         term.energies(x), [one.energies(x)[0] for one in singly], rtol=1e-12, atol=1e-15
     )
-    found, expected = np.zeros_like(x), np.zeros_like(x)
-    term.add_gradient(x, found)
+    found, expected = gradient(term, x, None), np.zeros_like(x)
     for one in singly:
-        one.add_gradient(x, expected)
+        one.add_gradient(x, None, expected)
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
 
 
@@ -164,19 +170,23 @@ def test_block_rows_are_those_of_the_element_hessians(
     name: str, limit: float, blend: float, n_owned: int
 ) -> None:
     term, x = bending(name, limit), shape(14)
-    blocks = BlockRows(BlockPattern(term.couplings, n_owned, 14))
-    found, expected = blocks.zeros(), blocks.zeros()
+    pattern = BlockPattern(term.couplings, n_owned, 14)
+    values = np.zeros((pattern.n_blocks, 3, 3))
     weight = 1.0 + np.arange(term.n_elements)
-    offsets = blocks.pattern.offsets
-    assert term.add_hessians(x, blend, weight, offsets, found)
-    rows = term.offsets_of_elements(offsets)
-    assert (rows >= 0).any() == bool(term.n_elements)
-    blocks.add(rows, lambda lo, hi, out: term.hessians(x, lo, hi, blend, out), weight, expected)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max(initial=1.0))
-    # and these offsets are what the whole stencil would have been given
+    term.add_hessian(x, None, blend, weight, pattern.offsets, values)
+    blocks = weight[:, None, None, None, None] * bending_blocks(term, x, blend)
+    expected = summed(term.stencil, blocks, 14)[:n_owned]
+    assert expected.any() == bool(term.n_elements)
+    np.testing.assert_allclose(
+        expanded(pattern, values, 14),
+        expected,
+        rtol=0.0,
+        atol=1e-12 * np.abs(expected).max(initial=1.0),
+    )
+    # and the pattern is that of the whole stencil
     whole = BlockPattern({"hinges": term.stencil}, n_owned, 14)
-    assert whole.columns.tolist() == blocks.pattern.columns.tolist()
-    np.testing.assert_array_equal(rows, whole.offsets["hinges"])
+    assert whole.columns.tolist() == pattern.columns.tolist()
+    assert whole.indptr.tolist() == pattern.indptr.tolist()
 
 
 def test_points_without_a_place_do_no_harm() -> None:
@@ -184,11 +194,10 @@ def test_points_without_a_place_do_no_harm() -> None:
     stencil, _ = SHEETS["band"]
     term, x = bending("band", 1e-12), shape(14)
     x[stencil[0, 1]] = x[stencil[0, 0]]
-    blocks = BlockRows(BlockPattern(term.couplings, 14, 14))
-    gradient, values = np.zeros_like(x), blocks.zeros()
-    term.add_gradient(x, gradient)
+    pattern = BlockPattern(term.couplings, 14, 14)
+    values = np.zeros((pattern.n_blocks, 3, 3))
     for blend in (0.0, 1.0):
-        assert term.add_hessians(x, blend, np.ones(len(stencil)), blocks.pattern.offsets, values)
+        term.add_hessian(x, None, blend, np.ones(len(stencil)), pattern.offsets, values)
     assert np.isfinite(term.energies(x)).all()
-    assert np.isfinite(gradient).all()
+    assert np.isfinite(gradient(term, x, None)).all()
     assert np.isfinite(values).all()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
+from oracle import frozen_by, gradient
 from physics import Simulation, grid, rotation
 
 from lyra_petsc.terms.term import Load, Viscous
@@ -133,10 +134,7 @@ def test_loads_act_within_their_window_only() -> None:
 def wind_on(simulation: Simulation, v: Array) -> Array:
     term = simulation.model.terms["wind"]
     assert isinstance(term, Viscous)
-    term.freeze(simulation.system.x, v)
-    out = np.zeros_like(v)
-    term.add_gradient(v, out)
-    return -out
+    return -gradient(term, v, frozen_by(term, simulation.system))
 
 
 def test_wind_force_of_a_tilted_sheet_is_the_stated_law() -> None:

@@ -28,8 +28,8 @@ def test_cylinder_at_rest_is_curved_and_free_of_force(tmp_path: Path) -> None:
         bending = bending_of(simulation)
         assert np.abs(bending.angles(simulation.system.x)).max() > 0.1
         force = np.zeros_like(simulation.system.x)
-        bending.add_gradient(simulation.system.x, force)
-        simulation.model.membrane.add_gradient(simulation.system.x, force)
+        bending.add_gradient(simulation.system.x, None, force)
+        simulation.model.membrane.add_gradient(simulation.system.x, None, force)
         assert np.abs(force).max() < 1e-11
         before = simulation.x
         np.testing.assert_allclose(simulation.run(0.05, 3), before, atol=1e-13)

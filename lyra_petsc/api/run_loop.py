@@ -1,0 +1,211 @@
+"""The loop of a run: set-up, all steps, results on disk, and a summary for every way of ending."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
+from lyra_petsc.linear.petsc_options import unused
+from lyra_petsc.output.h5py_loader import import_ahead
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.output.run_folder import FolderChoice, RunDirectory
+from lyra_petsc.output.summary import read_summary, versions, write_summary
+from lyra_petsc.parallel import on_root
+from lyra_petsc.phases import Phases
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.simulation import Simulation, StepReport
+
+StopAsked = Callable[[], int]
+"""Returns the signal by which any rank was asked to stop, else 0; collective."""
+
+
+class ProgressCallbacks:
+    """Called on all ranks while a run goes on; to be overridden."""
+
+    def begin(self, simulation: Simulation, folder: Path) -> None:
+        """The initial state, or that of the checkpoint, is on disk in ``folder``."""
+
+    def note(self, text: str) -> None:
+        """There is something that the user should know."""
+
+    def step(self, simulation: Simulation, report: StepReport) -> None:
+        """A step was accepted and recorded."""
+
+    def close(self) -> None:
+        """No step follows, whatever the reason."""
+
+    def done(self, simulation: Simulation, folder: Path) -> None:
+        """The run has reached its end, and all its files are written."""
+
+
+def simulate(
+    comm: MPI.Comm,
+    scene: Scene,
+    choice: FolderChoice,
+    callbacks: ProgressCallbacks,
+    stop: StopAsked,
+    phases: Phases | None = None,
+) -> Path:
+    """Simulate a scene from its start or from a checkpoint; collective. Returns the folder of the results.
+
+    Raises
+    ------
+    InputError
+        Bad input; nothing is written.
+    SolverError, OutputError
+        The run could not go on; all states announced before can be read.
+    Interrupted
+        It was asked to stop; the last step is in the checkpoint.
+    """
+    with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
+        import_ahead()
+        simulation = Simulation(comm, scene, phases)
+        try:
+            recorder = Recorder(simulation)
+            if directory.note:
+                simulation.notes.append(directory.note)
+            if number := stop():
+                raise Interrupted(
+                    f"stopped by {signal.Signals(number).name} during the set-up; nothing was written", number
+                )
+            with simulation.phases("output"):
+                directory.clean()
+                if choice.resume:
+                    recorder.resume(directory.path)
+                else:
+                    recorder.begin(directory.path)
+            simulation.model.release()
+            _RunLoop(simulation, recorder, directory.path, callbacks, resumed=choice.resume).run(stop)
+        except BaseException:
+            if comm.size == 1:  # on several ranks some may not come here, and destruction is collective
+                with suppress(Exception):  # the first error is the one to report
+                    simulation.destroy()
+            raise
+        simulation.destroy()
+        return directory.path
+
+
+class _RunLoop:
+    """Takes all steps, and writes the summary for every way of ending."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        recorder: Recorder,
+        folder: Path,
+        callbacks: ProgressCallbacks,
+        *,
+        resumed: bool,
+    ) -> None:
+        self._simulation, self._recorder, self._folder = simulation, recorder, folder
+        self._callbacks, self._comm = callbacks, simulation.comm
+        self._totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
+        self._versions = versions()
+        self._notes_shown = 0
+        self._first_step = simulation.step_number
+        self._resumed: list[dict[str, Any]] = []
+        if resumed:
+            earlier = on_root(self._comm, lambda: read_summary(folder / "summary.json")) or {}
+            changes = [{"key": c.key, "old": c.old, "new": c.new} for c in recorder.changes]
+            start = {"step": simulation.step_number, "time": simulation.time, "ranks": self._comm.size}
+            self._resumed = [*earlier.get("resumed", []), start | {"changes": changes}]
+
+    def run(self, stop: StopAsked) -> None:
+        simulation, recorder, callbacks = self._simulation, self._recorder, self._callbacks
+        self._summarise("running")
+        try:
+            callbacks.begin(simulation, self._folder)
+            self._show_notes()
+            simulation.stepper.monitor()
+            while not simulation.finished:
+                report = simulation.step()
+                for name in self._totals:
+                    self._totals[name] += getattr(report, name)
+                with simulation.phases("output"):
+                    recorder.record(report)
+                self._show_notes()
+                callbacks.step(simulation, report)
+                if number := stop():
+                    recorder.write_checkpoint()
+                    recorder.settle()
+                    raise Interrupted(
+                        f"stopped by {signal.Signals(number).name} after step {simulation.step_number} "
+                        f"(t = {simulation.time:g} s); the checkpoint is written, --resume goes on",
+                        number,
+                    )
+            with simulation.phases("output"):
+                recorder.settle()
+        except SolverError as error:
+            if error.collective:
+                error.details += self._write_failure(str(error))
+            raise
+        except LyraError as error:
+            with suppress(OutputError):  # on a full disk this fails as well
+                self._summarise(str(error))
+            if isinstance(error, OutputError) and not self._folder.is_dir():
+                error.details += (f"the folder {self._folder} is gone; nothing can be resumed",)
+            elif isinstance(error, OutputError):
+                hint = "what was announced before stands; once it can be written again, --resume goes on"
+                error.details += (hint,)
+            raise
+        finally:
+            callbacks.close()
+            recorder.close()
+        self._summarise("done")
+        callbacks.done(simulation, self._folder)
+
+    def _show_notes(self) -> None:
+        for note in self._simulation.notes[self._notes_shown :]:
+            self._callbacks.note(note)
+        self._notes_shown = len(self._simulation.notes)
+
+    def _write_failure(self, outcome: str) -> tuple[str, ...]:
+        """Write the last good state and the failed step; where these can be looked at."""
+        try:
+            self._recorder.write_state()
+            self._recorder.settle()
+            self._summarise(outcome)
+            if self._simulation.failure is None:
+                return ()
+            self._recorder.write_failure()
+        except OutputError as error:
+            return (str(error),)
+        return (f"look at {self._folder / 'failure.xdmf'} (ParaView) and {self._folder / 'failure.txt'}",)
+
+    def _summarise(self, outcome: str) -> None:
+        simulation = self._simulation
+        model = simulation.model
+        content: dict[str, Any] = {
+            "title": simulation.scene.title,
+            "outcome": outcome,
+            "versions": self._versions,
+            "ranks": self._comm.size,
+            "sizes": {
+                "vertices": model.outline.n_vertices,
+                "triangles": model.outline.n_triangles,
+                "unknowns": model.points.n_unknowns,
+            },
+            "terms": model.outline.terms,
+            "partitioner": model.partitioner,
+            "linear_solver": simulation.stepper.preset,
+            "petsc_options": PETSc.Options().getAll(),
+            "unused_petsc_options": unused(simulation.stepper.our_options) if outcome == "done" else [],
+            "integrator": simulation.scene.time.scheme,
+            "time": simulation.time,
+            "estimated_error": simulation.estimated_error if simulation.local_error else None,
+            "steps": simulation.step_number,
+            "steps_of_this_run": simulation.step_number - self._first_step,
+            **self._totals,
+            "resumed": self._resumed,
+            "wall_seconds": simulation.phases.seconds(),
+            "notes": simulation.notes,
+            **({"failure": simulation.failure.content()} if simulation.failure else {}),
+        }
+        write_summary(self._folder / "summary.json", content, self._comm)

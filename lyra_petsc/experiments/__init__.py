@@ -1,0 +1,18 @@
+"""Experiments: scenes with something to vary, an answer to compare with, and a verdict.
+
+In: a verb's request (which cases, which scene, which settings). Out: a folder with tables, a file for
+programs and a page, and an exit code that says whether all is as expected.
+
+A `case.Case` is one experiment; a verb adds its scene, what is varied and what is expected. `bench` runs its
+simulations, a verb's runner turns them into a `case.Outcome` with a `case.Verdict` for each claim, and
+`results.Results` runs case after case, on the communicator at hand or through `launch` in an mpirun each,
+and writes what a verb's `results.View` tells. `registry.Registry` finds cases by name and imports their
+modules only then; `records` keeps what outlives a process. Three verbs are views of this:
+
+- `verification`: exact and published answers; varied is the resolution, expected a value and an order.
+- `stress`: stiff and extreme scenes; expected are the balances of energy, force and momentum of every step.
+- `study`: a scene of the user; varied are its settings, expected is a reference (of `exact`, of a finer run),
+  and instead of a verdict it tells which setting gives an accuracy in the least time.
+
+A further verb brings its cases, a runner, a `View`, and a module in `cli` that is as short as `cli.verify`.
+"""

@@ -1,0 +1,231 @@
+"""Runs the simulations of a case: counts steps; for exact answers, a direct solver and tight tolerances."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from pydantic import ValidationError
+
+from lyra_petsc.errors import LyraError, SolverError
+from lyra_petsc.parallel import all_here, on_root
+from lyra_petsc.phases import Phases
+from lyra_petsc.scene.messages import input_error
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.simulation import Simulation, StepReport
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+"""Where a scene of a case says nothing: Newton being quadratic, it ends at round-off."""
+
+
+@contextmanager
+def simulated(comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> Iterator[Simulation]:
+    """A simulation, freed with the options it set when the block ends; collective."""
+    before = set(PETSc.Options().getAll())
+    simulation, alone = None, False
+    try:
+        simulation = Simulation(comm, scene, phases)
+        yield simulation
+    except BaseException as error:
+        # this rank may be alone with its error, and freeing would wait for the others
+        together = isinstance(error, LyraError) and getattr(error, "collective", True)
+        alone = comm.size > 1 and not together
+        raise
+    finally:
+        if simulation is not None and not alone:
+            simulation.destroy()
+        database = PETSc.Options()
+        for name in set(database.getAll()) - before:
+            database.delValue(name)
+
+
+def problem_of(comm: MPI.Comm, error: LyraError) -> str:
+    """Why a case ended early, in one line; collective.
+
+    Raises
+    ------
+    SolverError
+        The error itself, if not every rank has met one: the others could not go on together with this one.
+    """
+    if isinstance(error, SolverError) and not error.collective and not all_here(comm):
+        raise error
+    return " ".join(str(error).split())
+
+
+class Trial:
+    """One simulation of a case, with its state in mesh order on every rank.
+
+    Attributes
+    ----------
+    simulation : Simulation
+    start : (V, 3) array
+        Positions [m] in mesh order before the first step.
+    """
+
+    def __init__(self, bench: Bench, simulation: Simulation) -> None:
+        self._bench = bench
+        self.simulation = simulation
+        self.start = self.x
+
+    def step(self) -> StepReport:
+        """One accepted step; collective."""
+        self._bench.watch()
+        report = self.simulation.step()
+        self._bench.steps += 1
+        return report
+
+    def run(self) -> Trial:
+        """Steps to the end of the scene; collective."""
+        while not self.simulation.finished:
+            self.step()
+        return self
+
+    def gather(self, owned: Array) -> Array:
+        """Rows of the owned vertices (n_owned, …) in mesh order (V, …), on every rank; collective."""
+        points = self.simulation.model.points
+        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_owned])))
+        out = np.empty((points.n_global, *owned.shape[1:]))
+        for original, rows in pieces:
+            out[original] = rows
+        return out
+
+    @property
+    def x(self) -> Array:
+        """Positions (V, 3) [m] in mesh order."""
+        return self.gather(self.simulation.model.system.x)
+
+    @property
+    def v(self) -> Array:
+        """Velocities (V, 3) [m/s] in mesh order."""
+        return self.gather(self.simulation.model.system.v)
+
+    @property
+    def mass(self) -> Array:
+        """Masses (V,) [kg] in mesh order."""
+        return self.gather(self.simulation.model.system.mass)
+
+    def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
+        """Replace positions [m] or velocities [m/s], (V, 3) in mesh order; collective."""
+        model = self.simulation.model
+        for target, values in ((model.system.x, x), (model.system.v, v)):
+            if values is not None:
+                target[: model.points.n_owned] = values[model.points.original]
+                model.points.update_ghosts(target)
+
+    def total(self, owned: Array) -> float:
+        """Sum over all ranks of this rank's values; collective."""
+        return float(self._bench.comm.allreduce(float(np.sum(owned))))
+
+
+def direct_options(comm: MPI.Comm) -> dict[str, Any]:
+    """PETSc options of a direct solver.
+
+    On several ranks each factors the whole matrix: cases are small, so that this is faster than a
+    parallel factorisation, and it needs no other package.
+    """
+    return {"pc_type": "lu"} if comm.size == 1 else {"pc_type": "redundant", "redundant_pc_type": "lu"}
+
+
+def direct_solver(comm: MPI.Comm, matrix: PETSc.Mat, prefix: str) -> PETSc.KSP:
+    """A solver that factors the matrix once; collective. To be destroyed."""
+    solver = PETSc.KSP().create(comm)
+    solver.setOptionsPrefix(prefix)
+    solver.setOperators(matrix)
+    solver.setType(PETSc.KSP.Type.PREONLY)
+    solver.getPC().setType(direct_options(comm)["pc_type"])  # whose own default on several ranks is LU
+    solver.setFromOptions()
+    solver.setUp()
+    return solver
+
+
+class Bench:
+    """Runs the simulations of a case; a context manager that removes what it wrote.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    watch : callable, optional
+        Called before every step on all ranks; may raise to end the work.
+    exact : bool
+        Fill a direct solver and tight tolerances in; without, scenes run as a user's do.
+
+    Attributes
+    ----------
+    steps : int
+        Accepted steps so far.
+    latest : (int, float)
+        Accepted steps and wall seconds of the latest simulation, set-up included.
+    """
+
+    def __init__(
+        self, comm: MPI.Comm, watch: Callable[[], None] | None = None, *, exact: bool = True
+    ) -> None:
+        self.comm = comm
+        self._exact = exact
+        self.watch = watch or (lambda: None)
+        self.steps = 0
+        self.latest = (0, 0.0)
+        self._folder: TemporaryDirectory[str] | None = None
+        self._files = 0
+
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def mesh(self, vertices: Array, triangles: Ints, rest: Array | None = None) -> dict[str, Any]:
+        """The mesh block of a scene for a surface (V, 3) [m] of triangles (F, 3); collective.
+
+        ``rest`` (V, 2) [m] is its flat rest shape; without, the surface is its own.
+        """
+
+        def write() -> str:
+            if self._folder is None:
+                self._folder = TemporaryDirectory(prefix="lyra-cases-")
+            self._files += 1
+            path = Path(self._folder.name) / f"{self._files}.obj"
+            lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+            corners = (triangles + 1).tolist()
+            if rest is None:
+                lines += [f"f {a} {b} {c}" for a, b, c in corners]
+            else:
+                lines += [f"vt {u!r} {v!r}" for u, v in rest.tolist()]
+                lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in corners]
+            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            return str(path)
+
+        return {"file": on_root(self.comm, write)}
+
+    @contextmanager
+    def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
+        """Set a scene up; freed, with the options it set, when the block ends; collective.
+
+        ``content`` is a scene as in a file. Filled in where it says nothing: no output times, and on an
+        exact bench a direct linear solver and tight tolerances.
+        """
+        filled: dict[str, Any] = {"output": {"every": None}} | dict(content)
+        if self._exact:
+            filled = {"solver": TIGHT} | filled
+            filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
+        try:
+            scene = Scene.model_validate(filled)
+        except ValidationError as error:
+            raise input_error(error, filled, file="scene of the case") from None
+        began, steps = time.perf_counter(), self.steps
+        with simulated(self.comm, scene) as simulation:
+            yield Trial(self, simulation)
+        self.latest = (self.steps - steps, time.perf_counter() - began)

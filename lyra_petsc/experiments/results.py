@@ -1,0 +1,192 @@
+"""Runs the cases of a verb one after another and writes its folder: VERB.csv, VERB.json, report.*."""
+
+from __future__ import annotations
+
+import csv
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+from mpi4py import MPI
+
+from lyra_petsc.errors import InputError, Interrupted
+from lyra_petsc.experiments.case import Case, Outcome, passed_of
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.parallel import on_root
+from lyra_petsc.show.report.closing import close, lacking
+from lyra_petsc.show.report.document import Report
+
+O = TypeVar("O", bound=Outcome[Any])  # noqa: E741
+C = TypeVar("C", bound=Case)
+
+
+class View(ABC, Generic[O]):
+    """How a verb tells of its cases: in a table, in a file for programs, and on a page.
+
+    Attributes
+    ----------
+    verb : str
+    title : str
+        Of the page.
+    pictures : str
+        What the page lacks without the packages that draw.
+    columns : tuple of str
+        Of the CSV.
+    """
+
+    verb: ClassVar[str]
+    title: ClassVar[str]
+    pictures: ClassVar[str]
+    columns: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def rows(self, outcome: O) -> Iterable[Mapping[str, Any]]:
+        """Its lines of the CSV, by the columns."""
+
+    @abstractmethod
+    def told(self, outcome: O) -> dict[str, Any]:
+        """What the JSON file holds of a case beside its name, title and verdicts."""
+
+    def facts(self, outcomes: Sequence[O]) -> dict[str, Any]:
+        """What the JSON file holds beside the cases, the verdict on all, ranks and versions."""
+        return {}
+
+    @abstractmethod
+    def page(self, report: Report, outcomes: Sequence[O], summary: str, *, drawn: bool) -> None:
+        """Fill the page; ``summary`` says how many cases passed, ``drawn`` whether there can be pictures."""
+
+
+class Show(Protocol[C, O]):  # type: ignore[misc]
+    """Who is told of the cases as they run."""
+
+    def begin(self, case: C) -> None:
+        """A case begins."""
+
+    def end(self, outcome: O) -> None:
+        """A case has ended."""
+
+
+class Results(Generic[O]):
+    """The folder of a verb and what came of the cases so far; every method is collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    folder : Path or None
+        None: nothing is written.
+    view : View
+    ranks : int
+        On which each case is run.
+    command : sequence of str
+        That repeats it.
+    force : bool
+        The folder may exist.
+
+    Attributes
+    ----------
+    outcomes : list of Outcome
+
+    Raises
+    ------
+    InputError
+        If the folder exists and ``force`` is not given, or it cannot be created.
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        folder: Path | None,
+        view: View[O],
+        *,
+        ranks: int,
+        command: Sequence[str],
+        force: bool = False,
+    ) -> None:
+        self._comm, self.folder, self._view = comm, folder, view
+        self._ranks, self._command = ranks, command
+        self.outcomes: list[O] = []
+        if folder is not None:
+            on_root(comm, lambda: _create(folder, force=force))
+
+    def run(self, cases: Sequence[C], run: Callable[[C], O], show: Show[C, O]) -> str:
+        """Run the cases; what the page lacks and how to get it, empty if nothing.
+
+        Raises
+        ------
+        Interrupted
+            From ``run``; what had been done is in the folder.
+        OutputError
+            On every rank, if something could not be written.
+        """
+        try:
+            for case in cases:
+                show.begin(case)
+                self.outcomes.append(run(case))
+                show.end(self.outcomes[-1])
+                self.write()
+        except Interrupted:
+            self.finish()
+            raise
+        return self.finish()
+
+    def write(self) -> None:
+        """Write the tables of what came of the cases so far."""
+        if self.folder is None:
+            return
+        view, path = self._view, self.folder / f"{self._view.verb}.csv"
+        run = [outcome for outcome in self.outcomes if not outcome.left_out]
+        rows = [row for outcome in run for row in view.rows(outcome)]
+        on_root(self._comm, lambda: replace_text(path, csv_text(view.columns, rows)))
+        content = view.facts(self.outcomes) | {
+            "passed": all(outcome.passed for outcome in run),
+            "ranks": self._ranks,
+            "versions": versions(),
+            "cases": [
+                {"name": outcome.case.name, "title": outcome.case.title, **view.told(outcome)}
+                | {"verdicts": {name: asdict(verdict) for name, verdict in outcome.verdicts.items()}}
+                for outcome in run
+            ],
+        }
+        write_summary(path.with_suffix(".json"), content, self._comm)
+
+    def finish(self) -> str:
+        """Write the page; what is missing for its pictures, in words."""
+        return on_root(self._comm, self._page) or ""
+
+    def _page(self) -> str:
+        if self.folder is None:
+            return ""
+        report = Report(self._view.title)
+        on = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
+        summary = f"{passed_of(self.outcomes)} on {on}."
+        self._view.page(report, self.outcomes, summary, drawn=not lacking())
+        return close(report, self.folder, versions(), self._command, pictures=self._view.pictures)
+
+
+def _create(folder: Path, *, force: bool) -> None:
+    if folder.exists() and not (force and folder.is_dir()):
+        raise InputError("exists; choose another folder, or give --force", key=f"--out {folder}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", key=f"--out {folder}") from None
+
+
+def _plain(value: Any) -> Any:
+    """A cell: empty for what is not a number."""
+    return "" if value != value else value
+
+
+def csv_text(
+    columns: Sequence[str], rows: Iterable[Mapping[str, Any]], cell: Callable[[Any], Any] = _plain
+) -> str:
+    """A table as CSV; ``cell`` turns a value, None where a row has none, into a text or a number."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([cell(row.get(name)) for name in columns] for row in rows)
+    return text.getvalue()

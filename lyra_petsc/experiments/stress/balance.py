@@ -1,0 +1,308 @@
+"""What one step of backward Euler did to energy and momenta, from its two states and the terms alone.
+
+The energy identity, with the masses M, the elastic energy E and x' − x = Δt v' =: Δx::
+
+    Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt v'ᵀ D v' + bracket + work
+    bracket = ∫₀¹ ∇E(x + s Δx)·Δx ds − ∇E(x')·Δx
+
+The left side is made of energies and the right of forces, so that forces which are not the gradient of
+their energy break it as surely as a step that was not solved. The integral of the membrane is exact (its
+energy is a quartic along a line); that of the hinges is refined until it stands, and where hinges jump, which
+their model does beyond 180°, it is replaced by their energies' difference.
+
+Every step leaves a residual r on the free coordinates, of which the solver promises ‖r‖ ≤ force tolerance ×
+forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may be
+off by no more than ‖r‖ ‖Δx‖ and the round-off of its own summands, and the balance of momentum by √V ‖r‖ Δt:
+these are the tolerances, none is chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.stress.path import EPSILON, Terms, energy, force_along, gradient
+from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.terms.registry import Role
+from lyra_petsc.terms.term import Step
+
+Array = NDArray[np.float64]
+
+CHUNK = 4096
+"""Elements whose Hessians are held at once."""
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The balances of one step; J, N, kg m/s and kg m²/s, the same on every rank.
+
+    Attributes
+    ----------
+    energy : float
+        Kinetic + potential after the step.
+    change : float
+        Of it in the step.
+    numerical, viscous : float
+        ½ ‖Δv‖²_M and Δt v'ᵀ D v'.
+    bracket, work : float
+    defect, tolerance : float
+        Left minus right side of the energy identity, and what it may be.
+    residual, promised, floor : float
+        Norm of the forces left on free coordinates, what the solver promised, and its round-off.
+    driving : float
+        Norm of the largest of the other forces there, those within the sheet left out.
+    push : float
+        How far those forces moved the sheet [m]: largest change of a free coordinate beyond Δt v.
+    momentum, momentum_tolerance : float
+        Largest component of Δ(Σ m v) − Δt Σ forces from outside.
+    spin, spin_tolerance : float
+        Of Σ (x' − centre) × (m Δv) − Δt Σ torques.
+    jumped : bool
+        Hinges turned too far to follow; their part of the bracket is from their energies.
+    """
+
+    energy: float
+    change: float
+    numerical: float
+    viscous: float
+    bracket: float
+    work: float
+    defect: float
+    tolerance: float
+    residual: float
+    promised: float
+    floor: float
+    driving: float
+    push: float
+    momentum: float
+    momentum_tolerance: float
+    spin: float
+    spin_tolerance: float
+    jumped: bool = False
+
+    @property
+    def moved(self) -> float:
+        """Energy [J] that the step turned over."""
+        return abs(self.change) + self.numerical + abs(self.viscous) + abs(self.bracket) + abs(self.work)
+
+
+def largest(comm: MPI.Comm, values: Array) -> float:
+    """Largest size of all values on all ranks."""
+    return float(comm.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX))
+
+
+class Accountant:
+    """Takes the balance of each step of a simulation by backward Euler; collective.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Before its first step; `look` must see every state from which a step sets out.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._system = simulation.model.system
+        pulls = [term for term in self._system.elastic if term.registration.role is Role.CONSTRAINT]
+        self._pulling, self._elastic = pulls, [t for t in self._system.elastic if t not in pulls]
+        self.look()
+
+    @property
+    def _shell(self) -> Terms:
+        """The sheet's own terms, with targets where they stand now."""
+        return {term: self._system.frozen[term] for term in self._elastic}
+
+    @property
+    def _springs(self) -> Terms:
+        """The terms by which handles pull."""
+        return {term: self._system.frozen[term] for term in self._pulling}
+
+    def look(self) -> None:
+        """Note the state, and the energy with which its clamps end the step before."""
+        system = self._system
+        self._x, self._v = system.x.copy(), system.v.copy()
+        self._energy = energy(self._shell, system.x)
+
+    def balance(self, report: StepReport) -> Balance:
+        """The balance of the step just accepted, which set out from the state looked at last."""
+        system, comm = self._system, self._system.points.comm
+        n, dt = system.points.n_owned, report.dt
+        x0, v0, x1, v1 = self._x, self._v, system.x, system.v
+        dx, dv = x1 - x0, v1[:n] - v0[:n]
+        free = ~system.prescribed.mask[:n]
+        parts = self._parts(report, dv / dt)
+        total = np.asarray(sum(parts.values()))
+        reaction = self._simulation.ledger.reaction
+        weight = self._gravity(report)
+        moved = dx[:n]
+        outside = -parts["loads"] + reaction
+        for name in ("springs", "wind"):
+            outside = outside - parts[name]
+        # the planes of clamps stand in space: their energy is stored, but they push from outside
+        planes = {term: frozen for term, frozen in self._shell.items() if term.registration.moving}
+        pushed = gradient(planes, x1)[:n]
+        slowed = self._damping(planes, v1)[:n]
+        energy_now, energy_then = energy(self._shell, x1), energy(self._shell, x0)
+        turned = energy_then - self._energy
+        mass = system.mass[:, None]
+        sums = comm.allreduce(
+            np.array(
+                [
+                    0.5 * float(np.sum(mass * v0[:n] ** 2)),
+                    0.5 * float(np.sum(mass * v1[:n] ** 2)),
+                    energy_now - energy_then,
+                    turned,
+                    energy_now,
+                    sum(load.potential(x0) for load in system.loads),
+                    sum(load.potential(x1) for load in system.loads),
+                    0.5 * float(np.sum(mass * dv**2)),
+                    float(np.vdot(parts["damping"], moved)),
+                    float(np.vdot(parts["internal"], moved)),
+                    float(np.vdot(outside - weight, moved)),
+                    float(np.sum(total**2, where=free)),
+                    float(np.sum(moved**2, where=free)),
+                    float(np.sum(moved**2)),
+                    self._energy_roundoff(x1) + self._energy_roundoff(x0),
+                    float(sum(np.abs(part).sum() for part in parts.values())),
+                    float(sum(np.abs(part * moved).sum() for part in parts.values())),
+                    float(np.abs(mass * np.abs(system.x[:n])).sum()) * self._gravity_size(),
+                ]
+            )
+        )
+        (kinetic0, kinetic1, elastic, turn, stored, fallen0, fallen1, numerical, viscous, inner, outer,
+         left, free_way, way, energy_noise, forces, powers, heights) = map(float, sums)  # fmt: skip
+        reach = largest(comm, x1)
+        promised, floor, driving = self._promise(parts, reach)
+        residual = float(np.sqrt(left))
+        solved = residual * np.sqrt(free_way) + floor * np.sqrt(way)
+        # positions are rounded, too: x' − x is Δt v' only to their last digit
+        noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
+        tolerance = float(solved + noise)
+        along, jumped = force_along(comm, n, self._shell, x0, dx, enough=0.1 * tolerance)
+        bracket = along - inner
+        change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
+        work = outer + turn
+        defect = change - (-numerical - viscous + bracket + work)
+        gap = mass * dv - dt * (outside - pushed - slowed)
+        p, p_tol, spin, spin_tol = self._momenta(
+            gap, gap + dt * (parts["damping"] - slowed), dt, residual + floor, forces, reach
+        )
+        return Balance(
+            energy=kinetic1 + stored + fallen1,
+            change=change,
+            numerical=numerical,
+            viscous=viscous,
+            bracket=bracket,
+            work=work,
+            defect=defect,
+            tolerance=tolerance,
+            residual=residual,
+            promised=promised,
+            floor=floor,
+            driving=driving,
+            push=largest(comm, np.where(free, moved - dt * v0[:n], 0.0)),
+            momentum=p,
+            momentum_tolerance=p_tol,
+            spin=spin,
+            spin_tolerance=spin_tol,
+            jumped=jumped,
+        )
+
+    def _promise(self, parts: Mapping[str, Array], reach: float) -> tuple[float, float, float]:
+        """What the solver promised for the residual, its floor of round-off, and the driving forces [N]."""
+        system, simulation = self._system, self._simulation
+        free = ~system.prescribed.mask[: system.points.n_owned]
+        squares = np.array([float(np.sum(part**2, where=free)) for part in parts.values()])
+        norms = dict(zip(parts, np.sqrt(system.points.comm.allreduce(squares)).tolist(), strict=True))
+        floor = residual_roundoff(system, max(reach, simulation.model.outline.reach))
+        promised = max(simulation.scene.solver.force_tolerance * max(norms.values()), floor)
+        return promised, floor, max(norm for name, norm in norms.items() if name != "internal")
+
+    # -- parts ---------------------------------------------------------------------------------------
+
+    def _parts(self, report: StepReport, rate: Array) -> dict[str, Array]:
+        """The summands of F, each (n_owned, 3) [N], evaluated anew; loads with their sign in F."""
+        system = self._system
+        n, x1, v1 = system.points.n_owned, system.x, system.v
+        force = np.zeros((system.points.n_local, 3))
+        for load in system.loads:
+            load.add_force(self._x, report.time - report.dt, report.time, force)
+        wind = np.zeros_like(force)
+        for term in system.viscous:
+            step = Step(system.t0, system.t1, system.t0, self._x, system.reference.at)
+            term.add_gradient(v1, term.freeze(step), wind)
+        return {
+            "inertia": system.mass[:, None] * rate,
+            "internal": gradient(self._shell, x1)[:n],
+            "springs": gradient(self._springs, x1)[:n],
+            "damping": self._damping(self._shell, v1)[:n],
+            "wind": wind[:n],
+            "loads": -force[:n],
+        }
+
+    def _damping(self, terms: Terms, v: Array) -> Array:
+        """D v (n_owned, 3) [N], assembled anew with the stiffness of the start of the step."""
+        system = self._system
+        rows = system.discretisation.fixed
+        values = rows.zeros()
+        for term, frozen in terms.items():
+            gamma = term.elements.data.get("damping")
+            if term.registration.damped and gamma is not None and np.any(gamma):
+                rows.add_stiffness(term, self._x, frozen, 1.0, gamma, values)
+        return rows.product(values, v)
+
+    def _gravity(self, report: StepReport) -> Array:
+        """The weight (n_owned, 3) [N], whose work is in the potential."""
+        out = np.zeros((self._system.points.n_local, 3))
+        for load in self._system.loads:
+            if load.registration.energy:
+                load.add_force(self._x, report.time - report.dt, report.time, out)
+        return out[: self._system.points.n_owned]
+
+    def _gravity_size(self) -> float:
+        return float(np.linalg.norm(self._simulation.scene.gravity or (0.0, 0.0, 0.0)))
+
+    def _energy_roundoff(self, x: Array) -> float:
+        """Sum [J] over this rank's elements whose relative round-off their energies carry.
+
+        An energy ½ k s² whose strain s is a difference of coordinates is uncertain by √(2 E S) ε, with S
+        the energy at which the strain is of order one.
+        """
+        reach = float(np.abs(x).max(initial=0.0))
+        amount = 0.0
+        for term, frozen in self._shell.items():
+            each = term.energies(x, frozen)
+            scale = reach * term.force_scale(reach)[: term.n_owned]
+            amount += float(np.sum(np.abs(each) + np.sqrt(2.0 * np.abs(each) * scale)))
+            amount += EPSILON * float(np.sum(scale))
+        return amount
+
+    def _momenta(
+        self, gap: Array, damped: Array, dt: float, left: float, forces: float, reach: float
+    ) -> tuple[float, float, float, float]:
+        """Defects of linear and angular momentum and their tolerances.
+
+        ``gap`` (n_owned, 3) is m Δv less Δt times the forces from outside, ``damped`` also less those of
+        damping: frozen with the start's geometry they add up to nothing, but turn the sheet.
+        """
+        system, comm = self._system, self._system.points.comm
+        n, count = system.points.n_owned, system.points.n_global
+        x, mass = system.x[:n], system.mass[:, None]
+        centre = comm.allreduce(np.append((mass * x).sum(axis=0), mass.sum()))
+        arms = x - centre[:3] / centre[3]
+        sums = comm.allreduce(np.concatenate([gap.sum(axis=0), np.cross(arms, damped).sum(axis=0)]))
+        longest = float(comm.allreduce(float(np.square(arms).sum())))
+        noise = EPSILON * forces * dt
+        linear = dt * left * np.sqrt(count) + noise
+        angular = dt * left * np.sqrt(longest) + noise * reach
+        return (
+            float(np.abs(sums[:3]).max()),
+            float(linear),
+            float(np.abs(sums[3:]).max()),
+            float(angular),
+        )

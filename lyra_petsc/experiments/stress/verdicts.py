@@ -1,0 +1,181 @@
+"""What physics says of a record: pure functions, the same on every rank."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.stress.balance import Balance
+from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.show.report.numbers import short
+from lyra_petsc.terms.stretch import SOFTENS_BELOW
+
+RESOLVED = 0.1
+"""Part of the forces that move a sheet, or of how far they do, that may be left before it means nothing."""
+
+MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
+"""Newton iterations a step of a stiff sheet may take, in the median and at worst."""
+
+MOST_TIME = 5.0
+"""Wall time of a step of a stiff sheet over that of the base scene, medians."""
+
+
+def converged(record: Record) -> Verdict:
+    """Every step was solved, and the end reached."""
+    if record.stopped:
+        return Verdict(False, f"{len(record.reports)} steps, then: {record.stopped}")
+    words = f"all {len(record.reports)} steps"
+    if record.rejected:
+        smallest = short(record.smallest_step)
+        words += (
+            f", {record.rejected} attempts rejected, smallest Δt {smallest} s of {short(record.nominal)} s"
+        )
+    return Verdict(bool(record.reports), words)
+
+
+def solved(record: Record) -> Verdict:
+    """The forces left, computed anew, are as small as the solver promised in every step."""
+    number, worst = _worst(record, lambda b: over(b.residual, b.promised + b.floor))
+    at_floor = sum(balance.promised <= balance.floor for balance in record.balances)
+    words = (
+        f"worst in step {number}: {short(worst.residual)} N left on the free vertices, "
+        f"{short(worst.promised)} N promised"
+    )
+    if at_floor:
+        words += f"; in {at_floor} steps that is the floor of round-off"
+    return Verdict(worst.residual <= worst.promised + worst.floor, words)
+
+
+def resolved(record: Record) -> Verdict:
+    """The forces left are far below those that move the sheet, or what they still move is.
+
+    At the floor of round-off stiff forces may be left that are as large as the weight, and move nothing.
+    """
+    steps = zip(record.balances, record.reports, strict=True)
+    by_force = [over(balance.residual, RESOLVED * balance.driving) for balance in record.balances]
+    by_way = [over(report.left, RESOLVED * balance.push) for balance, report in steps]
+    number = max(range(len(by_force)), key=lambda i: min(by_force[i], by_way[i]))
+    worst, last = record.balances[number], record.reports[number].left
+    words = (
+        f"worst in step {number + 1}: {short(worst.residual)} N left, {short(worst.driving)} N move the sheet"
+    )
+    if worst.promised <= worst.floor:
+        words += "; round-off at this stiffness allows no better"
+    if by_way[number] < by_force[number]:
+        words += f"; they still move it by {short(last)} m, and the step's forces by {short(worst.push)} m"
+    return Verdict(min(by_force[number], by_way[number]) <= 1.0, words)
+
+
+def identity(record: Record) -> Verdict:
+    """The energy identity of backward Euler holds in every step to what its residual allows.
+
+    Of other integrators: the elastic forces along each step add up to the change of their energy.
+    """
+    number, worst = _worst(record, lambda b: over(abs(b.defect), b.tolerance))
+    words = (
+        f"worst in step {number}: off by {short(abs(worst.defect))} J, tolerance {short(worst.tolerance)} J, "
+        f"{short(worst.moved)} J turned over"
+    )
+    jumped = sum(balance.jumped for balance in record.balances)
+    if jumped:
+        words += f"; in {jumped} steps hinges turned too far or jumped, and count by their energies"
+    return Verdict(abs(worst.defect) <= worst.tolerance, words)
+
+
+def no_gain(record: Record) -> Verdict:
+    """Where the bracket of the identity is not positive, no more energy than the work put in."""
+    steps = [
+        (number, balance)
+        for number, balance in enumerate(record.balances, 1)
+        if not balance.bracket > balance.tolerance
+    ]
+    fed = len(record.balances) - len(steps)
+    more = f"; in {fed} steps buckling could feed energy in" if fed else ""
+    if not steps:
+        return Verdict(True, f"not to be judged{more}")
+    number, worst = max(steps, key=lambda step: over(_gain(step[1]), step[1].tolerance))
+    gain = _gain(worst)
+    if gain > worst.tolerance:
+        words = f"step {number} gained {short(gain)} J beyond the work, tolerance {short(worst.tolerance)} J"
+        return Verdict(False, words + more)
+    negative = [n for n, b in enumerate(record.balances, 1) if -b.viscous > b.tolerance]
+    if negative:
+        return Verdict(False, f"damping fed energy into step {negative[0]}{more}")
+    return Verdict(True, f"none in the {len(steps)} steps where the elastic energy is convex{more}")
+
+
+def momentum(record: Record) -> Verdict:
+    """Momentum and angular momentum change by what acts from outside: inner forces add up to nothing."""
+    at, line = _worst(record, lambda b: over(b.momentum, b.momentum_tolerance))
+    turn_at, turn = _worst(record, lambda b: over(b.spin, b.spin_tolerance))
+    words = f"worst in step {at}: {short(line.momentum)} N s, tolerance {short(line.momentum_tolerance)} N s"
+    if turn.spin_tolerance:
+        words += (
+            f"; angular in step {turn_at}: {short(turn.spin)} N m s, "
+            f"tolerance {short(turn.spin_tolerance)} N m s"
+        )
+    good = line.momentum <= line.momentum_tolerance and turn.spin <= turn.spin_tolerance
+    return Verdict(good, words)
+
+
+def softening(record: Record) -> Verdict:
+    """A triangle compressed beyond where the model softens was told of."""
+    smallest = record.stretches[0]
+    if not smallest < SOFTENS_BELOW:
+        return Verdict(True, f"no triangle below {SOFTENS_BELOW:.3f} of its length")
+    told = [note for note in record.notes if "St. Venant-Kirchhoff model softens" in note]
+    words = f"down to {short(smallest)} of its length, " + (
+        "which is said" if told else "and NOTHING was said"
+    )
+    return Verdict(bool(told), words)
+
+
+def speed(record: Record, ratio: float, busy_ratio: float) -> Verdict:
+    """Few iterations, and a time like that of the base scene.
+
+    ``ratio`` of the medians of wall time, ``busy_ratio`` of CPU time: on a machine that others use, too,
+    the former says little of what a step costs, and one that is good enough suffices.
+    """
+    median, worst = record.median_newton, max(record.newton, default=0)
+    good = median <= MOST_NEWTON_MEDIAN and worst <= MOST_NEWTON and min(ratio, busy_ratio) <= MOST_TIME
+    words = (
+        f"Newton iterations {short(median)} in the median and {worst} at worst "
+        f"({MOST_NEWTON_MEDIAN} and {MOST_NEWTON} allowed), {short(ratio)} times the base's wall time, "
+        f"{short(busy_ratio)} times its CPU time ({MOST_TIME:g} allowed)"
+    )
+    return Verdict(good and not record.stopped, words)
+
+
+def of_physics(record: Record) -> dict[str, Verdict]:
+    """All verdicts that need no knowledge of the case, by name."""
+    verdicts = {"converged": converged(record)}
+    if record.balances:
+        verdicts |= {
+            "equations": solved(record),
+            "resolved": resolved(record),
+            "energy": identity(record),
+            "momentum": momentum(record),
+        }
+        if record.integrator == "beuler":
+            verdicts["no gain"] = no_gain(record)
+    if record.reports:
+        verdicts["softening"] = softening(record)
+    return verdicts
+
+
+def _gain(balance: Balance) -> float:
+    return balance.change - balance.work
+
+
+def over(amount: float, tolerance: float) -> float:
+    """How many times the tolerance; what is no number is worst."""
+    if math.isnan(amount) or math.isnan(tolerance):
+        return math.inf
+    return amount / tolerance if tolerance > 0.0 else math.copysign(math.inf, amount) if amount else 0.0
+
+
+def _worst(record: Record, measure: Callable[[Balance], float]) -> tuple[int, Balance]:
+    """Number, from 1, and balance of the step for which ``measure`` is largest."""
+    number = max(range(len(record.balances)), key=lambda i: measure(record.balances[i]))
+    return number + 1, record.balances[number]

@@ -1,0 +1,253 @@
+"""The reference where nothing is exact: which runs to make, finer than all that is studied.
+
+A second-order integrator at a quarter of the smallest Δt, and solver tolerances of a hundredth of the
+tightest. Where element sizes vary, half the smallest; and where nothing of the time integration varies
+beside them, that stays as it is, so that the errors are those of the mesh. Beside it stand coarser runs,
+each coarser in one thing by a factor of two from the next, from which its own error is estimated
+(Richardson).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lyra_petsc.experiments.study.axes import Value
+from lyra_petsc.experiments.study.combination import mesh_overrides, overrides, time_overrides
+from lyra_petsc.experiments.study.measure import Errors
+from lyra_petsc.experiments.study.plan import Plan
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.show.report.numbers import seconds
+
+FINER = 4
+"""How many times smaller than the smallest Δt of the study the reference's is."""
+
+SECOND_ORDER = ("bdf2", "alpha2", "midpoint")
+TIGHTER = 100.0
+TIGHTEST = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+TIMES = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius")
+
+SAFETY = 2.0
+"""An error below so many times the reference's own cannot be told from it."""
+
+SLOWEST = 0.5
+"""Order of convergence below which an estimate is not trusted to follow it."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One run of the reference's family.
+
+    Attributes
+    ----------
+    name : str
+        The folder.
+    label : str
+        In words.
+    overrides : tuple of str
+    weight : float
+        Its cost beside a run at the study's finest.
+    """
+
+    name: str
+    label: str
+    overrides: tuple[str, ...]
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Runs that differ in one thing by factors of two, finest first.
+
+    Attributes
+    ----------
+    levels : tuple of Level
+    order : int
+        Expected; 0 where none is.
+    """
+
+    levels: tuple[Level, ...]
+    order: int
+
+
+@dataclass
+class Family:
+    """All runs of a reference.
+
+    Attributes
+    ----------
+    chains : list of Chain
+        Their finest differ from each other only where meshes are refined too.
+    """
+
+    chains: list[Chain]
+
+    @property
+    def best(self) -> Level:
+        """The reference."""
+        return self.chains[0].levels[0]
+
+    @property
+    def levels(self) -> list[Level]:
+        """Each run once, cheapest last."""
+        return list({level.name: level for chain in self.chains for level in chain.levels}.values())
+
+
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> Family:
+    """The runs of the reference of one physical scene.
+
+    Parameters
+    ----------
+    plan : Plan
+    physics : sequence of str
+        Overrides that make this scene, and what the whole study sets.
+    smallest : float or None
+        Smallest Δt [s] among the runs, where the time integration is refined.
+    integrator : str
+        With which it is.
+    """
+    common = [*physics, *_tolerances(plan, TIGHTER)]
+    mesh = plan.axis("mesh")
+    meshes: list[float | None] = [None]
+    if mesh is not None:
+        size = min(float(value) for value in mesh.values)
+        meshes = [size / 2.0, size, 2.0 * size]
+    if smallest is None or plan.static:
+        smallest, integrator = None, ""
+        fixed = [axis for axis in plan.axes if axis.path in TIMES and len(axis.values) == 1]
+        common += overrides(plan.base, fixed, [axis.values[0] for axis in fixed])
+
+    def chain(order: int, *sizes: tuple[float | None, float | None]) -> Chain:
+        return Chain(tuple(_level(plan.base, common, h, step, integrator) for h, step in sizes), order)
+
+    if smallest is None:
+        if mesh is not None:
+            return Family([chain(2, *((h, None) for h in meshes))])
+        tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
+        loose = Level("reference-loose", "tolerances ten times larger", tolerances)
+        return Family([Chain((*chain(0, (None, None)).levels, loose), 0)])
+    finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
+    order = 2 if integrator in SECOND_ORDER else 1
+    in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
+    return Family([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
+
+
+def refines_time(plan: Plan) -> bool:
+    """Whether the reference integrates time more finely: always, but where meshes alone are compared."""
+    if plan.static:
+        return False
+    varies = any(axis.path in TIMES and len(axis.values) > 1 for axis in plan.axes)
+    return varies or plan.axis("mesh") is None
+
+
+def integrators(plan: Plan) -> list[str]:
+    """Those to try for the reference, in order."""
+    # the scene's own first
+    return [*sorted(SECOND_ORDER, key=lambda name: name != plan.base.time.integrator), "beuler"]
+
+
+def _level(base: Scene, common: list[str], h: float | None, step: float | None, integrator: str) -> Level:
+    further, words, name, weight = [], [], ["reference"], 1.0
+    if step is not None:
+        chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
+        further += [f"time.integrator={integrator}", f"time.step={step!r}", *time_overrides(base, chosen)]
+        words += [integrator, f"Δt {seconds(step, 6)}"]
+        name += [integrator, f"dt{step:.6g}"]
+        weight /= step
+    if h is not None:
+        further += mesh_overrides(base, h)
+        words.append(f"h {h:g} m")
+        name.append(f"h{h:.6g}")
+        weight *= h**-2
+    return Level("-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight)
+
+
+def _tolerances(plan: Plan, tighter: float) -> list[str]:
+    """Solver tolerances below the tightest of the study."""
+    found = []
+    for name, least in TIGHTEST.items():
+        axis = plan.axis(f"solver.{name}")
+        values = [float(v) for v in axis.values] if axis else [float(getattr(plan.base.solver, name))]
+        found.append(f"solver.{name}={max(least, min(values) / tighter)!r}")
+    for axis in plan.axes:
+        if axis.path.startswith("petsc.") and axis.numeric and axis.path.endswith(("tol", "_atol")):
+            least = min(float(value) for value in axis.values)
+            found.append(f"{axis.path}={max(1e-13, least / tighter)!r}")
+    return found
+
+
+# -- its own error -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Own error of a reference in one quantity.
+
+    Attributes
+    ----------
+    error : float
+        Relative, as the errors measured against it.
+    order : float
+        Observed; NaN where two runs agree, or only two were made.
+    trusted : bool
+        Whether the runs converge.
+    """
+
+    error: float
+    order: float
+    trusted: bool
+
+
+def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:
+    """Own error of the finest of three runs.
+
+    Parameters
+    ----------
+    first, second : float
+        Differences of the two finest runs, and of the finest but one from the third.
+    ratio : float
+        Factor by which each is coarser than the one before.
+    order : int
+        Expected; the observed one is used where it is smaller.
+    """
+    if math.isnan(first) or math.isnan(second):
+        return Estimate(math.nan, math.nan, False)
+    if first == 0.0:
+        return Estimate(0.0, math.nan, True)
+    observed = math.log(second / first) / math.log(ratio) if second > 0.0 else -math.inf
+    used = min(float(order), max(observed, SLOWEST))
+    trusted = observed >= SLOWEST
+    largest = first if trusted else max(first, second)
+    return Estimate(largest / (ratio**used - 1.0), observed, trusted)
+
+
+def joined(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
+    """Sums of the errors in time and in space."""
+    names = dict.fromkeys(name for estimate in estimates for name in estimate)
+    found = {}
+    for name in names:
+        parts = [estimate[name] for estimate in estimates]
+        found[name] = Estimate(
+            math.fsum(part.error for part in parts),
+            parts[0].order if len(parts) == 1 else math.nan,
+            all(part.trusted for part in parts),
+        )
+    return found
+
+
+def of_chain(differences: Sequence[Errors], chain: Chain, ratio: float = 2.0) -> dict[str, Estimate]:
+    """Own error of a chain's finest run, by quantity.
+
+    Parameters
+    ----------
+    differences : sequence of Errors
+        Between neighbours, finest first.
+    """
+    found = {}
+    for name, first in differences[0].items():
+        if len(differences) == 1:
+            found[name] = Estimate(first, math.nan, True)
+        else:
+            found[name] = richardson(first, differences[1][name], ratio, chain.order)
+    return found

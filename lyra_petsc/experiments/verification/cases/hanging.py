@@ -1,0 +1,143 @@
+"""Strips that hang: by one end, and between two supports as catenaries."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.verification.bar_strip import LENGTH, WIDTH, G, hung
+from lyra_petsc.experiments.verification.case import Measured, case, data, farthest, isotropic
+from lyra_petsc.experiments.verification.claims import Converges, Exact
+
+ALONG = "cells along the strip"
+
+# -- by one end ------------------------------------------------------------------------------------------
+
+HANGING = data("hanging")
+STIFFNESS = 100.0
+"""N/m"""
+
+
+def _by_one_end(n: int, density: float, held: dict[str, Any], **more: Any) -> dict[str, Any]:
+    grid = {"width": LENGTH, "height": WIDTH, "nx": n, "ny": 1, **more.pop("grid", {})}
+    return {
+        "mesh": {"grid": grid},
+        "material": {"density": density, "membrane": isotropic(STIFFNESS)},
+        "handles": [held, {"group": "sheet", "axes": ["z"]}],
+        "time": {"analysis": "static"},
+        **more,
+    }
+
+
+@case(
+    "A strip hanging by one end, its weight in equal rows, static: the chain of n equal bars",
+    source=HANGING["source"],
+    resolutions=(1, 2, 4, 8, 16, 32, 64),
+    claim=Exact(1e-10),
+    quick=4,
+    counts=ALONG,
+)
+def hanging_strip_chain(bench: Bench, n: float) -> Iterator[Measured]:
+    bars = int(n)
+    rows = [{"nodes": [i, bars + 1 + i]} for i in range(bars + 1)]
+    shares = np.full(bars + 1, 1.0 / bars)
+    shares[[0, -1]] *= 0.5
+    for e, count, exact in HANGING["chain"]["rows"]:
+        if count == n:
+            weight = e * STIFFNESS * WIDTH
+            # not by gravity: the two corners of a strip's end differ in mass, its rows must not
+            loads = [
+                row | {"force": [weight * share, 0, 0]}
+                for row, share in zip(rows, shares.tolist(), strict=True)
+            ]
+            with bench.simulation(_by_one_end(bars, 0.1, rows[0], loads=loads)) as trial:
+                x = trial.run().x
+            end = farthest(x[[bars, 2 * bars + 1], 0] - LENGTH, exact * LENGTH)
+            yield Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m", LENGTH)
+
+
+@case(
+    "A strip hanging by one end under its own weight, static: elongation against the continuum",
+    source=HANGING["source"],
+    resolutions=(32, 64, 128),
+    claim=Converges(2.0, 1e-3),
+    counts=ALONG,
+)
+def hanging_strip(bench: Bench, n: float) -> Iterator[Measured]:
+    for e, exact in HANGING["strip"]["rows"]:
+        density, grid = e * STIFFNESS / (G * LENGTH), {"pattern": "criss-cross"}
+        scene = _by_one_end(int(n), density, {"group": "left"}, grid=grid, gravity=[G, 0, 0])
+        with bench.simulation(scene) as trial:
+            x = trial.run().x
+        end = float(x[[int(n), 2 * int(n) + 1], 0].mean()) - LENGTH
+        yield Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m")
+
+
+# -- catenaries ------------------------------------------------------------------------------------------
+
+CATENARY = data("catenary")
+CONVERGING: dict[str, Any] = {
+    "resolutions": (8, 16, 32, 64), "claim": Converges(2.0, 1e-3), "counts": ALONG,
+}  # fmt: skip
+
+STRETCHES = {0.95: 1e-6, 0.9: 1e-6, 0.8: 1e-6, 0.5: 1e-5}
+"""Weight over c11, by span: the strip stretches by no more, and the less it sags, the more that counts."""
+
+UNEQUAL = 2e-6
+"""of c11: the strip stretches by no more than that"""
+
+
+def _middle(bench: Bench, n: float, e: float, dx: float, dz: float = 0.0) -> tuple[float, float]:
+    """Where the middle of a strip hangs [m], x and z from its left support; supports (dx, dz) L apart."""
+    with bench.simulation(hung(bench, int(n), e, dx * LENGTH, dz * LENGTH)) as trial:
+        x, _, z = trial.run().x[int(n) // 2]
+    return float(x), float(z)
+
+
+@case(
+    "A stiff strip hung by both ends at one height, static: sag of the inextensible catenary",
+    source=CATENARY["source"],
+    **CONVERGING,
+)
+def catenary(bench: Bench, n: float) -> Iterator[Measured]:
+    for span, sag in CATENARY["inextensible"]["rows"]:
+        low = -_middle(bench, n, STRETCHES[span], span)[1]
+        yield Measured(f"sag, span {span:g} of the length", low, sag * LENGTH, "m")
+
+
+@case(
+    "A stiff strip hung at two heights, static: its middle against the inextensible catenary",
+    source="closed form",
+    **CONVERGING,
+)
+def catenary_unequal(bench: Bench, n: float) -> Iterator[Measured]:
+    for dx, dz, a, lowest, _, _ in CATENARY["unequal_heights"]["rows"]:
+        x, z = _middle(bench, n, UNEQUAL, dx, dz)
+        exact = middle(a, lowest)
+        supports = f"right support {dx:g} L away, {dz:g} L up"
+        yield Measured(f"x of the middle, {supports}", x, exact[0] * LENGTH, "m")
+        yield Measured(f"z of the middle, {supports}", z, exact[1] * LENGTH, "m")
+
+
+def middle(a: float, lowest: float) -> tuple[float, float]:
+    """Where half the length of a catenary has been run through from its left end [both over L].
+
+    ``a`` and ``lowest`` are its parameter and the abscissa of its lowest point.
+    """
+    x = lowest + a * math.asinh(0.5 / a - math.sinh(lowest / a))
+    return x, a * (math.cosh((x - lowest) / a) - math.cosh(lowest / a))
+
+
+@case(
+    "A strip hung by both ends that stretches under its own weight, static: sag",
+    source=CATENARY["source"],
+    **CONVERGING,
+)
+def catenary_elastic(bench: Bench, n: float) -> Iterator[Measured]:
+    for e, span, sag, _, _ in CATENARY["elastic"]["rows"]:
+        name = f"sag, weight {e:g} of c11, span {span:g} of the length"
+        yield Measured(name, -_middle(bench, n, e, span)[1], sag * LENGTH, "m")

@@ -1,0 +1,205 @@
+"""Membranes: a round one under a dead load, and small vibrations of stretched and of hanging ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.meshes import quarter_disc, rectangle
+from lyra_petsc.experiments.verification.case import Measured, case, data, isotropic
+from lyra_petsc.experiments.verification.claims import Converges, Exact
+from lyra_petsc.experiments.verification.spectrum import lowest_modes
+
+G = 9.81
+"""m/s²"""
+
+# -- a round membrane ------------------------------------------------------------------------------------
+
+ROUND = data("circular_membrane")
+RADIUS, STIFFNESS = 1.0, 1000.0
+"""m, N/m"""
+
+
+@case(
+    "A round membrane with a fixed rim under its own weight, static: central deflection",
+    source=ROUND["source"],
+    resolutions=(4, 8, 16, 32),
+    claim=Converges(2.0, 1e-3),
+    counts="cells along the radius",
+)
+def circular_membrane(bench: Bench, n: float) -> Iterator[Measured]:
+    number = np.arange((int(n) + 1) ** 2).reshape(int(n) + 1, int(n) + 1)
+    rim = np.unique(np.concatenate([number[-1], number[:, -1]]))
+    common = {
+        "mesh": bench.mesh(*quarter_disc(int(n), RADIUS)),
+        "gravity": [0, 0, -G],
+        # the rim, and the two planes of symmetry
+        "handles": [
+            {"nodes": rim.tolist()},
+            {"nodes": number[:, 0].tolist(), "axes": ["x"]},
+            {"nodes": number[0].tolist(), "axes": ["y"]},
+        ],
+        "time": {"analysis": "static"},
+    }
+    for nu, e, exact in ROUND["rows"]:
+        material = {"density": e * STIFFNESS / (G * RADIUS), "membrane": isotropic(STIFFNESS, nu)}
+        with bench.simulation(common | {"material": material}) as trial:
+            sag = -float(trial.run().x[0, 2])
+        name = f"central deflection, ν = {nu:g}, load {e:g} C/a"
+        yield Measured(name, sag, exact * RADIUS, "m")
+
+
+# -- a stretched one -------------------------------------------------------------------------------------
+
+STRETCHED = data("vibrations")["membrane"]
+MODES = ("11", "21", "31", "12")
+"""Half waves along and across, by ascending frequency."""
+
+
+def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """The scene of the membrane in its stretched state, all edges held there; n × n/2 cells."""
+    vertices, triangles = rectangle(n, n // 2, STRETCHED["A"], STRETCHED["B"])
+    number = np.arange(len(vertices)).reshape(n // 2 + 1, n + 1)
+    edge = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
+    start = vertices * [STRETCHED["lam1"], STRETCHED["lam2"], 0.0]
+    membrane = {name.lower(): STRETCHED[name] for name in ("C11", "C22", "C12", "C33")}
+    return {
+        "mesh": bench.mesh(start, triangles, rest=vertices[:, :2]),
+        "material": {"density": STRETCHED["rho"], "membrane": membrane},
+        "handles": [{"nodes": edge.tolist()}],
+        "time": time,
+        **more,
+    }
+
+
+@case(
+    "A stretched rectangular membrane: frequencies from the assembled K and M against the closed form",
+    source="closed form ω = π √((S11 (m/A)² + S22 (n/B)²)/ρ)",
+    resolutions=(16, 32, 64, 128),
+    claim=Converges(2.0, 1e-3),
+    quick=3,
+    counts="cells along the longer side",
+)
+def stretched_membrane(bench: Bench, n: float) -> Sequence[Measured]:
+    with bench.simulation(_stretched(bench, int(n), {"end": 1.0, "step": 1.0})) as trial:
+        found, _ = lowest_modes(trial, len(MODES))
+    return [
+        Measured(f"ω of mode {mode}", float(omega), STRETCHED["omega"][mode], "rad/s")
+        for mode, omega in zip(MODES, found, strict=True)
+    ]
+
+
+CELLS = 16
+AMPLITUDE = 1e-5
+"""m: small enough for a linear motion, large enough for its forces to stand above round-off"""
+
+PERIOD = 2.0 * math.pi / STRETCHED["omega"]["11"]
+"""s"""
+
+
+@case(
+    "A membrane's first mode followed in time: ω against that of K and M, and the schemes' own phase",
+    source="closed forms: phase of a step atan ωΔt (beuler), 2 atan ωΔt/2 (midpoint)",
+    resolutions=(20, 40, 80),
+    claim=Converges(2.0, 5e-3),
+    claims={
+        f"{what} of a step, {integrator}": Exact(1e-7)
+        for what in ("phase", "amplification")
+        for integrator in ("beuler", "midpoint")
+    },
+    counts="steps per period",
+    size=lambda n: PERIOD / n,
+)
+def released_mode(bench: Bench, n: float) -> Iterator[Measured]:
+    for integrator in ("beuler", "midpoint", "alpha2", "bdf2"):
+        omega, states = _followed(bench, n, integrator)
+        turn, dt = -np.unwrap(np.angle(states)), PERIOD / n
+        per_step = float(turn[-1] - turn[0]) / (len(states) - 1)
+        yield Measured(f"ω, {integrator}", per_step / dt, omega, "rad/s")
+        x = omega * dt
+        exact = {
+            "beuler": (math.atan(x), 1.0 / math.hypot(1.0, x)),
+            "midpoint": (2.0 * math.atan(0.5 * x), 1.0),
+        }
+        if integrator in exact:
+            phase, amplification = exact[integrator]
+            shrunk = float(abs(states[-1] / states[-2]))
+            yield Measured(f"phase of a step, {integrator}", per_step, phase, "rad")
+            yield Measured(f"amplification of a step, {integrator}", shrunk, amplification)
+
+
+def _followed(bench: Bench, n: float, integrator: str) -> tuple[float, NDArray[np.complex128]]:
+    """The mode's ω from K and M, and q + i q̇/ω of its coordinate q after every step of one period."""
+    time = {"end": PERIOD, "step": PERIOD / n, "integrator": integrator}
+    # only the rounding floor ends Newton: the stretched sheet's forces are large, the motion is small
+    tight = {"force_tolerance": 1e-15, "step_tolerance": 1e-15}
+    with bench.simulation(_stretched(bench, CELLS, time, solver=tight)) as trial:
+        frequencies, shapes = lowest_modes(trial, 1)
+        omega, shape = float(frequencies[0]), shapes[0]
+        trial.set_state(x=trial.start + AMPLITUDE / np.abs(shape).max() * shape)
+        weights = trial.mass[:, None] * shape
+        states = []
+        for count in range(round(n) + 1):
+            if count:
+                trial.step()
+            q, rate = np.sum(weights * (trial.x - trial.start)), np.sum(weights * trial.v)
+            states.append(complex(q, rate / omega))
+    return omega, np.array(states)
+
+
+# -- a hanging one ---------------------------------------------------------------------------------------
+
+CHAIN = data("vibrations")["hanging_chain"]
+LENGTH, WIDTH, DENSITY = 1.0, 0.05, 0.2
+"""m, m, kg/m²"""
+
+STIFF = 1e6
+"""N/m; the weight stretches the strip by 1e-6"""
+
+
+@case(
+    "A strip hanging from one edge: frequencies from the assembled K and M against zeros of J0",
+    source="closed form ω = j_0k/2 √(g/L)",
+    resolutions=(16, 32, 64, 128),
+    claim=Converges(2.0, 1e-3),
+    counts="cells along the strip",
+)
+def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
+    scene = {
+        "mesh": {"grid": {"width": WIDTH, "height": LENGTH, "nx": 2, "ny": int(n)}},
+        "material": {"density": DENSITY, "membrane": isotropic(STIFF)},
+        "gravity": [0, -G, 0],
+        # a membrane pulled in one direction only does not feel its neighbours on either side: of the
+        # three columns of vertices the middle one, whose masses are those of a wide sheet, is free
+        "handles": [
+            {"group": "top"},
+            {"group": "sheet", "axes": ["x"]},
+            {"group": "left", "axes": ["z"]},
+            {"group": "right", "axes": ["z"]},
+        ],
+        "time": {"end": 1.0, "step": 1.0},
+    }
+    with bench.simulation(scene) as trial:
+        x = trial.start
+        trial.set_state(x=np.column_stack([x[:, 0], _hanging(x[:, 1], n), x[:, 2]]))
+        found, _ = lowest_modes(trial, 3)
+    exact = [half * math.sqrt(G / LENGTH) for half in CHAIN["half_j0"]]
+    return [
+        Measured(f"ω of mode {k}", float(omega), exact[k - 1], "rad/s") for k, omega in enumerate(found, 1)
+    ]
+
+
+def _hanging(y: NDArray[np.float64], n: float) -> NDArray[np.float64]:
+    """Heights at which every bar between two rows carries what hangs below its middle."""
+    tension = DENSITY * G * LENGTH * (np.arange(int(n)) + 0.5) / n
+    # λ³ − λ = 2 T/C by two Newton steps from the linear answer
+    stretch = 1.0 + tension / STIFF
+    for _ in range(2):
+        stretch -= (stretch**3 - stretch - 2.0 * tension / STIFF) / (3.0 * stretch**2 - 1.0)
+    heights = np.concatenate([[0.0], np.cumsum(stretch) * LENGTH / n])
+    return np.asarray(LENGTH - (heights[-1] - heights)[np.rint(y / LENGTH * n).astype(np.int64)])

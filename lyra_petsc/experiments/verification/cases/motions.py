@@ -1,0 +1,259 @@
+"""Motions of a sheet that backward Euler steps through as a few numbers would: falls, a spring, a spin."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.verification.case import Measured, case, data, farthest, isotropic
+from lyra_petsc.experiments.verification.claims import Converges, Exact
+
+# -- falls -----------------------------------------------------------------------------------------------
+
+FALL = data("free_fall")
+
+
+def _sheet(nx: int, n: float, end: float, density: float, **more: Any) -> dict[str, Any]:
+    """A sheet that nothing holds, stepped by 1/n s."""
+    return {
+        "mesh": {"grid": {"width": 1.0, "height": 0.6, "nx": nx, "ny": 3, "pattern": "alternating"}},
+        "material": {"density": density, "membrane": {"c11": 1200, "c22": 800, "c12": 300, "c33": 250}},
+        "time": {"end": end, "step": 1.0 / n},
+        **more,
+    }
+
+
+@case(
+    "Free fall of a sheet, backward Euler: z against −g Δt² n(n+1)/2 and against −g t²/2",
+    source="closed form",
+    resolutions=(10, 100, 1000),
+    claim=Exact(1e-10),
+    claims={"mean z, continuous answer": Converges(1.0, 1.1e-2, slack=1e-6)},
+    counts="steps per second",
+)
+def free_fall(bench: Bench, n: float) -> Sequence[Measured]:
+    end = 0.1
+    with bench.simulation(_sheet(5, n, end, 0.2, gravity=[0, 0, -FALL["g"]])) as trial:
+        z = trial.run().x[:, 2]
+    discrete = next(z for dt, _, z in FALL["z_backward_euler"] if np.isclose(dt * n, 1.0))
+    exact = -0.5 * FALL["g"] * end**2
+    return [
+        Measured("z of the vertex farthest off, discrete answer", farthest(z, discrete), discrete, "m"),
+        Measured("mean z, continuous answer", float(z.mean()), exact, "m"),
+    ]
+
+
+WIND = data("wind_drag")
+G, DENSITY, AIR = WIND["g"], WIND["density"], WIND["air"]
+DRAG = 2.0
+"""kg/(m² s), along the sheet"""
+
+END = 0.5
+"""s"""
+
+
+def level_fall(n: float, end: float) -> tuple[float, float]:
+    """Speed [m/s] and depth [m] after backward Euler's steps of 1/n s; v is the root of its quadratic."""
+    dt, v, z = 1.0 / n, 0.0, 0.0
+    a = dt * AIR / DENSITY
+    for _ in range(round(end * n)):
+        b = v + dt * G
+        v = 2.0 * b / (1.0 + math.sqrt(1.0 + 4.0 * a * b))
+        z += dt * v
+    return v, z
+
+
+def _edge_on(n: float) -> float:
+    """Speed [m/s] of backward Euler under a force proportional to it."""
+    dt, v = 1.0 / n, 0.0
+    for _ in range(round(END * n)):
+        v = (v + dt * G) / (1.0 + dt * DRAG / DENSITY)
+    return v
+
+
+@case(
+    "Sheets falling in still air, level (force ρ A v²) and edge-on (drag A v), backward Euler",
+    source=WIND["source"],
+    resolutions=(50, 100, 200, 400),
+    claim=Exact(1e-10),
+    claims={
+        "depth of a level sheet, exact in time": Converges(1.0, 2e-3, slack=0.1),
+        "speed of a sheet edge-on, exact in time": Converges(1.0, 1e-2, slack=0.3),
+    },
+    counts="steps per second",
+)
+def wind_drag(bench: Bench, n: float) -> Iterator[Measured]:
+    def scene(gravity: list[float], air: float, drag: float) -> dict[str, Any]:
+        wind = {"velocity": [0, 0, 0], "density": air, "drag": drag}
+        return _sheet(4, n, END, DENSITY, gravity=gravity, wind=wind)
+
+    speed, depth = level_fall(n, END)
+    with bench.simulation(scene([0, 0, -G], AIR, 0.0)) as trial:
+        start = trial.x[0, 2]
+        trial.run()
+        level = farthest(-trial.v[:, 2], speed)
+        fallen = float(start - trial.x[0, 2])
+    exact = next(-z for t, _, z in WIND["continuous"] if t == END)
+    yield Measured("speed of a level sheet, backward Euler", level, speed, "m/s")
+    yield Measured("depth of a level sheet, backward Euler", fallen, depth, "m")
+    yield Measured("depth of a level sheet, exact in time", fallen, exact, "m")
+    with bench.simulation(scene([0, -G, 0], AIR, DRAG)) as trial:
+        slow = _edge_on(n)
+        edge_on = farthest(-trial.run().v[:, 1], slow)
+    terminal = DENSITY * G / DRAG
+    exact = terminal * (1.0 - math.exp(-G * END / terminal))
+    yield Measured("speed of a sheet edge-on, backward Euler", edge_on, slow, "m/s")
+    yield Measured("speed of a sheet edge-on, exact in time", edge_on, exact, "m/s")
+
+
+# -- a sheet on springs ----------------------------------------------------------------------------------
+
+SPRINGS = data("oscillator")
+SPRING_STEPS = 3
+OMEGA = 5.0
+"""rad/s"""
+
+SPRING_DENSITY = 0.3
+"""kg/m²"""
+
+
+def _sprung_sheet(time: dict[str, Any]) -> dict[str, Any]:
+    """One cell of two triangles, set off at 1 m/s along z from where its springs are slack.
+
+    All vertices feel the springs alike, so that it moves rigidly, as one linear oscillator: a third of a
+    triangle's mass is on each of its corners, and so is a third of its share of stiffness.
+    """
+    third = SPRING_DENSITY * 0.5 / 3.0 * OMEGA**2
+    return {
+        "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}},
+        "material": {"density": SPRING_DENSITY, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}},
+        "handles": [{"nodes": [0, 3], "stiffness": 2.0 * third}, {"nodes": [1, 2], "stiffness": third}],
+        "initial": {"velocity": [0, 0, 1]},
+        "time": time,
+    }
+
+
+def _states(trial: Trial) -> NDArray[np.complex128]:
+    return np.asarray(trial.x[:, 2] + 1j * trial.v[:, 2] / OMEGA)
+
+
+@case(
+    "A sheet on springs, backward Euler: amplification 1/√(1 + ω²Δt²) and phase atan ωΔt of a step",
+    source=SPRINGS["source"],
+    resolutions=(0.1, 1, 10, 100, 1000),
+    claim=Exact(1e-10),
+    quick=3,
+    counts="1/(ωΔt)",
+)
+def oscillator(bench: Bench, n: float) -> Sequence[Measured]:
+    row = next(row for row in SPRINGS["rows"] if abs(row[0] * n - 1.0) < 1e-9)
+    time = {"end": SPRING_STEPS / (n * OMEGA), "step": 1.0 / (n * OMEGA)}
+    with bench.simulation(_sprung_sheet(time)) as trial:
+        for _ in range(SPRING_STEPS):
+            before = _states(trial)
+            trial.step()
+        # z and v/ω turn and shrink together
+        ratios = _states(trial) / before
+    size, turn = np.abs(ratios), -np.angle(ratios)
+    return [
+        Measured("amplification per step", farthest(size, row[1]), row[1]),
+        Measured("phase per step", farthest(turn, row[2]), row[2], "rad"),
+    ]
+
+
+# -- a spinning triangle ---------------------------------------------------------------------------------
+
+SPIN = data("rigid_rotation")
+STEPS = 10
+TRIANGLE_DENSITY, RADIUS, DT = 0.2, 1.0, 1e-2
+"""kg/m², m, s"""
+
+STRAIN = 1e-6
+"""ρ ω² R²/c11: how far from rigid the triangle is."""
+
+RIGID = "angle of a step, of a rigid body"
+
+
+def _stiffness(n: float) -> float:
+    return TRIANGLE_DENSITY * (RADIUS / (n * DT)) ** 2 / STRAIN
+
+
+def _first_velocity(n: float) -> complex:
+    """Radial and tangential velocity [m/s] that a step of the full angle, 1/n, has left behind."""
+    return RADIUS / DT * (1.0 - cmath.exp(-1j / n))
+
+
+def _backward_euler(n: float) -> tuple[float, float]:
+    """Last step's angle [rad] and radius [m] of the triangle as three points with one common radius.
+
+    The force of a radius r points to the centre: the point x + Δt v turns no further, it only
+    shrinks to the radius at which m (|x + Δt v| − r)/Δt² is the force.
+    """
+    area = 0.75 * math.sqrt(3.0) * RADIUS**2
+    mass = TRIANGLE_DENSITY * area / 3.0
+    stiffness = _stiffness(n)
+
+    def force(r: float) -> float:
+        stretch = r / RADIUS
+        return area * stiffness * (stretch**3 - stretch) / RADIUS / 3.0
+
+    x, v = complex(RADIUS, 0.0), _first_velocity(n)
+    angle = 0.0
+    for _ in range(STEPS):
+        free = x + DT * v
+        r = abs(x)
+        for _ in range(100):
+            change = (abs(free) - r - DT**2 / mass * force(r)) / (
+                1.0 + DT**2 / mass * area * stiffness * (3.0 * (r / RADIUS) ** 2 - 1.0) / RADIUS**2 / 3.0
+            )
+            r += change
+            if abs(change) < 1e-15 * RADIUS:
+                break
+        after = free * r / abs(free)
+        angle = math.atan2((after / x).imag, (after / x).real)
+        x, v = after, (after - x) / DT
+    return angle, abs(x)
+
+
+@case(
+    "A stiff triangle spinning freely, backward Euler: angle of the tenth step",
+    source=SPIN["source"],
+    resolutions=(1, 2, 10, 100, 1000),
+    claim=Exact(1e-10),
+    claims={RIGID: Exact(1e-5)},
+    quick=3,
+    counts="1/(ωΔt)",
+)
+def rigid_rotation(bench: Bench, n: float) -> Sequence[Measured]:
+    corners = 0.5 * np.pi + 2.0 / 3.0 * np.pi * np.arange(3)
+    vertices = RADIUS * np.column_stack([np.cos(corners), np.sin(corners), np.zeros(3)])
+    scene = {
+        "mesh": bench.mesh(vertices, np.array([[0, 1, 2]])),
+        "material": {"density": TRIANGLE_DENSITY, "membrane": isotropic(_stiffness(n))},
+        "time": {"end": STEPS * DT, "step": DT},
+    }
+    with bench.simulation(scene) as trial:
+        v = _first_velocity(n)
+        radial = vertices / RADIUS
+        trial.set_state(v=v.real * radial + v.imag * np.cross([0.0, 0.0, 1.0], radial))
+        before = trial.x
+        while not trial.simulation.finished:
+            before = trial.x
+            trial.step()
+        x = trial.x
+    cross = before[:, 0] * x[:, 1] - before[:, 1] * x[:, 0]
+    angles = np.arctan2(cross, np.einsum("vi,vi->v", before, x))
+    exact, radius = _backward_euler(n)
+    row = next(row for row in SPIN["sequences"] if abs(row["omega_h"] * n - 1.0) < 1e-9)
+    angle = farthest(angles, exact)
+    return [
+        Measured("angle of a step, of the elastic triangle", angle, exact, "rad"),
+        Measured("radius at the end", float(np.linalg.norm(x, axis=1).max()), radius, "m"),
+        Measured(RIGID, angle, row["angle_after_steps"][str(STEPS)], "rad"),
+    ]

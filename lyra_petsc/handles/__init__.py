@@ -1,1 +1,0 @@
-"""Prescribed motion of held vertices."""

@@ -1,0 +1,194 @@
+"""What kernels do with 3×3 blocks and numba has no words for.
+
+A row of blocks is multiplied a column of a block at a time in the processor's vectors. Numba leaves such
+loops scalar; here they are written in LLVM's language, which every processor has vectors or a substitute
+for. Blocks are (n_blocks, 9), column by column. A fourth number is read, and computed, with each three; of
+the blocks it is always one of the same block. And what will soon be needed is fetched into the caches.
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import Any
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
+
+from lyra_petsc.kernels.llvm import INDEX, LANE, WIDTH, Code
+
+AHEAD = 64
+"""Blocks by which they are fetched before they are used: in a sweep each row waits for the one before it."""
+
+
+def _check(*arrays: Any) -> None:
+    kinds = {array.dtype for array in arrays}
+    if len(kinds) > 1 or any(array.layout != "C" or array.ndim != 2 for array in arrays):
+        raise TypingError("contiguous arrays of two dimensions and one type are expected")
+
+
+def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
+    """Sum of blocks[k] x[columns[k]] for lo ≤ k < hi, three numbers; x (n, 3).
+
+    Each time the block is fetched that will be needed ``ahead`` blocks later.
+    """
+    _check(blocks, x)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks columns x lo hi ahead")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("x")
+        ahead = code.integer("ahead")
+        zero = ir.Constant(code.vector, [0.0] * WIDTH)
+        sums = [cgutils.alloca_once_value(builder, zero) for _ in range(3)]  # type: ignore[no-untyped-call]
+        with code.loop() as (k, _):
+            code.fetch(code.at(block_rows, builder.add(k, ahead), 9))
+            source = code.at(vectors, code.number(numbers, k), 3)
+            for i, column in enumerate(code.columns(code.at(block_rows, k, 9))):
+                factor = code.repeat(builder.load(builder.gep(source, [INDEX(i)])))
+                builder.store(code.plus(builder.load(sums[i]), code.times(column, factor)), sums[i])
+        one, two, three = map(builder.load, sums)
+        total = code.plus(code.plus(one, two), three)
+        found = [builder.extract_element(total, LANE(i)) for i in range(3)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
+    return three(blocks, columns, x, lo, hi, ahead), generate
+
+
+def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
+    """out[columns[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; out (n, 4), the last of no meaning."""
+    _check(blocks, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks columns out lo hi factors")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("columns"), code.begin("out")
+        row = code.filled(code.numbers("factors"))
+        with code.loop() as (k, _):
+            a, b, c = (code.times(column, row) for column in code.columns(code.at(block_rows, k, 9)))
+            # the sums of a, b and c, whose fourth numbers mean nothing
+            ab, last = code.pick(a, b, 0, 4, 1, 5), code.pick(a, b, 2, 6, 2, 6)
+            first, second = code.pick(ab, c, 0, 1, 4, 4), code.pick(ab, c, 2, 3, 5, 5)
+            total = code.plus(code.plus(first, second), code.pick(last, c, 0, 1, 6, 6))
+            target = code.at(vectors, code.number(numbers, k), WIDTH)
+            code.store(code.plus(code.load(target), total), target)
+        return context.get_dummy_value()
+
+    return types.void(blocks, columns, out, lo, hi, factors), generate
+
+
+def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
+    """blocks[at // 2] += diagonal I + left rightᵀ, transposed where ``at`` is odd; nothing where negative."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks at diagonal left right")
+        at, begin = code.integer("at"), code.begin("blocks")
+        with builder.if_then(code.is_ours(at), likely=True):
+            left, right = code.swapped(at, *(code.filled(code.numbers(name)) for name in ("left", "right")))
+            diagonal, (eight, ninth) = code.given["diagonal"], code.outer(left, right)
+            eight, ninth = code.plus(eight, code.identity(diagonal)), code.plus(ninth, diagonal)
+            code.add_block(code.at(begin, builder.ashr(at, INDEX(1)), 9), eight, ninth)
+        return context.get_dummy_value()
+
+    return types.void(blocks, at, diagonal, left, right), generate
+
+
+def _add_six(typing: Any, blocks: Any, offsets: Any, e: Any, n: Any, six: Any) -> Any:
+    """Add the blocks n Rᵀ + L nᵀ of the couplings (0, 0), (0, 1), …, (2, 2) of an element e.
+
+    They are given by R and L, tuples of three numbers or sums: of pairs of a factor and three numbers; n is
+    three numbers. Offsets (E, 6) are a pattern's.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks offsets e n six")
+        n = code.filled(code.numbers("n"))
+        n_left, n_right, offsets, blocks = code.spread(n), code.tiled(n), code.six_offsets(), []
+        for offset, (right, left) in zip(offsets, code.pairs("six"), strict=True):
+            ninth = code.third(code.times(n, code.plus(left, right)))
+            right, left = code.swapped(offset, right, left)  # transposed: n Lᵀ + R nᵀ
+            eight = code.summed((n_left, code.tiled(right)), (code.spread(left), n_right))
+            blocks.append((eight, ninth))
+        code.add_six(offsets, blocks)
+        return context.get_dummy_value()
+
+    return types.void(blocks, offsets, e, n, six), generate
+
+
+def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three: Any) -> Any:
+    """Add the blocks of the couplings of an element e whose rows and columns of blocks sum to zero.
+
+    Given are those of (1, 1), (1, 2), (2, 2) as factors (uu, uv, vu, vv, g) of two vectors: a block is
+    uu fu fuᵀ + uv fu fvᵀ + vu fv fuᵀ + vv fv fvᵀ + g I. Offsets (E, 6) are those of a pattern.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks offsets e f three")
+        u, v = code.vectors("f")
+        (uu, uu9), (uv, uv9), (vv, vv9) = code.outer(u, u), code.outer(u, v), code.outer(v, v)
+        vu, made = code.transposed(uv), []
+        for a, b, c, d, g in code.tuples("three"):
+            ninth = code.plus(code.summed((a, uu9), (builder.fadd(b, c), uv9), (d, vv9)), g)
+            a, b, c, d = (code.repeat(factor, 8) for factor in (a, b, c, d))
+            eight = code.summed((a, uu), (b, uv), (c, vu), (d, vv))
+            made.append((code.plus(eight, code.identity(g)), ninth))
+        (b11, one), (b12, two), (b22, three) = made
+        b21, offsets = code.transposed(b12), code.six_offsets()
+        b01 = code.minus_sum(b11, code.swapped(offsets[1], b21, b12)[0]), code.minus_sum(one, two)
+        b02 = code.minus_sum(b22, code.swapped(offsets[2], b12, b21)[0]), code.minus_sum(two, three)
+        b00 = reduce(code.plus, (b11, b12, b21, b22)), reduce(code.plus, (one, two, two, three))
+        stored = code.swapped(offsets[4], b12, b21)[0], two
+        code.add_six(offsets, [b00, b01, b02, (b11, one), stored, (b22, three)])
+        return context.get_dummy_value()
+
+    return types.void(blocks, offsets, e, f, three), generate
+
+
+def _put(transposed: bool, typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k], or this transposed."""
+    _check(blocks, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks k out at")
+        source = code.at(code.begin("blocks"), code.integer("k"), 9)
+        target = code.at(code.begin("out"), code.integer("at"), 9)
+        eight, last = code.load(source, code.eight), INDEX(8)
+        code.store(code.transposed(eight) if transposed else eight, target)
+        builder.store(builder.load(builder.gep(source, [last])), builder.gep(target, [last]))
+        return context.get_dummy_value()
+
+    return types.void(blocks, k, out, at), generate
+
+
+def _put_plain(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k]; both (n, 9)."""
+    return _put(False, typing, blocks, k, out, at)
+
+
+def _put_transposed(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
+    """out[at] = blocks[k] transposed; both (n, 9)."""
+    return _put(True, typing, blocks, k, out, at)
+
+
+def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
+    """Let block k come into the caches; there need be no such block."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks k")
+        block = code.at(code.begin("blocks"), code.integer("k"), 9)
+        for last in (0, 8):  # it may lie on two cache lines
+            code.fetch(builder.gep(block, [INDEX(last)]))
+        return context.get_dummy_value()
+
+    return types.void(blocks, k), generate
+
+
+# their callers leave out ``typing``
+gather: Any = intrinsic(_gather)
+add_outer: Any = intrinsic(_add_outer)
+add_six: Any = intrinsic(_add_six)
+add_triangle: Any = intrinsic(_add_triangle)
+fetch: Any = intrinsic(_fetch)
+put_plain: Any = intrinsic(_put_plain)
+put_transposed: Any = intrinsic(_put_transposed)
+scatter: Any = intrinsic(_scatter)

@@ -1,0 +1,52 @@
+"""Products of block rows with vectors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
+from lyra_petsc.linear.pattern import BlockPattern
+
+Array = NDArray[np.float64]
+
+MOST_KEPT = 20_000
+"""Rows up to which scratch is kept; more of it is got quickly enough, and assembly needs the room."""
+
+
+@cached(fastmath={"contract", "nsz"})
+def half_stored(indptr, ends, columns, blocks, x, sums, out):  # type: ignore[no-untyped-def]
+    """out (n_owned, 3) = rows · x (n_local, 3) of a symmetric matrix of which one half is stored.
+
+    The first block (n_blocks, 9) of a row is the diagonal one; from ``ends`` (n_owned,) on they are in
+    columns of ghosts, whose rows are others'. sums (n_owned, 4) is scratch.
+    """
+    n = Index(len(ends))
+    sums[:] = 0.0
+    for row in range(n):
+        lo, hi = Index(indptr[row]), Index(indptr[row + Index(1)])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        scatter(blocks, columns, sums, lo + Index(1), Index(ends[row]), (x[row, 0], x[row, 1], x[row, 2]))
+        # the rows above have done their part
+        out[row, 0], out[row, 1], out[row, 2] = s0 + sums[row, 0], s1 + sums[row, 1], s2 + sums[row, 2]
+
+
+class HalfStored:
+    """Products with symmetric block rows of which one half is stored.
+
+    Parameters
+    ----------
+    pattern : BlockPattern
+    values : (n_blocks, 3, 3)
+    """
+
+    def __init__(self, pattern: BlockPattern, values: Array) -> None:
+        self._rows = pattern.indptr, pattern.ends, pattern.columns, values.reshape(-1, 9)
+        self._shape = pattern.n_owned, 4
+        self._kept = np.empty(self._shape) if pattern.n_owned <= MOST_KEPT else None
+
+    def __call__(self, x: Array, out: Array) -> None:
+        """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
+        sums = np.empty(self._shape) if self._kept is None else self._kept
+        half_stored(*self._rows, x, sums, out)

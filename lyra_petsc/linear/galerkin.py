@@ -1,0 +1,332 @@
+"""Block rows of a coarse matrix: interpolationᵀ · symmetric block rows · interpolation."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.linear.exchange_blocks import SharedBlocks
+from lyra_petsc.linear.pattern import BlockPattern, begins, diagonal_keys, index_type, union
+from lyra_petsc.mesh.distribute import local_numbers
+from lyra_petsc.mesh.points import Points
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+CHUNK_ROWS = 1 << 13
+"""Fine rows whose products are looked at together while the coarse pattern is made."""
+
+CHUNK_PRODUCTS = 1 << 20
+
+FAR = 255
+"""In place of an offset that does not fit into a byte, or of a block elsewhere than in the coarse rows."""
+
+
+@cached()
+def _slots(lo, hi, indptr, columns, start, parents, slots, keys, width):  # type: ignore[no-untyped-def]
+    """Of fine rows lo..hi: where a row's product with the interpolation is summed, and what it adds to.
+
+    A row of blocks times the interpolation has a block for each coarse point met, in the order in which
+    they are met, first over owned and then over ghost columns; ``slots`` are their numbers. Of ``keys``
+    there is one for each parent of the row and each of these. Blocks of owned columns stand for their
+    transpose too: smaller · width + larger coarse point, ~ of it if the product is to be transposed. Those
+    of ghosts do not: width² + row · width + column.
+    """
+    n_owned = len(indptr) - 1
+    seen, at = np.full(width, -1, np.int64), np.zeros(width, np.int64)
+    met = np.empty(2 * width, np.int64)
+    s = q = 0
+    for row in range(lo, hi):
+        m = own = 0
+        mark = 2 * row
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] >= n_owned and mark == 2 * row:
+                mark, own = mark + 1, m
+            for p in range(start[columns[k]], start[columns[k] + 1]):
+                c = parents[p]
+                if seen[c] != mark:
+                    seen[c], at[c], met[m] = mark, m, c
+                    m += 1
+                slots[s] = at[c]
+                s += 1
+        if mark == 2 * row:
+            own = m
+        for p in range(start[row], start[row + 1]):
+            a = parents[p]
+            for t in range(m):
+                c = met[t]
+                if t >= own:
+                    keys[q] = (width + a) * width + c
+                else:
+                    keys[q] = a * width + c if c >= a else ~(c * width + a)
+                q += 1
+
+
+@cached()
+def _counts(indptr, columns, start, parents, width, slots, keys):  # type: ignore[no-untyped-def]
+    """Of each fine row, how many slots and keys it has."""
+    n_owned = len(indptr) - 1
+    seen = np.full(width, -1, np.int64)
+    for row in range(n_owned):
+        m = n = 0
+        for k in range(indptr[row], indptr[row + 1]):
+            mark = 2 * row + (columns[k] >= n_owned)
+            for p in range(start[columns[k]], start[columns[k] + 1]):
+                n += 1
+                if seen[parents[p]] != mark:
+                    seen[parents[p]] = mark
+                    m += 1
+        slots[row] = n
+        keys[row] = m * (start[row + 1] - start[row])
+
+
+@cached(fastmath=True)
+def _project(indptr, columns, start, parents, weights, slots, most, first, offset, far, values, free, out):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add what fine rows give to the coarse ones (C, 9); diagonal blocks are half what they are to be.
+
+    The products of a row and of a parent go, one after the other, to the block ``offset`` behind the
+    ``first`` one of the lesser coarse point's row; where that is FAR, to the next of ``far``, ~ of it if
+    transposed.
+    Rows and columns of coordinates that are not free are decoupled: only their diagonal must not count.
+    Unsigned indices, and no views: numba looks at the sign of others, which takes four times as long.
+    """
+    sums, met = np.empty((most, 9)), np.empty(most, np.int64)
+    s = q = f = 0
+    for row in range(len(indptr) - 1):
+        m = 0
+        for k in range(Index(indptr[row]), Index(indptr[row + 1])):
+            j = Index(columns[k])
+            b0, b1, b2 = values[k, 0], values[k, 1], values[k, 2]
+            b3, b4, b5 = values[k, 3], values[k, 4], values[k, 5]
+            b6, b7, b8 = values[k, 6], values[k, 7], values[k, 8]
+            half = 1.0
+            if j == Index(row):
+                half = 0.5
+                b0, b4, b8 = free[row, 0] * b0, free[row, 1] * b4, free[row, 2] * b8
+            for p in range(start[j], start[j + Index(1)]):
+                w, t = half * weights[p], Index(slots[s])
+                s += 1
+                if t == Index(m):
+                    met[m] = parents[p]
+                    m += 1
+                    sums[t, 0], sums[t, 1], sums[t, 2] = w * b0, w * b1, w * b2
+                    sums[t, 3], sums[t, 4], sums[t, 5] = w * b3, w * b4, w * b5
+                    sums[t, 6], sums[t, 7], sums[t, 8] = w * b6, w * b7, w * b8
+                else:
+                    sums[t, 0] += w * b0
+                    sums[t, 1] += w * b1
+                    sums[t, 2] += w * b2
+                    sums[t, 3] += w * b3
+                    sums[t, 4] += w * b4
+                    sums[t, 5] += w * b5
+                    sums[t, 6] += w * b6
+                    sums[t, 7] += w * b7
+                    sums[t, 8] += w * b8
+        for p in range(start[row], start[row + 1]):
+            w, a = weights[p], parents[p]
+            for u in range(Index(m)):
+                if offset[q] == FAR:
+                    k = far[f]
+                    f += 1
+                elif a <= met[u]:
+                    k = first[a] + offset[q]
+                else:
+                    k = ~(first[met[u]] + offset[q])
+                q += 1
+                b0, b1, b2 = w * sums[u, 0], w * sums[u, 1], w * sums[u, 2]
+                b3, b4, b5 = w * sums[u, 3], w * sums[u, 4], w * sums[u, 5]
+                b6, b7, b8 = w * sums[u, 6], w * sums[u, 7], w * sums[u, 8]
+                if k < 0:
+                    k = ~k
+                    b1, b2, b3, b5, b6, b7 = b3, b6, b1, b7, b2, b5
+                o = Index(k)
+                out[o, 0] += b0
+                out[o, 1] += b1
+                out[o, 2] += b2
+                out[o, 3] += b3
+                out[o, 4] += b4
+                out[o, 5] += b5
+                out[o, 6] += b6
+                out[o, 7] += b7
+                out[o, 8] += b8
+
+
+@cached()
+def _finish_diagonal(indptr, values):  # type: ignore[no-untyped-def]
+    """Add the transposed half to the diagonal blocks of values (n_blocks, 9)."""
+    for row in range(len(indptr) - 1):
+        k = indptr[row]
+        for i in range(3):
+            values[k, 4 * i] *= 2.0
+        for i, j in ((1, 3), (2, 6), (5, 7)):
+            values[k, i] = values[k, j] = values[k, i] + values[k, j]
+
+
+@cached()
+def _fill_diagonal(indptr, values, free):  # type: ignore[no-untyped-def]
+    """A one, and 0 in free (n, 3), where nothing is interpolated from a coordinate."""
+    for row in range(len(indptr) - 1):
+        for i in range(3):
+            free[row, i] = 1.0
+            if values[indptr[row], 4 * i] == 0.0:
+                values[indptr[row], 4 * i], free[row, i] = 1.0, 0.0
+
+
+class Galerkin:
+    """The coarse rows of a rank.
+
+    Parameters
+    ----------
+    points : Points
+        The fine ones.
+    pattern : BlockPattern
+        Of the fine rows.
+    start : (n_owned + 1,)
+        Where each fine point's parents begin.
+    parents, weights : (P,)
+        Coarse points, in global numbers, that it is interpolated from.
+    bounds : (ranks + 1,)
+        First coarse point of each rank.
+
+    Attributes
+    ----------
+    points : Points
+        The coarse ones, with those of other ranks that the rows couple to, or are interpolated from, as
+        ghosts.
+    pattern : BlockPattern
+        Of the coarse rows.
+    interpolation : (n_local + 1,), (P,) int32, (P,)
+        Where the parents of each fine point begin, those of ghosts too, in the coarse points' local numbers,
+        and their weights.
+    """
+
+    def __init__(
+        self, points: Points, pattern: BlockPattern, start: Ints, parents: Ints, weights: Array, bounds: Ints
+    ) -> None:
+        comm = points.comm
+        first, end = int(bounds[comm.rank]), int(bounds[comm.rank + 1])
+        everyone, self._weights, self._start = _with_ghosts(points, start, parents, weights)
+        near = np.unique(everyone[(everyone < first) | (everyone >= end)])
+        n, width = end - first, end - first + len(near)
+        self._fine = pattern
+        self._parents = local_numbers(everyone, near, first, end).astype(np.int32)
+        keys, target = self._products(width)
+        one, other = np.divmod(keys, max(width, 1))
+        inside = (one < n) & (other < n)
+        mixed = ~inside
+        symmetric = one < width
+        number = np.concatenate([np.arange(first, end), near])
+        pairs = np.column_stack([number[one - np.where(symmetric, 0, width)], number[other]])[mixed]
+        self._shared = shared = SharedBlocks(comm, bounds, pairs, symmetric[mixed])
+        needed = np.concatenate([shared.columns, everyone])
+        ghosts = np.unique(needed[(needed < first) | (needed >= end)])
+        self.points = Points(comm, bounds, ghosts)
+        local = local_numbers(everyone, ghosts, first, end).astype(np.int32)
+        self.interpolation = self._start, local, self._weights
+        n_local = self.points.n_local
+        own = one[inside] * n_local + other[inside]
+        came = (shared.rows - first) * n_local + local_numbers(shared.columns, ghosts, first, end)
+        final = union(diagonal_keys(n, n_local), own, came)
+        self.pattern = BlockPattern.of_keys(final, n, n_local)
+        shared.into(np.searchsorted(final, came))
+        place = np.empty(len(keys), dtype=np.int64)
+        place[inside] = np.searchsorted(final, own)
+        place[mixed] = len(final) + np.arange(len(pairs))
+        self._offset, self._far = self._where(target, place)
+        self._n_sums = len(final) + len(pairs)
+
+    def _where(self, target: Ints, place: Ints) -> tuple[NDArray[np.uint8], Ints]:
+        """Where products go that add to these keys, whose blocks stand at ``place``."""
+        counts = np.diff(self.pattern.indptr)
+        behind = np.arange(self.pattern.n_blocks) - np.repeat(self.pattern.indptr[:-1], counts)
+        short = np.full(len(place), FAR, dtype=np.uint8)
+        inside = place < len(behind)
+        short[inside] = np.minimum(behind[place[inside]], FAR)
+        offset, far = np.empty(len(target), dtype=np.uint8), [np.empty(0, dtype=np.int64)]
+        for lo in range(0, len(target), CHUNK_PRODUCTS):
+            part = target[lo : lo + CHUNK_PRODUCTS]
+            key = np.where(part < 0, ~part, part)
+            offset[lo : lo + len(part)] = short[key]
+            beyond = short[key] == FAR
+            at = place[key[beyond]]
+            far.append(np.where(part[beyond] < 0, ~at, at))
+        return offset, np.concatenate(far)
+
+    def _products(self, width: int) -> tuple[Ints, Ints]:
+        """All keys, ascending, and which of them each product adds to; ~ of it if transposed."""
+        fine, n = self._fine, self._fine.n_owned
+        rows = fine.indptr, fine.columns, self._start, self._parents
+        n_slots, n_keys = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+        _counts(*rows, width, n_slots, n_keys)
+        self._most = int((n_keys // np.maximum(np.diff(self._start[: n + 1]), 1)).max(initial=0))
+        self._slots = np.empty(int(n_slots.sum()), dtype=np.int16 if self._most < 2**15 else np.int32)
+        firsts = begins(n_slots)
+        chunks = [(lo, min(lo + CHUNK_ROWS, n)) for lo in range(0, n, CHUNK_ROWS)]
+
+        def made(lo: int, hi: int) -> Ints:
+            keys = np.empty(int(n_keys[lo:hi].sum()), dtype=np.int64)
+            _slots(lo, hi, *rows, self._slots[firsts[lo] :], keys, width)
+            return keys
+
+        keys = np.empty(0, dtype=np.int64)
+        for lo, hi in chunks:
+            new = made(lo, hi)
+            keys = union(keys, np.where(new < 0, ~new, new))
+        target = np.empty(int(n_keys.sum()), dtype=index_type(2 * len(keys)))
+        q = 0
+        for lo, hi in chunks:
+            new = made(lo, hi)
+            found = np.searchsorted(keys, np.where(new < 0, ~new, new))
+            target[q : q + len(new)] = np.where(new < 0, ~found, found)
+            q += len(new)
+        return keys, target
+
+    def project(self, values: Array, free: Array) -> tuple[Array, Array]:
+        """Make coarse block rows of fine ones (n_blocks, 3, 3); collective.
+
+        ``free`` (n_owned, 3) is 0 for coordinates that nothing is interpolated to, 1 for others; those are
+        decoupled in ``values``.
+
+        Returns
+        -------
+        values : (n_blocks, 3, 3)
+            The coarse rows.
+        free : (n_owned, 3)
+            1 for coarse coordinates that something is interpolated from, else 0.
+        """
+        fine, n = self._fine, self.pattern.n_blocks
+        sums, coarse_free = np.zeros((self._n_sums, 9)), np.empty((self.pattern.n_owned, 3))
+        rows = fine.indptr, fine.columns, self._start, self._parents, self._weights
+        into = self.pattern.indptr, self._offset, self._far
+        _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, sums)
+        _finish_diagonal(self.pattern.indptr, sums)
+        self._shared.add(sums[n:], sums[:n])
+        _fill_diagonal(self.pattern.indptr, sums, coarse_free)
+        return sums[:n].reshape(-1, 3, 3), coarse_free
+
+
+def _with_ghosts(points: Points, start: Ints, parents: Ints, weights: Array) -> tuple[Ints, Array, Ints]:
+    """Parents and weights of all local points, and where those of each begin; collective."""
+    if points.comm.size == 1:
+        return parents, weights, start
+    counts = np.zeros((points.n_local, 3))
+    counts[: points.n_owned, 0] = np.diff(start)
+    points.update_ghosts(counts)
+    number = counts[:, 0].astype(np.int64)
+    everywhere = begins(number)
+    all_parents, all_weights = np.empty(everywhere[-1], dtype=np.int64), np.empty(everywhere[-1])
+    all_parents[: len(parents)], all_weights[: len(weights)] = parents, weights
+    row = np.zeros((points.n_local, 3))
+    for nth in range(points.comm.allreduce(int(number.max(initial=0)), MPI.MAX)):
+        there = number > nth
+        own = there[: points.n_owned]
+        at = start[:-1][own] + nth
+        row[: points.n_owned][own, 0], row[: points.n_owned][own, 1] = parents[at], weights[at]
+        points.update_ghosts(row)
+        ghosts = np.flatnonzero(there[points.n_owned :]) + points.n_owned
+        all_parents[everywhere[ghosts] + nth] = row[ghosts, 0].astype(np.int64)
+        all_weights[everywhere[ghosts] + nth] = row[ghosts, 1]
+    return all_parents, all_weights, everywhere

@@ -1,0 +1,151 @@
+"""Gauss-Seidel over symmetric block rows of which one half is stored: each sweep reads the matrix once.
+
+A = L + D + Lᵀ with the stored upper half Lᵀ; a sweep gathers with it and, as each unknown is found, scatters
+with it, so that no second pass is needed for the other half or for the residual. Sweeps of a rank see the
+values of others' points as they are given (block Jacobi between ranks). All in single precision: half the
+bytes, which are what a sweep costs, and a preconditioner need not be exact. Indices are unsigned: numba looks
+at the sign of others each time. Tiny numbers are zero, so that no product is below 1.2e-38, the like of which
+takes processors a hundred times longer: a flat sheet's couplings across its plane are round-off.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
+
+TINY = np.float32(1e-20)
+"""Velocities [m/s] below it are none."""
+
+NEGLIGIBLE = 1e-12
+"""Entries below this fraction of the least on the diagonal are none."""
+
+
+@cached(inline="always")
+def _flushed(value):  # type: ignore[no-untyped-def]
+    return value if abs(value) > TINY else np.float32(0.0)
+
+
+@cached()
+def store(indptr, values, blocks):  # type: ignore[no-untyped-def]
+    """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision, without negligible ones."""
+    least = np.float64(np.inf)
+    for row in range(Index(len(indptr) - 1)):
+        k = Index(indptr[row])
+        for i in (0, 4, 8):
+            if 0.0 < values[k, i] < least:
+                least = values[k, i]
+    least *= NEGLIGIBLE
+    for block in range(Index(len(blocks))):
+        for i in range(Index(9)):
+            value = values[block, i]
+            blocks[block, i] = value if abs(value) > least else 0.0
+
+
+@cached()
+def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
+    """Inverses of the symmetric diagonal blocks of values (n_blocks, 9) into inverse (n, 9).
+
+    Of a singular block, of its diagonal.
+    """
+    for row in range(Index(len(inverse))):
+        k = Index(indptr[row])
+        a, b, c = values[k, 0], values[k, 1], values[k, 2]
+        d, e, f = values[k, 4], values[k, 5], values[k, 8]
+        p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+        u, v, w = a * f - c * c, b * c - a * e, a * d - b * b
+        det = a * p + b * q + c * r
+        if abs(det) > 1e-14 * abs(a * d * f):
+            s = 1.0 / det
+            p, q, r, u, v, w = s * p, s * q, s * r, s * u, s * v, s * w
+        else:
+            q = r = v = 0.0
+            p = 1.0 / a if a != 0.0 else 0.0
+            u = 1.0 / d if d != 0.0 else 0.0
+            w = 1.0 / f if f != 0.0 else 0.0
+        inverse[row, 0], inverse[row, 1], inverse[row, 2] = p, q, r
+        inverse[row, 3], inverse[row, 4], inverse[row, 5] = q, u, v
+        inverse[row, 6], inverse[row, 7], inverse[row, 8] = r, v, w
+
+
+@cached(inline="always")
+def _solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """A point's unknowns by the inverse of its block."""
+    y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
+    y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
+    y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
+    return _flushed(y0), _flushed(y1), _flushed(y2)
+
+
+@cached(fastmath=True)
+def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-untyped-def]
+    """A backward sweep from x (n_local, 3) over the owned points: (D + Lᵀ) x = r.
+
+    ``ends`` (n_owned,) says where a row's couplings to ghosts begin. r (n_owned, 4), whose last numbers mean
+    nothing, is what ``forward`` leaves, b − L x before (b, where x is zero), and b − A x after it; but
+    for what has changed in couplings to ghosts.
+    """
+    n = Index(len(ends))
+    for below in range(n):
+        row = n - Index(1) - below
+        lo, hi = Index(indptr[row] + 1), Index(ends[row])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
+        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        r[row, 0] = r[row, 1] = r[row, 2] = 0.0
+        scatter(blocks, columns, r, lo, hi, less)
+
+
+@cached(fastmath=True)
+def subtract_ghosts(rows, indptr, ends, columns, blocks, x, r):  # type: ignore[no-untyped-def]
+    """r −= the couplings of owned rows (n,), those that have some, to ghosts times x (n_local, 3)."""
+    for number in range(Index(len(rows))):
+        row = Index(rows[number])
+        s0, s1, s2 = gather(blocks, columns, x, Index(ends[row]), Index(indptr[row + Index(1)]), AHEAD)
+        r[row, 0] -= s0
+        r[row, 1] -= s1
+        r[row, 2] -= s2
+
+
+@cached(fastmath=True)
+def forward(indptr, ends, columns, blocks, inverse, b, x, r):  # type: ignore[no-untyped-def]
+    """A forward sweep from x (n_local, 3), ghosts as they are; r (n_owned, 4) becomes b − L x."""
+    n = Index(len(ends))
+    for row in range(n):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(n):
+        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
+
+
+@cached(fastmath=True)
+def restrict(start, parents, weights, free, r, out):  # type: ignore[no-untyped-def]
+    """out (C, 3) = interpolationᵀ · r (n, 3), without coordinates that are not free."""
+    out[:] = 0.0
+    for row in range(Index(len(start) - 1)):
+        r0, r1, r2 = free[row, 0] * r[row, 0], free[row, 1] * r[row, 1], free[row, 2] * r[row, 2]
+        for p in range(Index(start[row]), Index(start[row + Index(1)])):
+            c, w = Index(parents[p]), weights[p]
+            out[c, 0] += w * r0
+            out[c, 1] += w * r1
+            out[c, 2] += w * r2
+
+
+@cached(fastmath=True)
+def add_interpolated(start, parents, weights, free, coarse, x):  # type: ignore[no-untyped-def]
+    """x (n, 3) += interpolation · coarse (C, 3) in the free coordinates."""
+    for row in range(Index(len(start) - 1)):
+        e0 = e1 = e2 = np.float32(0.0)
+        for p in range(Index(start[row]), Index(start[row + Index(1)])):
+            c, w = Index(parents[p]), weights[p]
+            e0 += w * coarse[c, 0]
+            e1 += w * coarse[c, 1]
+            e2 += w * coarse[c, 2]
+        x[row, 0] += free[row, 0] * e0
+        x[row, 1] += free[row, 1] * e1
+        x[row, 2] += free[row, 2] * e2

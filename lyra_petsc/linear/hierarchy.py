@@ -1,0 +1,176 @@
+"""The levels of geometric multigrid: coarse meshes, interpolation from them, and Galerkin products."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.linear.coarsening import coarsen
+from lyra_petsc.linear.galerkin import Galerkin
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.mesh.points import Layout, Points
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+COARSEST = 100
+"""Vertices, over all ranks, at which a factorisation takes over."""
+
+WORTH = 0.7
+"""Fraction of the vertices left by a coarsening above which another brings nothing."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A rank's part of the mesh.
+
+    Attributes
+    ----------
+    x : (n_local, 3)
+        Positions [m] that interpolation follows.
+    triangles : (F, 3)
+        Local numbering.
+    """
+
+    x: Array
+    triangles: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class InterpolationRows:
+    """A rank's rows of the interpolation from a coarser level.
+
+    Attributes
+    ----------
+    bounds : (ranks + 1,)
+        First coarse vertex of each rank.
+    start : (n_owned + 1,)
+        Where each vertex' parents begin.
+    parents : (P,)
+        Coarse vertices that it is interpolated from, in global numbers.
+    weights : (P,)
+    """
+
+    bounds: Ints
+    start: Ints
+    parents: Ints
+    weights: Array
+
+
+class Level:
+    """Points of one level, and, but for the coarsest, what makes the next coarser one.
+
+    Attributes
+    ----------
+    points : Points
+    pattern : BlockPattern
+    galerkin : Galerkin or None
+        Interpolates from the next coarser level, and makes its block rows.
+    """
+
+    def __init__(self, points: Points, pattern: BlockPattern) -> None:
+        self.points, self.pattern = points, pattern
+        self.galerkin: Galerkin | None = None
+
+
+class Hierarchy:
+    """All levels of a mesh, finest first; collective.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+    interpolations : sequence of InterpolationRows
+        Between the levels, finest first.
+
+    Attributes
+    ----------
+    levels : list of Level
+    """
+
+    def __init__(
+        self, points: Points, pattern: BlockPattern, interpolations: Sequence[InterpolationRows]
+    ) -> None:
+        level = Level(points, pattern)
+        self.levels = [level]
+        for interpolation in interpolations:
+            rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
+            level.galerkin = Galerkin(level.points, level.pattern, *rows)
+            level = Level(level.galerkin.points, level.galerkin.pattern)
+            self.levels.append(level)
+
+    def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
+        """Of each level, finest first, the block rows that those of the finest make; collective.
+
+        Each is made when it is asked for, and there is room for it only if the one before is let go.
+
+        Parameters
+        ----------
+        values : (n_blocks, 3, 3)
+            Of the finest level.
+        held : (n_local, 3)
+            Its prescribed coordinates.
+
+        Yields
+        ------
+        values : (n_blocks, 3, 3)
+        free : (n_owned, 3)
+            0 for coordinates that take no part in interpolation, 1 for others.
+        """
+        free = np.where(held[: self.levels[0].points.n_owned], 0.0, 1.0)
+        for level in self.levels:
+            yield values, free
+            if level.galerkin is not None:
+                values, free = level.galerkin.project(values, free)
+
+    def destroy(self) -> None:
+        """Free the communication objects of the coarse levels; collective."""
+        for level in self.levels[1:]:
+            level.points.destroy()
+        self.levels = []
+
+
+def interpolations(layout: Layout, surface: Surface, most: int) -> list[InterpolationRows]:
+    """This rank's rows of the interpolations between at most so many levels, finest first; collective.
+
+    Rank 0 makes all coarse meshes, so that they do not depend on the ranks. Nothing is interpolated to the
+    unknowns of edges.
+    """
+    comm, n = layout.comm, layout.n_vertices
+    first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
+    corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
+    parts = comm.gather((surface.x[:n], corners))
+    shares: list[list[InterpolationRows]] = []
+    if parts is not None:
+        x, triangles = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+        del parts
+        shares = _shares(x, triangles, layout.vertex_bounds, most)
+    share: list[InterpolationRows] = comm.scatter(shares)
+    if share and layout.n_owned > n:
+        start = share[0].start
+        share[0] = replace(share[0], start=np.append(start, np.full(layout.n_owned - n, start[-1])))
+    return share
+
+
+def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[InterpolationRows]]:
+    """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers."""
+    shares: list[list[InterpolationRows]] = [[] for _ in bounds[1:]]
+    levels = 1
+    while levels < most and (len(x) > COARSEST or levels == 1):
+        coarse = coarsen(x, triangles)
+        if len(coarse.vertices) > WORTH * len(x):
+            break
+        below = np.searchsorted(coarse.vertices, bounds)
+        for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
+            start = coarse.start[lo : hi + 1]
+            rows = slice(start[0], start[-1])
+            share.append(
+                InterpolationRows(below, start - start[0], coarse.parents[rows], coarse.weights[rows])
+            )
+        x, triangles, bounds = x[coarse.vertices], coarse.triangles, below
+        levels += 1
+    return shares

@@ -1,0 +1,214 @@
+"""The PETSc matrices of a run: the operator, and what preconditioners are built from."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear.block_product import MOST_KEPT, HalfStored
+from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
+from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
+from lyra_petsc.mesh.points import Points
+
+Array = NDArray[np.float64]
+
+FILLED = ("aij", "baij", "sbaij")
+"""Matrix types with entries that block rows are put into."""
+
+
+def _set_vec_type(mat: PETSc.Mat) -> None:
+    """Let vectors made for a matrix be of the type that ``-vec_type`` says."""
+    kind = PETSc.Options().getString("vec_type", "")
+    if kind:
+        mat.setVecType(kind)
+
+
+class _Product:
+    """What PETSc calls of a matrix of type ``python``: the product with block rows of which one half is
+    stored.
+
+    PETSc's own for ``sbaij`` fetches each block past the caches, in which it takes two to three times as
+    long; that for ``baij`` works number by number, and takes twice as long in the caches.
+    """
+
+    def __init__(self, points: Points, pattern: BlockPattern, rows: Array) -> None:
+        self._points = points if points.comm.size > 1 else None
+        self._multiply = HalfStored(pattern, rows)
+        self._operations = 2.0 * 9.0 * pattern.n_couplings
+        n_local = points.n_local if self._points is not None else 0
+        self._local = np.empty((n_local, 3)) if n_local <= MOST_KEPT else None
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = A x; collective."""
+        values = x.getArray(readonly=True).reshape(-1, 3)
+        if self._points is not None:
+            local = np.empty((self._points.n_local, 3)) if self._local is None else self._local
+            local[: len(values)] = values
+            self._points.update_ghosts(local)
+            values = local
+        self._multiply(values, y.getArray().reshape(-1, 3))
+        PETSc.Log.logFlops(self._operations)
+
+    multTranspose = mult  # it is symmetric
+
+
+class BlockMatrix:
+    """A symmetric matrix of 3×3 blocks whose entries are block rows of ours, of which PETSc only asks
+    products.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+
+    Attributes
+    ----------
+    mat : PETSc.Mat
+        Of type ``python``.
+    rows : (n_blocks, 3, 3) float64
+        Its block rows; ``set`` tells PETSc that they changed.
+    followers : list of callables
+        Are given the block rows whenever they change.
+    """
+
+    kind = "python"
+
+    def __init__(self, points: Points, pattern: BlockPattern) -> None:
+        rows = 3 * points.n_owned
+        self.mat = PETSc.Mat().create(points.comm)
+        self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
+        self.mat.setType(PETSc.Mat.Type.PYTHON)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.rows = np.zeros((pattern.n_blocks, 3, 3))
+        self.followers: list[Callable[[Array], None]] = []
+        self._diagonal = pattern.indptr[:-1]
+        self.mat.setPythonContext(_Product(points, pattern, self.rows))
+        _set_vec_type(self.mat)
+        self.mat.setUp()
+        # what PETSc frees when Python is gone must not call it
+        self._detach = weakref.finalize(self, self.mat.setType, PETSc.Mat.Type.SHELL)
+
+    def set(self, values: Array, larger: float = 0.0) -> None:
+        """Replace all entries by block rows ``values`` (n_blocks, 3, 3), mostly ``rows`` themselves;
+        collective.
+
+        Diagonal blocks become ``larger`` by this fraction.
+        """
+        if values is not self.rows:
+            self.rows[:] = values
+        if larger > 0.0:
+            self.rows[self._diagonal] *= 1.0 + larger
+        for follower in self.followers:
+            follower(self.rows)
+        self.mat.assemble()
+        self.mat.stateIncrease()
+
+    def destroy(self) -> None:
+        """Free the matrix; collective."""
+        # solvers that Python has not freed yet hold it, perhaps until Python is gone
+        self._detach()
+        self.mat.destroy()
+
+
+class AssembledMatrix:
+    """A symmetric matrix of 3×3 blocks with entries of PETSc's.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+    kind : str
+        PETSc matrix type where ``-mat_type`` says nothing (``baij``, ``aij``, ``sbaij``).
+    prefix : str
+        Of the options that count, such as ``-mat_type``.
+    diagonal : bool
+        Only diagonal blocks are stored.
+
+    Attributes
+    ----------
+    mat : PETSc.Mat
+    rows : (n_blocks, 3, 3) float64
+        Where to put new block rows together for ``set``.
+    """
+
+    def __init__(
+        self, points: Points, pattern: BlockPattern, kind: str, *, prefix: str = "", diagonal: bool = False
+    ) -> None:
+        comm, rows = points.comm, 3 * points.n_owned
+        self.mat = PETSc.Mat().create(comm)
+        self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
+        self.mat.setType(kind)
+        if not diagonal:
+            self._set_from_options(prefix)
+        self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
+        self._n_blocks, self._diagonal, self._only_diagonal = pattern.n_blocks, pattern.indptr[:-1], diagonal
+        self._rows: Array | None = None
+        if diagonal:
+            keys = diagonal_keys(points.n_owned, points.n_local)
+            pattern = BlockPattern.of_keys(keys, points.n_owned, points.n_local)
+        self._stored = StoredRows(points, pattern, self.kind)
+        inside, outside = self._stored.inside, self._stored.outside
+        if self.kind == "aij":
+            inside, outside = np.repeat(3 * inside, 3), np.repeat(3 * outside, 3)
+        self.mat.setPreallocationNNZ((inside, outside) if comm.size > 1 else inside)
+        # all rows are owned ones, and a block's values stand column by column
+        for option, value in (("SYMMETRIC", True), ("NO_OFF_PROC_ENTRIES", True), ("ROW_ORIENTED", False)):
+            self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
+        _set_vec_type(self.mat)
+        self.mat.setUp()
+        # zeros that nobody touches take no memory
+        self._stored.insert(np.zeros((pattern.n_blocks, 3, 3)), self.mat)
+        self._storage: Storage | None = None
+        ascending = bool(np.all(np.diff(points.ghosts) > 0))
+        if self.kind in KINDS and PETSc.ScalarType == np.float64 and ascending:
+            with suppress(AttributeError, OSError):
+                self._storage = Storage(self.mat, self.kind, pattern, self._stored)
+
+    def _set_from_options(self, prefix: str) -> None:
+        asked = PETSc.Options(prefix).getString("mat_type", "")
+        self.mat.setOptionsPrefix(prefix)
+        try:
+            self.mat.setFromOptions()
+        except PETSc.Error:
+            raise InputError(f"PETSc has no matrix type '{asked}'", key=f"-{prefix}mat_type") from None
+        if str(self.mat.getType()).removeprefix("seq").removeprefix("mpi") not in FILLED:
+            allowed = ", ".join(FILLED)
+            raise InputError(
+                f"'{asked}' cannot be filled by blocks; take {allowed}", key=f"-{prefix}mat_type"
+            )
+
+    @property
+    def rows(self) -> Array:
+        if self._rows is None:
+            self._rows = np.zeros((self._n_blocks, 3, 3))
+        return self._rows
+
+    def set(self, values: Array, larger: float = 0.0) -> None:
+        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective.
+
+        Diagonal blocks become ``larger`` by this fraction.
+        """
+        kept = values[self._diagonal]
+        if self._only_diagonal:
+            values = (1.0 + larger) * kept
+        elif larger > 0.0:
+            values[self._diagonal] = (1.0 + larger) * kept
+        if self._storage is not None:
+            self._storage.write(values)
+        else:
+            self._stored.insert(values, self.mat)
+        if larger > 0.0 and not self._only_diagonal:
+            values[self._diagonal] = kept
+
+    def destroy(self) -> None:
+        """Free the matrix; collective."""
+        self.mat.destroy()
+
+
+Matrix = BlockMatrix | AssembledMatrix

@@ -1,0 +1,179 @@
+"""Block sparsity from the stencils of the active terms, and where each element block goes.
+
+The matrices are symmetric: of two blocks that are each other's transpose one is stored.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.term import Across, Couplings
+
+Ints = NDArray[np.int64]
+Offsets = NDArray[np.int32] | NDArray[np.int64]
+
+LARGEST_INT32 = 2**31 - 1
+
+
+class BlockPattern:
+    """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
+
+    A row holds the columns from its own on: the upper triangle among owned points, and all ghosts. Values of
+    a block stand column by column, as PETSc keeps them.
+
+    Parameters
+    ----------
+    couplings : mapping of name → (E, n) int or Across
+        Local rows that elements couple; only these get an entry, and the diagonal.
+    n_owned, n_local : int
+
+    Attributes
+    ----------
+    n_owned : int
+    indptr : (n_owned + 1,) int64
+        The first block of a row is the diagonal one.
+    columns : (n_blocks,) int32
+        Local column of each block, ascending within a row.
+    offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
+        Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
+        index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
+        both rows. Of `Across` (E,).
+    """
+
+    def __init__(self, couplings: Couplings, n_owned: int, n_local: int) -> None:
+        keys = _with(couplings, diagonal_keys(n_owned, n_local), n_owned, n_local)
+        self._set(keys, n_owned, n_local)
+        self.offsets: dict[str, Offsets] = {}
+        self._locate(couplings, keys, n_local)
+
+    def _locate(self, couplings: Couplings, keys: Ints, n_local: int) -> None:
+        """Find the offsets of elements in the pattern of these keys."""
+        for name, coupling in couplings.items():
+            # terms on the same triangles are wont to have them in the same order
+            alike = [other for other in self.offsets if _same(couplings.get(other), coupling)]
+            self.offsets[name] = (
+                self.offsets[alike[0]] if alike else _offsets(coupling, keys, self.n_owned, n_local)
+            )
+
+    def extended(self, couplings: Couplings, n_local: int) -> tuple[BlockPattern, Ints]:
+        """The pattern with further couplings, among more ghosts than before.
+
+        Returns
+        -------
+        pattern : BlockPattern
+        place : (n_blocks,) int64
+            Which of its blocks each block of this pattern is.
+        """
+        rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
+        own = rows * n_local + self.columns
+        keys = _with(couplings, own, self.n_owned, n_local)
+        made = BlockPattern.of_keys(keys, self.n_owned, n_local)
+        place = np.searchsorted(keys, own)
+        kind = index_type(2 * len(keys))
+        for name, offsets in self.offsets.items():
+            moved = 2 * place[offsets >> 1] + (offsets & 1)
+            made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
+        made._locate(couplings, keys, n_local)
+        return made, place
+
+    @classmethod
+    def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:
+        """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""
+        made = cls.__new__(cls)
+        made._set(keys, n_owned, n_local)
+        made.offsets = {}
+        return made
+
+    def _set(self, keys: Ints, n_owned: int, n_local: int) -> None:
+        self.n_owned = n_owned
+        rows, columns = np.divmod(keys, max(n_local, 1))
+        self.columns: NDArray[np.int32] = columns.astype(np.int32)
+        self.indptr: Ints = begins(np.bincount(rows, minlength=n_owned))
+
+    @property
+    def n_blocks(self) -> int:
+        return len(self.columns)
+
+    @cached_property
+    def ends(self) -> Ints:
+        """Where (n_owned,) the blocks of a row in columns of ghosts begin."""
+        owned = self.columns < self.n_owned
+        if owned.all():
+            return self.indptr[1:]
+        ends: Ints = self.indptr[:-1] + np.diff(begins(owned)[self.indptr])
+        return ends
+
+    @property
+    def n_couplings(self) -> int:
+        """Blocks of the whole rows, both of those that are each other's transpose."""
+        return self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_owned
+
+
+def begins(counts: NDArray[Any]) -> Ints:
+    """Sums (n + 1,) of the first 0, 1, … of ``counts`` (n,): where rows of so many blocks begin and end."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+
+
+def diagonal_keys(n_owned: int, n_local: int) -> Ints:
+    """Keys of the diagonal blocks, ascending."""
+    return np.arange(n_owned, dtype=np.int64) * (n_local + 1)
+
+
+def index_type(largest: int) -> np.dtype[Any]:
+    """The smaller kind of offsets that counts so far."""
+    return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
+
+
+def _pairs(coupling: NDArray[np.int32] | Across) -> list[tuple[int, int]]:
+    """Which rows (a, b), b ≥ a, of elements are coupled."""
+    if isinstance(coupling, Across):
+        return [(0, 1)]
+    n = coupling.shape[1]
+    return [(a, b) for a in range(n) for b in range(a, n)]
+
+
+def _stencil(coupling: NDArray[np.int32] | Across) -> NDArray[np.int32]:
+    return coupling.stencil if isinstance(coupling, Across) else coupling
+
+
+def _same(one: NDArray[np.int32] | Across | None, other: NDArray[np.int32] | Across) -> bool:
+    return one is not None and type(one) is type(other) and np.array_equal(_stencil(one), _stencil(other))
+
+
+def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Ints:
+    key: Ints = np.minimum(one, other).astype(np.int64) * n_local + np.maximum(one, other)
+    return key
+
+
+def _with(couplings: Couplings, keys: Ints, n_owned: int, n_local: int) -> Ints:
+    """The keys, and those of all couplings that this rank stores: row · n_local + column, ascending."""
+    for coupling in couplings.values():
+        stencil = _stencil(coupling)
+        # one row of elements after the other: all couplings at once take much memory
+        for _, pairs in groupby(_pairs(coupling), key=itemgetter(0)):
+            found = (_keys(stencil[:, a], stencil[:, b], n_local) for a, b in pairs)
+            keys = union(keys, *(part[part < n_owned * n_local] for part in found))
+    return keys
+
+
+def union(*parts: Ints) -> Ints:
+    """All numbers, ascending, each once; as ``np.unique``, with one copy less."""
+    numbers = np.concatenate(parts)
+    numbers.sort()
+    return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers
+
+
+def _offsets(coupling: NDArray[np.int32] | Across, keys: Ints, n_owned: int, n_local: int) -> Offsets:
+    stencil, pairs = _stencil(coupling), _pairs(coupling)
+    out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
+    for pair, (a, b) in enumerate(pairs):
+        one, other = stencil[:, a], stencil[:, b]
+        found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one < other)
+        out[:, pair] = np.where(np.minimum(one, other) < n_owned, found, -1)
+    return out[:, 0] if isinstance(coupling, Across) else out

@@ -1,0 +1,97 @@
+"""The PETSc options database: who wins, and what was never used.
+
+Precedence: our defaults < scene ``petsc:`` < ``.petscrc`` < ``PETSC_OPTIONS`` < command line. PETSc has
+read the last three by the time a scene is known, so that a scene and our defaults only fill gaps. The
+database is never cleared.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Mapping
+
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear.reasons import last_words
+
+Value = str | int | float | bool | None
+
+READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidump", "get_total_flops"})
+"""What PETSc asks for only while it leaves."""
+
+
+def fill_gaps(options: Mapping[str, Value]) -> list[str]:
+    """Set each option that nobody has set; returns the names that were set."""
+    database = PETSc.Options()
+    filled = []
+    for name, value in options.items():
+        if not database.hasName(name):
+            database.setValue(name, _text(value))
+            filled.append(name)
+    return filled
+
+
+def is_set(name: str) -> bool:
+    """Whether an option stands in the database."""
+    return bool(PETSc.Options().hasName(name))
+
+
+def petsc_number(name: str, default: float) -> float:
+    """A number from the options database, or ``default``.
+
+    Raises
+    ------
+    InputError
+        If something else stands there.
+    """
+    value = PETSc.Options().getString(name, "")
+    if is_set(name) and not value:
+        raise InputError("needs a number after it", key=f"-{name}")
+    try:
+        return float(PETSc.Options().getReal(name, default))
+    except PETSc.Error:
+        raise InputError(f"must be a number, not '{value}'", key=f"-{name}") from None
+
+
+def refused(error: PETSc.Error) -> InputError:
+    """What PETSc has against an option."""
+    return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
+
+
+def culprits(error: PETSc.Error) -> str:
+    """The options that an error is about: those whose value it quotes, as it does not tell their names."""
+    told = re.split(r"[\s;:,]+", last_words(error))
+    options = PETSc.Options().getAll()
+    names = [f"-{name}" for name, value in options.items() if value and value.strip() in told]
+    return " or ".join(sorted(names)) or "PETSc options"
+
+
+def _text(value: Value) -> str:
+    if value is None or value is True:
+        return "" if value is None else "true"
+    return "false" if value is False else str(value)
+
+
+def unused(ours: list[str]) -> list[str]:
+    """Options in the database that nothing has asked for, but for those of ``ours``.
+
+    petsc4py has no call for this, the C library has: ``PetscOptionsLeftGet``.
+    """
+    try:
+        library = ctypes.CDLL(PETSc.__file__)
+        get = library.PetscOptionsLeftGet
+    except (AttributeError, OSError):
+        return []
+    count = ctypes.c_int64(0)  # PetscInt is 32 or 64 bits wide; little end first
+    names = ctypes.POINTER(ctypes.c_char_p)()
+    values = ctypes.POINTER(ctypes.c_char_p)()
+    get.argtypes = [ctypes.c_void_p] * 4
+    if get(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)):
+        return []
+    found = [names[i].decode() for i in range(count.value)]
+    restore = library.PetscOptionsLeftRestore
+    restore.argtypes = [ctypes.c_void_p] * 4
+    restore(None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values))
+    return sorted(set(found) - set(ours) - READ_AT_THE_END)

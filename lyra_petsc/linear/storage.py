@@ -1,0 +1,204 @@
+"""The arrays in which a PETSc matrix keeps its entries, so that new values reach them in one pass.
+
+petsc4py has no calls for them, the C library has. ``MatSetValues`` looks for every entry's place each time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.vectors import put_plain, put_transposed
+from lyra_petsc.linear.pattern import BlockPattern, begins, index_type
+from lyra_petsc.mesh.points import Points
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+KINDS = {"aij": "AIJ", "baij": "BAIJ"}
+"""Matrix types whose storage is known here, as the C library spells them."""
+
+PORTIONS = 16
+"""In which transposed blocks go through ``MatSetValues``: it is given a copy of them."""
+
+
+@cached(inline="always")
+def _put(block, out, at, across, along):  # type: ignore[no-untyped-def]
+    """Rows of a block as it is stored ``across`` apart, columns ``along``."""
+    for i in range(3):
+        for j in range(3):
+            out[at + across * i + along * j] = block[i, j]
+
+
+@cached()
+def _to_baij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+    """Blocks column by column; those of owned columns apart from those of ghosts."""
+    n, p, q = len(indptr) - 1, 0, 0
+    blocks, inner, outer = values.reshape(-1, 9), inside.reshape(-1, 9), outside.reshape(-1, 9)
+    for row in range(n):
+        for t in range(begin[row], begin[row + 1]):
+            put_transposed(blocks, below[t], inner, p)
+            p += 1
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                put_plain(blocks, k, inner, p)
+                p += 1
+            else:
+                put_plain(blocks, k, outer, q)
+                q += 1
+
+
+@cached()
+def _to_aij(indptr, columns, begin, below, values, inside, outside):  # type: ignore[no-untyped-def]
+    """Three scalar rows for each row of blocks; owned columns apart from ghosts."""
+    n, p, q = len(indptr) - 1, 0, 0
+    for row in range(n):
+        width, beyond = 3 * (begin[row + 1] - begin[row]), 0
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                width += 3
+            else:
+                beyond += 3
+        at = p
+        for t in range(begin[row], begin[row + 1]):
+            _put(values[below[t]], inside, at, width, 1)
+            at += 3
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] < n:
+                _put(values[k], inside, at, 1, width)
+                at += 3
+        at = q
+        for k in range(indptr[row], indptr[row + 1]):
+            if columns[k] >= n:
+                _put(values[k], outside, at, 1, beyond)
+                at += 3
+        p += 3 * width
+        q += 3 * beyond
+
+
+@cached()
+def _transposes(indptr, columns, place, below):  # type: ignore[no-untyped-def]
+    """Blocks of the upper triangle by columns; ``place`` (n_owned,) is where those of each begin."""
+    n = len(indptr) - 1
+    for row in range(n):
+        for k in range(indptr[row] + 1, indptr[row + 1]):
+            c = columns[k]
+            if c < n:
+                below[place[c]] = k
+                place[c] += 1
+
+
+class StoredRows:
+    """The rows that a PETSc matrix of a pattern stores: whole ones, or of ``sbaij`` the upper triangle.
+
+    Parameters
+    ----------
+    points : Points
+    pattern : BlockPattern
+    kind : str
+
+    Attributes
+    ----------
+    inside, outside : (n_owned,) int
+        Blocks of each row in owned columns, and in columns of ghosts.
+    begin, below : (n_owned + 1,) int64, (n_below,) int
+        Compressed rows of what stands before the diagonal: blocks of the pattern, to be transposed.
+    """
+
+    def __init__(self, points: Points, pattern: BlockPattern, kind: str) -> None:
+        self._points, self._pattern = points, pattern
+        n, indptr, columns = points.n_owned, pattern.indptr, pattern.columns
+        own = columns < n
+        self._kept = np.ones(len(columns), dtype=bool)
+        if kind == "sbaij":
+            self.begin, self.below = np.zeros(n + 1, dtype=np.int64), np.empty(0, dtype=np.int32)
+            self._kept[~own] = points.ghosts[columns[~own] - n] > points.start
+        else:
+            self.begin = begins(np.bincount(columns[own], minlength=n) - 1)
+            self.below = np.empty(self.begin[-1], dtype=index_type(len(columns)))
+            _transposes(indptr, columns, self.begin[:-1].copy(), self.below)
+        self.inside = (np.diff(self.begin) + _per_row(own, indptr)).astype(PETSc.IntType)
+        self.outside = _per_row(self._kept & ~own, indptr).astype(PETSc.IntType)
+
+    def insert(self, values: Array, mat: PETSc.Mat) -> None:
+        """Set all entries by ``MatSetValues``; collective."""
+        indptr, columns, kept = self._pattern.indptr, self._pattern.columns, self._kept
+        numbers = self._points.global_number
+        if not kept.all():
+            columns, values, indptr = columns[kept], values[kept], begins(_per_row(kept, indptr))
+        _set(mat, indptr, numbers[columns], values)
+        edges = np.linspace(0, len(self.below), PORTIONS + 1).astype(np.int64)
+        for lo, hi in itertools.pairwise(edges):
+            part = self.below[lo:hi]
+            rows = np.searchsorted(self._pattern.indptr, part, side="right") - 1
+            # all rows, most of them empty: petsc4py takes no others
+            _set(mat, np.clip(self.begin, lo, hi) - lo, numbers[rows], values[part].transpose(0, 2, 1))
+        mat.assemble()
+
+
+def _set(mat: PETSc.Mat, indptr: Ints, columns: Ints, blocks: Array) -> None:
+    indices = indptr.astype(PETSc.IntType), columns.astype(PETSc.IntType)
+    mat.setValuesBlockedCSR(*indices, np.ascontiguousarray(blocks), PETSc.InsertMode.INSERT)
+
+
+def _per_row(flags: NDArray[np.bool_], indptr: Ints) -> Ints:
+    """How many blocks (n_blocks,) of each row are flagged."""
+    counts: Ints = np.diff(begins(flags)[indptr])
+    return counts
+
+
+class Storage:
+    """Writes block rows into the arrays of an assembled matrix.
+
+    Parameters
+    ----------
+    mat : PETSc.Mat
+        With the entries of the pattern and no others; assembled. Columns of ghosts ascend as the ghosts do.
+    kind : str
+        A key of ``KINDS``.
+    pattern : BlockPattern
+    stored : StoredRows
+
+    Raises
+    ------
+    AttributeError, OSError
+        If the C library does not offer the calls.
+    """
+
+    def __init__(self, mat: PETSc.Mat, kind: str, pattern: BlockPattern, stored: StoredRows) -> None:
+        library, name = ctypes.CDLL(PETSc.__file__), KINDS[kind]
+        self._get = getattr(library, f"MatSeq{name}GetArray")
+        self._give_back = getattr(library, f"MatSeq{name}RestoreArray")
+        self._mat = mat
+        self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
+        self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
+        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if mat.getComm().size > 1 else None
+        self._fill = {"aij": _to_aij, "baij": _to_baij}[kind]
+
+    def write(self, values: Array) -> None:
+        """Replace all entries by block rows (n_blocks, 3, 3); collective."""
+        parts = self._parts()
+        arrays = [self._array(part, size) for part, size in zip(parts, self._sizes, strict=False)]
+        self._fill(*self._rows, values, *arrays, *[np.empty(0)] * (2 - len(arrays)))
+        for part in parts:
+            self._give_back(part, ctypes.byref(ctypes.c_void_p()))
+        self._mat.assemble()
+
+    def _array(self, part: ctypes.c_void_p, size: int) -> Array:
+        pointer = ctypes.POINTER(ctypes.c_double)()
+        self._get(part, ctypes.byref(pointer))
+        return np.ctypeslib.as_array(pointer, (size,)) if size else np.empty(0)
+
+    def _parts(self) -> list[ctypes.c_void_p]:
+        """This rank's matrices of entries in owned columns and in ghosts'."""
+        whole = ctypes.c_void_p(self._mat.handle)
+        if self._split is None:
+            return [whole]
+        inside, outside, columns = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_void_p()
+        self._split(whole, ctypes.byref(inside), ctypes.byref(outside), ctypes.byref(columns))
+        return [inside, outside]

@@ -1,0 +1,208 @@
+"""Geometric multigrid of ours: ``-pc_type python`` with the ``-pc_python_type`` of ``presets``.
+
+A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
+is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) three are visited twice,
+as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear import gauss_seidel as sweeps
+from lyra_petsc.linear.hierarchy import Hierarchy, Level
+from lyra_petsc.linear.matrix import AssembledMatrix
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+TWICE = 3
+"""Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
+
+
+HUGE = 1e30
+"""No preconditioner has such entries."""
+
+
+class Smoother:
+    """The arrays that a level's sweeps and its interpolation work on.
+
+    Attributes
+    ----------
+    b, x : (n_local, 3)
+        Right-hand side and solution.
+    r : (n_owned, 4)
+        Residual, and numbers without a meaning.
+    """
+
+    def __init__(self, level: Level) -> None:
+        pattern, points = level.pattern, level.points
+        self.points = points
+        n = points.n_owned
+        self._rows = pattern.indptr, pattern.ends, pattern.columns
+        self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
+        self._inverse = np.empty((n, 9), dtype=np.float32)
+        self.x = np.zeros((points.n_local, 3), dtype=np.float32)
+        self.b = np.zeros_like(self.x)
+        self.r = np.zeros((n, 4), dtype=np.float32)
+        assert level.galerkin is not None
+        self._coarse = level.galerkin.points
+        start, parents, weights = level.galerkin.interpolation
+        self._parents = start, parents, weights.astype(np.float32)
+        self._free = np.ones_like(self.x)
+
+    def set(self, values: Array, free: Array) -> None:
+        """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
+        values, first = values.reshape(-1, 9), self._rows[0]
+        sweeps.store(first, values, self._blocks)
+        sweeps.invert_diagonal(first, values, self._inverse)
+        self._free[: len(free)] = free
+        self.points.update_ghosts(self._free)
+
+    def before(self, coarse: Floats, *, again: bool) -> None:
+        """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
+
+        From zero, or again from where ``after`` ended.
+        """
+        if again:
+            self._subtract_ghosts(np.zeros_like(self.x[self.points.n_owned :]))
+        else:
+            self.x[:] = 0.0
+            self.r[:, :3] = self.b[: len(self.r)]
+        seen = self.x[self.points.n_owned :].copy()
+        sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
+        self._subtract_ghosts(seen)
+        start, *parents = self._parents
+        sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
+        self._coarse.add_to_owners(coarse)
+
+    def _subtract_ghosts(self, seen: Floats) -> None:
+        """Let the residual follow the ghosts, of which it has seen these values; collective."""
+        if self.points.comm.size > 1:
+            self.points.update_ghosts(self.x)
+            ghosts = self.x[self.points.n_owned :]
+            ghosts -= seen
+            sweeps.subtract_ghosts(self._edge, *self._rows, self._blocks, self.x, self.r)
+            ghosts += seen
+
+    def after(self, coarse: Floats) -> None:
+        """Add what the coarser level found, and sweep; collective.
+
+        What is interpolated to ghosts is not worth a message: ``before`` left them as their owners have them.
+        """
+        self._coarse.update_ghosts(coarse)
+        sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+        sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
+
+
+class Coarsest:
+    """The last level, solved by a KSP of its own (``-mg_coarse_``)."""
+
+    def __init__(self, level: Level) -> None:
+        self.points = level.points
+        self.matrix = AssembledMatrix(level.points, level.pattern, "aij", prefix="mg_coarse_")
+        self.x, self.b = (np.zeros((level.points.n_local, 3), dtype=np.float32) for _ in range(2))
+        self._solution, self._rhs = self.matrix.mat.createVecs()
+        self._ksp = PETSc.KSP().create(level.points.comm)
+        self._ksp.setOptionsPrefix("mg_coarse_")
+        self._ksp.setType(PETSc.KSP.Type.PREONLY)
+        self._ksp.setFromOptions()
+
+    def set(self, values: Array, free: Array) -> None:
+        """Take new block rows (n_blocks, 3, 3); collective."""
+        self.matrix.set(values)
+        self._ksp.setOperators(self.matrix.mat)
+
+    def solve(self) -> None:
+        """x of b; collective."""
+        n = self.points.n_owned
+        self._rhs.getArray()[:] = self.b[:n].ravel()
+        self._ksp.solve(self._rhs, self._solution)
+        self.x[:n] = self._solution.getArray().reshape(-1, 3)
+
+    def destroy(self) -> None:
+        """Free the PETSc objects; collective."""
+        for item in (self._ksp, self.matrix, self._solution, self._rhs):
+            item.destroy()
+
+
+class VCycle:
+    """What PETSc's PC of type python makes and calls; its levels are given to it by ``attach``."""
+
+    def __init__(self) -> None:
+        self._levels: list[Smoother | Coarsest] = []
+        self._renew: Callable[[], Iterator[tuple[Array, Array]]] | None = None
+        self._twice_from = 0
+
+    def setFromOptions(self, pc: PETSc.PC) -> None:
+        """Read ``-pc_mg_w_from``."""
+        self._twice_from = PETSc.Options(pc.getOptionsPrefix()).getInt("pc_mg_w_from", 0)
+
+    def attach(self, hierarchy: Hierarchy, renew: Callable[[], Iterator[tuple[Array, Array]]]) -> None:
+        """Work on these levels, whose present block rows ``renew`` makes; collective."""
+        *finer, coarsest = hierarchy.levels
+        self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
+        self._renew = renew
+
+    def setUp(self, pc: PETSc.PC) -> None:
+        """Take the levels' new block rows, when the matrix has changed; collective.
+
+        Raises
+        ------
+        InputError
+            As a part of another preconditioner, which has no levels to give.
+        """
+        if self._renew is None:
+            prefix = pc.getOptionsPrefix() or ""
+            raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
+        for level, rows in zip(self._levels, self._renew(), strict=True):
+            level.set(*rows)
+
+    def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """x = one cycle on b; collective."""
+        finest, n = self._levels[0], b.getLocalSize() // 3
+        finest.b[:n] = b.getArray(readonly=True).reshape(-1, 3)
+        self._visit(0)
+        found = finest.x[:n]
+        if math.isfinite(float(np.vdot(found, found))):
+            x.getArray()[:] = found.ravel()
+        else:
+            # sweeps over an indefinite matrix can grow without bound; of this PETSc says just that
+            x.getArray()[:] = -HUGE * b.getArray(readonly=True)
+
+    def _visit(self, number: int, *, again: bool = False) -> None:
+        """Let x of a level be what it finds for its b, from zero or going on; collective."""
+        level, coarser = self._levels[number], number + 1
+        if isinstance(level, Coarsest):
+            level.solve()
+            return
+        below = self._levels[coarser]
+        level.before(below.b, again=again)
+        self._visit(coarser)
+        if 0 < self._twice_from <= coarser < min(self._twice_from + TWICE, len(self._levels) - 1):
+            self._visit(coarser, again=True)
+        level.after(below.x)
+
+    def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        """For ``-ksp_view`` and ``-snes_view``."""
+        sizes = [level.points.n_global for level in self._levels]
+        again = f", {TWICE} of them twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
+        viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices{again}\n")
+
+    def destroy(self, pc: PETSc.PC) -> None:
+        """Free the PETSc objects; collective."""
+        self.detach()
+
+    def detach(self) -> None:
+        """Let go of the levels; collective."""
+        for level in self._levels:
+            if isinstance(level, Coarsest):
+                level.destroy()
+        self._levels, self._renew = [], None

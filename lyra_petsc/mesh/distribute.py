@@ -1,0 +1,229 @@
+"""Hand each rank its part of the mesh: its block rows, its elements, their constants.
+
+Each rank gets every element that touches a row it owns, so that assembly needs no communication
+beyond the ghost update; elements it counts (energies) come first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from mpi4py.util import pkl5
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
+from lyra_petsc.mesh.points import Ints, Layout, Numbering, Unknowns
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Whole:
+    """What there is to distribute, on rank 0.
+
+    Attributes
+    ----------
+    n_vertices : int
+    triangles : (F, 3) int64
+        For the partitioner's graph.
+    elements : dict of name → Elements
+        In mesh numbering.
+    vertex_data : dict of name → (V, …) array
+    edges : (N, 2) int64 or None
+        Vertices of the mesh's edges, where elements couple unknowns on edges.
+    """
+
+    n_vertices: int
+    triangles: Ints
+    elements: dict[str, Elements]
+    vertex_data: dict[str, Array]
+    edges: Ints | None = None
+
+
+@dataclass
+class Part:
+    """One rank's share.
+
+    Attributes
+    ----------
+    layout : Layout
+    elements : dict of name → Elements
+        In local numbering; counted elements first.
+    vertex_data : dict of name → (n_vertices, …) array
+    partitioner : str
+        What cut the mesh.
+    """
+
+    layout: Layout
+    elements: dict[str, Elements]
+    vertex_data: dict[str, Array]
+    partitioner: str
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Block rows of the whole mesh (rank 0).
+
+    Attributes
+    ----------
+    bounds : (ranks + 1,) int64
+        First row of each rank.
+    vertex, vertex_owner : (V,) int64
+        Row of each vertex, and the rank that owns it.
+    edge, edge_owner, component : (N,) int64
+        The same of each edge's unknown, and which of the three of its row it is; −1 for edges without one.
+    unknowns : list of Unknowns
+        Of each rank.
+    """
+
+    bounds: Ints
+    vertex: Ints
+    vertex_owner: Ints
+    edge: Ints
+    edge_owner: Ints
+    component: Ints
+    unknowns: list[Unknowns]
+
+    @classmethod
+    def build(cls, vertices: Numbering, whole: Whole) -> Rows:
+        """The rows of numbered vertices, and of the edges whose unknowns elements couple."""
+        n_ranks = len(vertices.bounds) - 1
+        n_vertices = np.diff(vertices.bounds)
+        n_edges, edges_of = np.zeros_like(n_vertices), [np.empty(0, dtype=np.int64)] * n_ranks
+        edge = edge_owner = component = np.empty(0, dtype=np.int64)
+        used = [each.edges.ravel() for each in whole.elements.values() if each.edges is not None]
+        bounds, vertex = vertices.bounds, vertices.number
+        if used:
+            assert whole.edges is not None
+            chosen = np.unique(np.concatenate(used))
+            # an edge goes with its lesser vertex: so three unknowns of a row belong to edges around one
+            # vertex
+            ends = np.sort(vertices.number[whole.edges[chosen]], axis=1)
+            owner = np.searchsorted(vertices.bounds, ends[:, 0], side="right") - 1
+            order = np.lexsort((ends[:, 1], ends[:, 0], owner))
+            chosen, owner = chosen[order], owner[order]
+            n_edges = np.bincount(owner, minlength=n_ranks)
+            edges_of = np.split(order, np.cumsum(n_edges)[:-1])
+            bounds = np.concatenate([[0], np.cumsum(n_vertices + -(-n_edges // 3))])
+            vertex = vertices.number + (bounds - vertices.bounds)[vertices.owner]
+            place = np.arange(len(chosen)) - (np.cumsum(n_edges) - n_edges)[owner]
+            edge, edge_owner, component = (np.full(len(whole.edges), -1, dtype=np.int64) for _ in range(3))
+            edge[chosen] = bounds[owner] + n_vertices[owner] + place // 3
+            edge_owner[chosen], component[chosen] = owner, place % 3
+        by_number = np.argsort(vertices.number)
+        unknowns = [
+            Unknowns(n_vertices, n_edges, by_number[lo:hi], edges)
+            for lo, hi, edges in zip(vertices.bounds, vertices.bounds[1:], edges_of, strict=False)
+        ]
+        return cls(bounds, vertex, vertices.owner, edge, edge_owner, component, unknowns)
+
+    def of_elements(self, elements: Elements, index: Ints) -> Ints:
+        """Rows (n, …) that the elements ``index`` (n,) touch: of their vertices, then of their edges."""
+        vertices: Ints = self.vertex[elements.stencil[index]]
+        if elements.edges is None:
+            return vertices
+        return np.concatenate([vertices, self.edge[elements.edges[index]]], axis=1)
+
+    def owners(self, elements: Elements) -> Ints:
+        """Ranks (E, …) that own the rows that each element touches."""
+        vertices: Ints = self.vertex_owner[elements.stencil]
+        if elements.edges is None:
+            return vertices
+        return np.concatenate([vertices, self.edge_owner[elements.edges]], axis=1)
+
+
+def split_elements(owner: NDArray[np.int64], n_ranks: int) -> list[tuple[Ints, int]]:
+    """Elements of each rank from the owners (E, n) of their rows.
+
+    Returns
+    -------
+    list of (indices, n_owned)
+        Per rank the elements that touch a row it owns, those it counts first. An element is counted
+        by the owner of its first vertex.
+    """
+    n_elements = len(owner)
+    pairs = (
+        np.unique((owner * n_elements + np.arange(n_elements)[:, None]).ravel())
+        if n_elements
+        else owner.ravel()
+    )
+    ranks, elements = np.divmod(pairs, max(n_elements, 1))
+    ends = np.searchsorted(ranks, np.arange(n_ranks + 1))
+    pieces = []
+    for rank in range(n_ranks):
+        mine = elements[ends[rank] : ends[rank + 1]]
+        counted = owner[mine, 0] == rank
+        pieces.append((np.concatenate([mine[counted], mine[~counted]]), int(counted.sum())))
+    return pieces
+
+
+def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
+    """Partition the mesh and give each rank its part; collective. ``whole`` is read on rank 0 only."""
+    n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
+    graph = vertex_graph([whole.triangles], n_vertices) if whole else None
+    owner, name = partition(comm, graph, n_vertices)
+    post = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
+    if comm.rank == 0:
+        assert whole is not None
+        assert owner is not None
+        assert graph is not None
+        rows = Rows.build(Numbering.build(owner, locality_order(graph), comm.size), whole)
+        del graph
+        pieces = _pieces(whole, rows, comm.size)
+        own = None
+        for rank, piece in enumerate(pieces):
+            if rank == 0:
+                own = piece
+            else:
+                post.send(piece, dest=rank)
+        piece = own
+    else:
+        piece = post.recv(source=0)
+    bounds, ghosts, unknowns, elements, vertex_data = piece
+    return Part(Layout(comm, bounds, ghosts, unknowns), elements, vertex_data, name)
+
+
+def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
+    """One picklable piece after the other, so that rank 0 holds one at a time."""
+    split = {name: split_elements(rows.owners(each), n_ranks) for name, each in whole.elements.items()}
+    for rank in range(n_ranks):
+        lo, hi = rows.bounds[rank], rows.bounds[rank + 1]
+        touched = {
+            name: rows.of_elements(whole.elements[name], mine[rank][0]) for name, mine in split.items()
+        }
+        every = np.unique(np.concatenate([t.ravel() for t in touched.values()] or [np.empty(0, np.int64)]))
+        ghosts = every[(every < lo) | (every >= hi)]
+        elements = {}
+        for name, (index, n_owned) in ((n, s[rank]) for n, s in split.items()):
+            each = whole.elements[name]
+            n = each.stencil.shape[1]
+            local = local_numbers(touched[name], ghosts, lo, hi)
+            order = _by_locality(local[:, :n], n_owned)
+            index, local = index[order], local[order]
+            data = {key: np.ascontiguousarray(v[index]) for key, v in each.data.items()}
+            counts = np.promote_types(np.int32, np.min_scalar_type(-len(each.stencil)))
+            edges = None if each.edges is None else 3 * local[:, n:] + rows.component[each.edges[index]]
+            stencil = local[:, :n].astype(np.int32)
+            elements[name] = Elements(stencil, data, n_owned, index.astype(counts), edges)
+        own = rows.unknowns[rank]
+        vertex_data = {key: np.ascontiguousarray(v[own.vertices]) for key, v in whole.vertex_data.items()}
+        yield rows.bounds, ghosts, own, elements, vertex_data
+
+
+def local_numbers(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
+    """Local numbers of global ones: owned from 0, ghosts, which ascend, after them."""
+    inside = (numbers >= lo) & (numbers < hi)
+    local: Ints = np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
+    return local
+
+
+def _by_locality(stencil: Ints, n_owned: int) -> Ints:
+    """An order of the elements, counted ones first, that walks through memory."""
+    if len(stencil) == 0:
+        return np.empty(0, dtype=np.int64)
+    points = np.sort(stencil, axis=1).T
+    order: Ints = np.lexsort((*points[::-1], np.arange(len(stencil)) >= n_owned))
+    return order

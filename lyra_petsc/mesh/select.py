@@ -1,0 +1,109 @@
+"""Vertices and triangles picked by group, by number or by box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.mesh.measures import bounding_diagonal
+from lyra_petsc.mesh.mesh import Group, Mesh
+from lyra_petsc.mesh.readers import first_few
+from lyra_petsc.scene.schema import VertexChoice
+
+DIMENSION_NAMES = ("point", "curve", "surface", "volume")
+
+
+def select_vertices(
+    mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None
+) -> NDArray[np.int64]:
+    """Vertices a selector names, ascending, each once.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    selector : VertexChoice
+        With a group, numbers or a box; the box includes its faces, give or take 1e-9 of the mesh's size.
+    key : str
+        The scene key of the selector, for messages (``handles[0]``).
+    file : optional
+        The scene file, for messages.
+
+    Returns
+    -------
+    (n,) int64
+
+    Raises
+    ------
+    InputError
+        Unknown group, vertex out of range, or nothing selected.
+    """
+    if selector.group is not None:
+        return find_group(mesh, selector.group, key=f"{key}.group", file=file).vertices
+    if selector.nodes is not None:
+        return _numbered(mesh, selector.nodes, key=f"{key}.nodes", file=file)
+    assert selector.box is not None
+    return _boxed(mesh, selector.box, key=f"{key}.box", file=file)
+
+
+def select_triangles(
+    mesh: Mesh, group: str | None, *, key: str, file: object | None = None
+) -> NDArray[np.int64]:
+    """Triangles of a surface group, ascending; all triangles for ``None``.
+
+    Raises
+    ------
+    InputError
+        Unknown group, or one of points or curves.
+    """
+    if group is None:
+        return np.arange(mesh.n_triangles, dtype=np.int64)
+    found = find_group(mesh, group, key=key, file=file)
+    if found.dimension != 2:
+        surfaces = [name for name, candidate in mesh.groups.items() if candidate.dimension == 2]
+        raise InputError(
+            f"group '{group}' is a {DIMENSION_NAMES[found.dimension]} group and has no triangles; "
+            f"surface groups: {first_few(sorted(surfaces), 20) or 'none'}",
+            key=key,
+            file=file,
+        )
+    return found.triangles
+
+
+def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -> Group:
+    """The group of that name.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message gives the nearest name and those that exist.
+    """
+    found = mesh.groups.get(name)
+    if found is not None:
+        return found
+    raise InputError(f"no group '{name}' in the mesh; {nearest(name, mesh.groups)}", key=key, file=file)
+
+
+def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> NDArray[np.int64]:
+    wrong = [node for node in nodes if node >= mesh.n_vertices]
+    if wrong:
+        raise InputError(
+            f"no vertex {first_few(wrong)}; the mesh has vertices 0 to {mesh.n_vertices - 1}",
+            key=key,
+            file=file,
+        )
+    return np.unique(np.asarray(nodes, dtype=np.int64))
+
+
+def _boxed(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> NDArray[np.int64]:
+    corners = np.asarray(box, dtype=np.float64)
+    slack = 1e-9 * bounding_diagonal(mesh.positions)
+    low, high = corners.min(axis=0) - slack, corners.max(axis=0) + slack
+    inside = np.flatnonzero(((mesh.positions >= low) & (mesh.positions <= high)).all(axis=1))
+    if inside.size == 0:
+        first, last = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
+        span = " to ".join("[" + ", ".join(f"{x:.6g}" for x in point) + "]" for point in (first, last))
+        raise InputError(f"no vertex lies in the box; the mesh spans {span}", key=key, file=file)
+    return inside.astype(np.int64)

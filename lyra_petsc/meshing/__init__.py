@@ -1,1 +1,0 @@
-"""Mesh sources (.geo, .msh, .obj, grids) → vertices, triangles, material coordinates, groups."""

@@ -1,0 +1,131 @@
+"""Fields that a scene may ask for beside the positions; one function and one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.stepping.problem import Model
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.bending import Bending
+
+Array = NDArray[np.float64]
+
+
+def _velocity(model: Model) -> Array:
+    return model.system.written_velocity()[: model.points.n_vertices]
+
+
+def _green_strain(model: Model) -> Array:
+    return model.membrane.strain_and_stress(model.system.x)[0][: model.membrane.n_owned]
+
+
+def _stress(model: Model) -> Array:
+    return model.membrane.strain_and_stress(model.system.x)[1][: model.membrane.n_owned]
+
+
+def _membrane_energy(model: Model) -> Array:
+    membrane = model.membrane
+    density: Array = membrane.energies(model.system.x) / membrane.elements.data["area"][: membrane.n_owned]
+    return density
+
+
+def _to_vertices(model: Model, bending: Bending, on_hinges: Array) -> Array:
+    """Halves of what hinges carry, summed on their edges' ends and divided by the vertices' rest area."""
+    n_local, n_owned = model.points.n_local, model.points.n_vertices
+    ends = bending.stencil[:, :2].ravel()
+    carried = np.bincount(ends, np.repeat(0.5 * on_hinges, 2), n_local)
+    membrane = model.membrane
+    thirds = np.repeat(membrane.elements.data["area"] / 3.0, 3)
+    area = np.bincount(membrane.stencil.ravel(), thirds, n_local)
+    density: Array = carried[:n_owned] / area[:n_owned]
+    return density
+
+
+def _bending_energy(model: Model) -> Array:
+    bending = _bending(model)
+    return _to_vertices(model, bending, bending.all_energies(model.system.x, bending.n_elements))
+
+
+def _curvature(model: Model) -> Array:
+    bending, x = _bending(model), model.system.x
+    # what a collapsed triangle has for an angle says nothing
+    angles = bending.weights(x) * bending.angles(x)
+    return _to_vertices(model, bending, -bending.elements.data["length"] * angles)
+
+
+def _bending(model: Model) -> Bending:
+    """The term of the hinges, which `check_field` has seen."""
+    from lyra_petsc.terms.bending import Bending
+
+    return next(term for term in model.terms.values() if isinstance(term, Bending))
+
+
+def _rank(model: Model) -> Array:
+    return np.full(model.points.n_vertices, float(model.points.comm.rank))
+
+
+@dataclass(frozen=True)
+class Field:
+    """Where a field lives, what it is, and how it is computed on one rank (owned rows)."""
+
+    name: str
+    on: Literal["vertex", "triangle"]
+    meaning: str
+    compute: Callable[[Model], Array]
+    term: str = "membrane"
+
+
+FIELDS = {
+    field.name: field
+    for field in (
+        Field("velocity", "vertex", "m/s, (V, 3)", _velocity),
+        Field("green_strain", "triangle", "E_uu, E_vv, E_uv in material axes, (F, 3)", _green_strain),
+        Field("stress", "triangle", "second Piola-Kirchhoff S_uu, S_vv, S_uv, N/m, (F, 3)", _stress),
+        Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
+        Field(
+            "bending_energy",
+            "vertex",
+            "J per m² of rest area, hinges averaged, (V,)",
+            _bending_energy,
+            "bending",
+        ),
+        Field("curvature", "vertex", "κ1 + κ2, 1/m, hinge angles averaged, (V,)", _curvature, "bending"),
+        Field("rank", "vertex", "owning rank, (V,)", _rank),
+    )
+}
+
+
+def chosen(model: Model) -> list[Field]:
+    """The fields a scene asks for.
+
+    Raises
+    ------
+    InputError
+        For a field of a term that the scene does not have.
+    """
+    fields = [FIELDS[name] for name in model.scene.output.fields]
+    for field in fields:
+        check_field(field, model)
+    return fields
+
+
+def check_field(field: Field, model: Model) -> None:
+    """Refuse a field of a term that the scene does not have.
+
+    Raises
+    ------
+    InputError
+    """
+    if field.term not in model.terms:
+        raise InputError(
+            f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",
+            file=model.scene.source,
+            key="output.fields",
+        )

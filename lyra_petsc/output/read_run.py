@@ -1,0 +1,436 @@
+"""A run's folder, read by one process while the run goes on or afterwards."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from xml.etree.ElementTree import Element, ParseError, parse
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.summary import read_summary
+from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
+
+if TYPE_CHECKING:
+    from lyra_petsc.scene.schema import Scene
+
+Array = NDArray[np.float64]
+Columns: TypeAlias = dict[str, NDArray[Any]]
+
+Place: TypeAlias = tuple[str, str]
+"""File, relative to the run's folder, and name of a dataset in it."""
+
+
+ENERGIES = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
+ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
+COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"})
+"""Columns of whole numbers."""
+
+
+class Run:
+    """The results of one run. Nothing is read before it is asked for, no file stays open.
+
+    Parameters
+    ----------
+    folder : path
+        As in ``runs/flag``.
+
+    Attributes
+    ----------
+    folder : Path
+    times : (n_states,) float64
+        When the states were written [s]; load factors in a static analysis.
+    fields : tuple of str
+        What the states hold besides the positions.
+
+    Raises
+    ------
+    InputError
+        If it is not the folder of a run, or no state is written yet.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self._look()
+
+    def _look(self) -> None:
+        self._stamp = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
+        self._states: list[StoredState] = announced_states(self.folder)
+        self.times: Array = np.array([state.time for state in self._states])
+        first = self._states[0].fields
+        # a run that was resumed with other fields has them in some states only
+        self.fields = tuple(name for name in first if all(name in state.fields for state in self._states))
+
+    def refresh(self) -> bool:
+        """See what a run that goes on has written meanwhile.
+
+        Returns
+        -------
+        bool
+            Whether there are other states than before.
+
+        Raises
+        ------
+        InputError
+            If the results are gone.
+        """
+        for name in ("_history", "summary", "scene"):
+            self.__dict__.pop(name, None)
+        states, mesh = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
+        if mesh != self._stamp[1]:  # replaced by another run
+            for name in ("_mesh", "triangles", "rest"):
+                self.__dict__.pop(name, None)
+        if (states, mesh) == self._stamp:
+            return False
+        self._look()
+        return True
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.absolute().name
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def __repr__(self) -> str:
+        return f"<run {self.folder}: {len(self)} states, t = {self.times[0]:g} to {self.times[-1]:g} s>"
+
+    # -- mesh ----------------------------------------------------------------------------------------
+
+    @cached_property
+    def _mesh(self) -> dict[str, NDArray[Any]]:
+        """Texture coordinates, by the names they have in the file."""
+        path = self.folder / MESH_FILE
+        try:
+            with import_h5py().File(path, "r") as file:
+                mesh = file["mesh"]
+                given = bool(mesh.attrs.get("vt", 0))
+                return {name: mesh[name][()] for name in ("uv", "corner_uv") if given and name in mesh}
+        except HDF5_ERRORS as error:
+            raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+
+    @cached_property
+    def triangles(self) -> NDArray[np.int64]:
+        """(F, 3) vertices of each triangle, both in the order of the mesh file."""
+        return read_array(self.folder, (MESH_FILE, "mesh/triangles"))
+
+    @cached_property
+    def rest(self) -> Array:
+        """(V, 3) rest shape [m]."""
+        return read_array(self.folder, (MESH_FILE, "mesh/rest"))
+
+    @property
+    def uv(self) -> Array | None:
+        """(V, 2) texture coordinates (``vt``) [m]; None if the mesh has none, or has seams."""
+        return self._mesh.get("uv")
+
+    @property
+    def corner_uv(self) -> Array | None:
+        """(F, 3, 2) texture coordinates (``vt``) [m] of the triangles' corners; None without ``vt``."""
+        uv = self.uv
+        return self._mesh.get("corner_uv") if uv is None else uv[self.triangles]
+
+    # -- states --------------------------------------------------------------------------------------
+
+    @property
+    def positions(self) -> StateArrays:
+        """(V, 3) [m] for each state."""
+        return StateArrays(self.folder, "positions", [state.position for state in self._states])
+
+    @property
+    def velocities(self) -> StateArrays:
+        """(V, 3) [m/s] for each state, if the scene's ``output.fields`` names ``velocity``."""
+        return self.field("velocity")
+
+    def field(self, name: str) -> StateArrays:
+        """What the states hold under a name: (V,), (V, 3), (F,) or (F, 3) for each.
+
+        Raises
+        ------
+        InputError
+            If they do not hold it.
+        """
+        if name not in self.fields:
+            what = nearest(name, self.fields) if self.fields else "the states hold positions alone"
+            raise InputError(
+                f"no field {name!r}, {what}; a scene's output.fields names them", file=self.folder
+            )
+        return StateArrays(self.folder, name, [state.fields[name] for state in self._states])
+
+    def field_units(self, name: str) -> str:
+        """Unit of a field, as in ``N/m``; ``1`` for plain numbers."""
+        from lyra_petsc.scene.schema import FIELD_UNITS
+
+        return "m" if name == "position" else FIELD_UNITS[name]
+
+    def field_on(self, name: str) -> str:
+        """``vertex`` or ``triangle``: what the rows of a field belong to, in the order of the mesh file."""
+        return self._states[0].on[name]
+
+    def at(self, time: float) -> int:
+        """Number of the state nearest to a time [s]."""
+        return int(np.abs(self.times - time).argmin())
+
+    def dataset(self, every: int = 1) -> Any:
+        """The states as an ``xarray.Dataset``, in memory; the extra ``export`` brings xarray.
+
+        Parameters
+        ----------
+        every : int
+            Take every so manieth state.
+        """
+        from lyra_petsc.output.xarray_dataset import dataset
+
+        return dataset(self, range(0, len(self), every))
+
+    # -- tables --------------------------------------------------------------------------------------
+
+    @property
+    def history(self) -> Any:
+        """history.csv, a row for each accepted step: a pandas frame, or columns where pandas is missing."""
+        return as_frame(self._history)
+
+    @property
+    def energies(self) -> Any:
+        """``time`` and the energies [J] of the history."""
+        return as_frame({name: self._history[name] for name in ("time", *ENERGIES)})
+
+    @property
+    def iterations(self) -> Any:
+        """``step``, ``time`` and the iterations of the history."""
+        return as_frame({name: self._history[name] for name in ("step", "time", *ITERATIONS)})
+
+    @property
+    def reactions(self) -> Any:
+        """reactions.csv [N]; empty if the scene does not ask for it."""
+        return as_frame(self._table("reactions.csv"))
+
+    @property
+    def probes(self) -> Any:
+        """probes.csv [m]; empty if the scene has none."""
+        return as_frame(self._table("probes.csv"))
+
+    @cached_property
+    def _history(self) -> Columns:
+        return read_table(self.folder / "history.csv")
+
+    def _table(self, name: str) -> Columns:
+        path = self.folder / name
+        return read_table(path) if path.exists() else {}
+
+    # -- the run itself ------------------------------------------------------------------------------
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene as understood; its mesh files need not be there any more."""
+        from lyra_petsc.scene.load import load_scene
+
+        return load_scene(self.folder / "scene.yaml", meshes_needed=False)
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """summary.json; empty if there is none."""
+        return read_summary(self.folder / "summary.json")
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run came to its end."""
+        return bool(self.summary.get("outcome") == "done")
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """What changes when a file is replaced."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size, status.st_ino
+
+
+@dataclass(frozen=True)
+class StoredState:
+    """A written state.
+
+    Attributes
+    ----------
+    time : float
+        [s], or the load factor of a static analysis.
+    position : tuple of str
+        Where the positions are.
+    fields : mapping of str to tuple of str
+        Where what else the state holds is.
+    on : mapping of str to str
+        ``vertex`` or ``triangle``: what the rows of each field belong to.
+    """
+
+    time: float
+    position: Place
+    fields: Mapping[str, Place]
+    on: Mapping[str, str]
+
+
+def announced_states(folder: Path) -> list[StoredState]:
+    """The states of a run in the order of time.
+
+    Raises
+    ------
+    InputError
+        If the folder is none of a run, nothing is written yet, or the announcement is damaged.
+    """
+    path = folder / XDMF_FILE
+    try:
+        root = parse(path).getroot()
+        states = [_state(grid) for grid in root.iterfind("./Domain/Grid/Grid")]
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(_absent(folder), file=folder) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+    except (ParseError, ValueError, AttributeError, UnicodeDecodeError):
+        raise InputError("is damaged, or was not written by a run", file=path) from None
+    if not states:
+        raise InputError("no state is written yet", file=folder)
+    return states
+
+
+def _absent(folder: Path) -> str:
+    if not folder.exists():
+        return "no such folder; give the folder of a run, as in runs/flag"
+    if not folder.is_dir():
+        return "is a file; give the folder of a run, as in runs/flag"
+    if (folder / "run.lock").exists():
+        return f"no state is written yet (no {XDMF_FILE})"
+    return f"is not the folder of a run (no {XDMF_FILE})"
+
+
+def _state(grid: Element) -> StoredState:
+    time, geometry = grid.find("Time"), grid.find("Geometry")
+    if time is None or geometry is None:
+        raise ValueError
+    fields = {a.attrib["Name"]: a for a in grid.iterfind("Attribute") if a.get("Name") != "rest"}
+    return StoredState(
+        float(time.attrib["Value"]),
+        _place(geometry),
+        {name: _place(field) for name, field in fields.items()},
+        {name: "triangle" if field.get("Center") == "Cell" else "vertex" for name, field in fields.items()},
+    )
+
+
+def _place(element: Element) -> Place:
+    file, colon, dataset = (element.findtext("DataItem") or "").strip().rpartition(":")
+    if not colon:
+        raise ValueError
+    return file, dataset
+
+
+class StateArrays(Sequence[NDArray[Any]]):
+    """What all states hold under one name: ``[i]`` reads one array, ``[i:j]`` reads nothing yet.
+
+    ``numpy.asarray`` of it reads them all, stacked along a first axis.
+
+    Parameters
+    ----------
+    folder : Path
+        The run's folder.
+    name : str
+    places : sequence of (str, str)
+        File and dataset of each state.
+    """
+
+    def __init__(self, folder: Path, name: str, places: Sequence[Place]) -> None:
+        self._folder, self._name, self._places = folder, name, places
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, index: int) -> NDArray[Any]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> StateArrays: ...
+
+    def __getitem__(self, index: int | slice) -> NDArray[Any] | StateArrays:
+        """Read the array of a state, or choose states.
+
+        Raises
+        ------
+        IndexError
+            If there is no such state.
+        InputError
+            If its file is gone or damaged.
+        """
+        if isinstance(index, slice):
+            return StateArrays(self._folder, self._name, self._places[index])
+        return read_array(self._folder, self._places[index])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        if not self._places:
+            raise ValueError(f"no states of {self._name} to stack")
+        return np.stack([np.asarray(array, dtype=dtype) for array in self])
+
+    def __repr__(self) -> str:
+        return f"<{self._name} of {len(self)} states in {self._folder}>"
+
+
+def read_array(folder: Path, place: Place) -> NDArray[Any]:
+    """A whole dataset.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    file, dataset = place
+    try:
+        with import_h5py().File(folder / file, "r") as opened:
+            array: NDArray[Any] = opened[dataset][()]
+    except HDF5_ERRORS as error:
+        why = reason(error) if (folder / file).exists() else "no such file"
+        raise InputError(f"{dataset.lstrip('/')} cannot be read: {why}", file=folder / file) from None
+    return array
+
+
+def read_table(path: Path) -> Columns:
+    """The columns of a table, without a last row that is not whole yet.
+
+    Raises
+    ------
+    InputError
+        If it is missing or damaged.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+    except UnicodeDecodeError:
+        raise InputError("is damaged", file=path) from None
+    header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
+    if not header or any(len(row) != len(header) for row in rows):
+        raise InputError("is damaged", file=path)
+    try:
+        return {
+            name: np.array([row[i] for row in rows], dtype="U64").astype(
+                np.int64 if name in COUNTS else float
+            )
+            for i, name in enumerate(header)
+        }
+    except ValueError:
+        raise InputError("is damaged", file=path) from None
+
+
+def as_frame(columns: Columns) -> Any:
+    """A pandas frame where pandas is installed, else the columns as they are."""
+    if importlib.util.find_spec("pandas") is None:
+        return columns
+    import pandas
+
+    return pandas.DataFrame(columns)

@@ -1,0 +1,357 @@
+"""The files of a run: states, checkpoints, history, probes, reactions; every method is collective."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.background import Background
+from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
+from lyra_petsc.output.failure_files import Moment, remove_failure, write_failure
+from lyra_petsc.output.fields import Field, chosen
+from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
+from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.states import StateWriter
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.dump import Change, changes, dump_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.simulation import Simulation, StepReport
+
+Array = NDArray[np.float64]
+
+MOST_CHANGES = 12
+"""Changes of a resumed scene that are told one by one."""
+
+CHEAP = 100.0
+"""Time since the last checkpoint, over the time that took (with a state, if one was due), from which on
+another is written."""
+
+
+class Recorder:
+    """Writes what a scene asks for.
+
+    Construction checks and plans, and touches no file; ``begin`` or ``resume`` opens them.
+
+    Parameters
+    ----------
+    simulation : Simulation
+
+    Attributes
+    ----------
+    changes : list of Change
+        What the scene says otherwise than the one that the run was begun with, after ``resume``.
+
+    Raises
+    ------
+    InputError
+        For a field that the scene cannot have.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        model = simulation.model
+        self._fields: list[Field] = chosen(model)
+        points = model.points
+        self._vertices = FileOrder(points.comm, points.original, points.n_vertices_global)
+        self._edges: FileOrder | None = None
+        if points.n_edges_global:
+            self._edges = FileOrder(points.comm, points.edges, points.n_edges_global)
+        self._triangles: FileOrder | None = None
+        if any(field.on == "triangle" for field in self._fields):
+            elements = model.membrane.elements
+            own = elements.index[: elements.n_owned].astype(np.int64)
+            self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
+        self._comm = points.comm
+        self._background = Background(points.comm)
+        self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
+        self._last_state = -1
+        self._checkpoint_seconds = 0.0
+        self.changes: list[Change] = []
+
+    # -- opening -------------------------------------------------------------------------------------
+
+    def begin(self, folder: Path) -> None:
+        """Write the mesh, the scene as understood, the initial state, row and checkpoint."""
+        simulation = self._simulation
+        model = simulation.model
+        scene = model.scene
+        write_mesh(folder, model.mesh, model.points.comm)
+        on_root(model.points.comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        self._open(folder, None)
+        self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
+        self.write_state()
+        self.settle()
+
+    def resume(self, folder: Path) -> None:
+        """Put the newest checkpoint into the simulation and cut the files behind it.
+
+        Raises
+        ------
+        InputError
+            If the run in the folder cannot go on with this scene; the folder is untouched.
+        """
+        simulation = self._simulation
+        model, scene = simulation.model, simulation.scene
+        system, layout = model.system, model.points
+        check_same_mesh(folder, model.mesh, _groups(scene), self._comm)
+        checkpoint = read_checkpoint(folder, self._vertices, self._edges)
+        on_root(self._comm, lambda: self._check_kind(folder, checkpoint))
+        memory = checkpoint.scalars
+        arrays = {
+            name: layout.joined(values, checkpoint.edges.get(name))
+            for name, values in checkpoint.arrays.items()
+        }
+        for number, start in enumerate(memory["late_starts"]):
+            system.reference.resume(float(start), arrays[f"start_{number}"])
+        system.state.set(arrays["position"], arrays["velocity"])
+        simulation.resume(memory, arrays)
+        if checkpoint.note:
+            simulation.notes.append(checkpoint.note)
+        self._note_changes(folder / "scene.yaml")
+        self._open(folder, simulation.step_number)
+        kept, last = self._history.kept_until, simulation.step_number
+        if kept != last:
+            simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
+        on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        self._last_state = int(memory["last_state"])
+
+    def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
+        """Refuse what cannot go on from the checkpoint (rank 0)."""
+        now = self._simulation.scene.time.scheme
+        before = checkpoint.scalars.get("scheme", now)
+        if "static" in (now, before) and now != before:
+            raise InputError(
+                "a motion does not go on as a static analysis, nor the other way round: run without --resume",
+                file=checkpoint.file,
+                key="time.analysis",
+            )
+        for name, columns in self._tables().items():
+            check_columns(folder / name, columns)
+
+    def _note_changes(self, before: Path) -> None:
+        """Tell what the scene says otherwise than the one in the folder."""
+        scene, notes = self._simulation.scene, self._simulation.notes
+        try:
+            self.changes = on_root(self._comm, lambda: changes(before, scene)) or []
+        except InputError as error:
+            notes.append(f"{error}; what has changed since the run was begun is not known")
+            return
+        for change in self.changes[:MOST_CHANGES]:
+            if change.key == "time.end":
+                notes.append(str(change))
+            elif change.key == "time.integrator":
+                notes.append(
+                    f"changed since the run was begun: {change} (begins without memory of earlier steps)"
+                )
+            else:
+                notes.append(f"changed since the run was begun: {change}")
+        if len(self.changes) > MOST_CHANGES:
+            notes.append(f"and {len(self.changes) - MOST_CHANGES} more changes, listed in summary.json")
+
+    def _tables(self) -> dict[str, tuple[str, ...]]:
+        """Names and columns of the tables that the scene asks for."""
+        scene = self._simulation.scene
+        more = tuple(self._simulation.ledger.column_names)
+        tables: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *more)}
+        if scene.probes:
+            tables["probes.csv"] = vector_columns(list(scene.probes))
+        if scene.output.reactions and scene.handles:
+            tables["reactions.csv"] = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
+        return tables
+
+    def _open(self, folder: Path, resume_after: int | None) -> None:
+        self._folder = folder
+        on_root(self._comm, lambda: remove_failure(folder))
+        self._states = StateWriter(
+            folder,
+            self._vertices,
+            self._triangles,
+            n_triangles=self._simulation.model.outline.n_triangles,
+            resume_after=resume_after,
+            vtkhdf=self._simulation.scene.output.vtkhdf,
+            background=self._background,
+        )
+        opened = {
+            name: History(folder / name, columns, self._comm, resume_after=resume_after)
+            for name, columns in self._tables().items()
+        }
+        self._history = opened["history.csv"]
+        self._probes, self._reactions = opened.get("probes.csv"), opened.get("reactions.csv")
+
+    # -- a step --------------------------------------------------------------------------------------
+
+    def record(self, report: StepReport) -> None:
+        """Everything that the step just accepted has to leave on disk, be it during the next ones."""
+        self._steps_since += 1
+        due = self._write_row(report)
+        control = self._simulation.control
+        if control.writes_at(report.time) or self._simulation.finished:
+            self.write_state()
+        elif due:
+            self.write_checkpoint()
+
+    def _due(self) -> bool:
+        """Whether a checkpoint is due, by steps or by wall time (rank 0).
+
+        Also where it costs next to nothing beside the steps since the last one: a step of minutes is
+        then not lost to a launcher that leaves a second to finish.
+        """
+        asked = self._simulation.scene.output.checkpoint
+        if asked.steps is not None and self._steps_since >= asked.steps:
+            return True
+        elapsed = clock.monotonic() - self._last_checkpoint
+        return elapsed >= asked.seconds or elapsed >= CHEAP * self._checkpoint_seconds
+
+    def _write_row(self, report: StepReport) -> bool:
+        """A row of each table; whether a checkpoint is due, by rank 0's clock."""
+        budget = self._simulation.budget
+        history = {
+            "step": report.step,
+            "time": report.time,
+            "dt": report.dt,
+            "newton_iterations": report.newton_iterations,
+            "linear_iterations": report.linear_iterations,
+            "rejected": report.rejected,
+            "kinetic_energy": budget.kinetic,
+            "membrane_energy": budget.membrane,
+            "bending_energy": budget.bending,
+            "potential_energy": budget.potential,
+            "external_work": budget.external_work,
+            "dissipation": budget.dissipation,
+            "residual": report.residual,
+            "wall_seconds": report.wall_seconds,
+            **self._simulation.ledger.columns(),
+        }
+        rows = [(self._history, history)]
+        if self._probes is not None:
+            rows.append((self._probes, self._vectors(report, self._probe_means())))
+        if self._reactions is not None:
+            pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
+            forces = {f"handle{n}": force for n, force in enumerate(pulls)}
+            rows.append((self._reactions, self._vectors(report, forces)))
+
+        def work() -> bool:
+            for table, row in rows:
+                table.append(row)
+            return self._due()
+
+        return bool(on_root(self._comm, work))
+
+    @staticmethod
+    def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float]:
+        row: dict[str, float] = {"step": report.step, "time": report.time}
+        for name, vector in vectors.items():
+            row |= {f"{name}_{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
+        return row
+
+    def _probe_means(self) -> dict[str, Array]:
+        """Mean position [m] of each probe's vertices."""
+        model = self._simulation.model
+        local = np.zeros((len(model.probes), 4))
+        for row, vertices in enumerate(model.probes.values()):
+            local[row, :3] = model.system.x[vertices].sum(axis=0)
+            local[row, 3] = len(vertices)
+        total = np.empty_like(local)
+        model.points.comm.Allreduce(local, total, MPI.SUM)
+        return {name: total[row, :3] / total[row, 3] for row, name in enumerate(model.probes)}
+
+    # -- states --------------------------------------------------------------------------------------
+
+    def write_state(self) -> None:
+        """Write the present state, to be announced, unless it is written already, and a checkpoint of it."""
+        simulation = self._simulation
+        if simulation.step_number == self._last_state:
+            self.write_checkpoint()
+            return
+        model = simulation.model
+        values = {field: field.compute(model) for field in self._fields}
+        with self._checkpoint(last_state=simulation.step_number) as checkpoint:
+            self._states.write(
+                simulation.step_number,
+                simulation.time,
+                model.system.x[: model.points.n_vertices],
+                {field.name: value for field, value in values.items() if field.on == "vertex"},
+                {field.name: value for field, value in values.items() if field.on == "triangle"},
+                beside=[checkpoint],  # what is announced is not written again after a kill
+            )
+        self._last_state = simulation.step_number
+
+    def write_checkpoint(self) -> None:
+        """Replace the checkpoint by the present state."""
+        with self._checkpoint(self._last_state) as checkpoint:
+            write_collective([checkpoint], self._comm, self._background)
+
+    @contextmanager
+    def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
+        """A checkpoint of the present state, to be written within the context."""
+        simulation = self._simulation
+        system, layout = simulation.model.system, simulation.model.points
+        n = layout.n_owned
+        rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
+        for number, start in enumerate(sorted(system.reference.late)):
+            rows[f"start_{number}"] = system.reference.late[start]
+        arrays = {name: layout.split(values)[0] for name, values in rows.items()} | simulation.term_states()
+        edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
+        scalars = simulation.memory() | {
+            "last_state": last_state,
+            "scheme": simulation.scene.time.scheme,
+        }
+        began = clock.monotonic()
+        yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges)
+        self._last_checkpoint = clock.monotonic()
+        self._steps_since = 0
+        self._checkpoint_seconds = self._last_checkpoint - began
+
+    def write_failure(self) -> None:
+        """Write why the last step could not be taken: the state before it and the failing iterate."""
+        simulation, failure = self._simulation, self._simulation.failure
+        assert failure is not None
+        system, n = simulation.model.system, simulation.model.points.n_vertices
+        stuck = failure.stuck.of_vertices(n)
+        before = {"velocity": system.v[:n]}  # the equations of the failed step say nothing of it
+        failing = {"velocity": stuck.velocity, "residual": stuck.residual}
+        # a number that is not finite has no place in space
+        position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])
+        write_failure(
+            self._folder,
+            self._vertices,
+            simulation.model.outline.n_triangles,
+            simulation.step_number,
+            (Moment(failure.time, system.x[:n], before), Moment(stuck.time, position, failing)),
+            failure.text,
+        )
+
+    def settle(self) -> None:
+        """Return when all that was written is on the disk and announced.
+
+        Raises
+        ------
+        OutputError
+            If it could not be; what was announced before stands.
+        """
+        self._background.settle()
+
+    def close(self) -> None:
+        """Close the tables; for one rank. What of the rest goes wrong now, only `settle` tells."""
+        self._background.close()
+        for table in (self._history, self._probes, self._reactions):
+            if table is not None:
+                table.close()
+
+
+def _groups(scene: Scene) -> set[str]:
+    """Names of the mesh's groups that a scene uses."""
+    selectors = [*scene.handles, *scene.loads, *scene.probes.values()]
+    names = {block.group for block in scene.material} | {selector.group for selector in selectors}
+    return {name for name in names if name is not None}

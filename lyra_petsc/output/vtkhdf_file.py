@@ -1,0 +1,193 @@
+"""states.vtkhdf: the states as one time series in VTK's own HDF5 layout, read by ParaView and VTK.
+
+The file holds no state. Its datasets are *virtual*: they map onto those of ``states-NNNN.h5``, so that it is
+small, is replaced in one instant like ``states.xdmf``, and stands for exactly the states that it announces.
+The triangles, which VTK wants in another form than ``mesh.h5`` has, are in ``cells.h5``.
+
+Layout: VTK's documentation, "VTKHDF file format", version 2.0, a transient UnstructuredGrid of one part; as
+all steps share the triangles, their offsets are 0 at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.atomic import replace_bytes
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
+
+VTKHDF_FILE = "states.vtkhdf"
+CELLS_FILE = "cells.h5"
+
+TRIANGLE = 5
+"""VTK's number of the cell type."""
+
+GROUPS = {"vertex": "PointData", "triangle": "CellData"}
+
+
+def cells(triangles: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+    """``Connectivity`` (3 F,), ``Offsets`` (F + 1,) and ``Types`` (F,) of triangles (F, 3)."""
+    n = len(triangles)
+    return {
+        "Connectivity": np.ascontiguousarray(triangles, dtype=np.int64).ravel(),
+        "Offsets": 3 * np.arange(n + 1, dtype=np.int64),
+        "Types": np.full(n, TRIANGLE, dtype=np.uint8),
+    }
+
+
+def write_cells(folder: Path, mesh_file: str) -> None:
+    """Write ``cells.h5`` from the mesh of the folder, once. Call on one rank.
+
+    Raises
+    ------
+    OutputError
+    """
+    path = folder / CELLS_FILE
+    try:
+        with import_h5py().File(folder / mesh_file, "r") as stored:
+            triangles = stored["mesh/triangles"][()]
+        with _in_memory() as file:
+            for name, array in cells(triangles).items():
+                file[name] = array
+            content = _content(file)
+    except HDF5_ERRORS as error:
+        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+    replace_bytes(path, content)
+
+
+def write_vtkhdf(
+    folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int, mesh_file: str
+) -> None:
+    """Announce states. Call on one rank.
+
+    A field that some states lack is NaN there (0 if it is of whole numbers).
+
+    Parameters
+    ----------
+    folder : Path
+        With ``cells.h5`` and the files of the states.
+    states : sequence of WrittenState
+    n_vertices, n_triangles : int
+    mesh_file : str
+        Name of the file with ``/mesh/rest``.
+
+    Raises
+    ------
+    OutputError
+        If it could not be written; what stood there before stands.
+    """
+    path = folder / VTKHDF_FILE
+    rows = {"vertex": n_vertices, "triangle": n_triangles}
+    try:
+        with _in_memory() as file:
+            root = describe(file, [state.time for state in states], n_vertices, n_triangles)
+            lengths = {"Connectivity": 3 * n_triangles, "Offsets": n_triangles + 1, "Types": n_triangles}
+            for name, length in lengths.items():
+                kind = np.dtype(np.uint8 if name == "Types" else np.int64)
+                _virtual(root, name, (length,), kind, {0: (CELLS_FILE, name)}, length)
+            real = np.dtype(np.float64)
+            positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
+            _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
+            rest = {0: (mesh_file, "mesh/rest")}
+            _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
+            add_offsets(root, "vertex", "rest", len(states), 0)
+            for field in _fields(states):
+                places = {
+                    i: (state.file, f"{group_name(state.number)}/{field.name}")
+                    for i, state in enumerate(states)
+                    if field in state.fields
+                }
+                n = rows[field.on]
+                name = f"{GROUPS[field.on]}/{field.name}"
+                shape = (len(states) * n, *field.shape[1:])
+                _virtual(root, name, shape, np.dtype(field.dtype), places, n)
+                add_offsets(root, field.on, field.name, len(states), n)
+            content = _content(file)
+    except HDF5_ERRORS as error:
+        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+    replace_bytes(path, content)
+
+
+def _fields(states: Sequence[WrittenState]) -> list[StoredField]:
+    """The fields of all states, each name once: as the newest state has it."""
+    return list({field.name: field for state in states for field in state.fields}.values())
+
+
+def describe(file: Any, times: Sequence[float], n_vertices: int, n_triangles: int) -> Any:
+    """Create the group ``/VTKHDF`` with all that is not data of states; returns it.
+
+    Parameters
+    ----------
+    file : h5py.File
+    times : sequence of float
+        [s].
+    """
+    h5py = import_h5py()
+    n = len(times)
+    root = file.create_group("VTKHDF", track_order=True)
+    root.attrs["Version"] = np.array([2, 0])
+    kind = b"UnstructuredGrid"
+    root.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
+    for name, count in (
+        ("NumberOfPoints", n_vertices),
+        ("NumberOfCells", n_triangles),
+        ("NumberOfConnectivityIds", 3 * n_triangles),
+    ):
+        root[name] = np.full(n, count, dtype=np.int64)
+    for name in GROUPS.values():
+        root.create_group(name)
+    steps = root.create_group("Steps")
+    steps.attrs["NSteps"] = n
+    steps["Values"] = np.asarray(times, dtype=np.float64)
+    steps["NumberOfParts"] = np.ones(n, dtype=np.int64)
+    steps["PartOffsets"] = np.zeros(n, dtype=np.int64)
+    steps["PointOffsets"] = n_vertices * np.arange(n, dtype=np.int64)
+    steps["CellOffsets"] = np.zeros((n, 1), dtype=np.int64)
+    steps["ConnectivityIdOffsets"] = np.zeros((n, 1), dtype=np.int64)
+    for name in GROUPS.values():
+        steps.create_group(f"{name}Offsets")
+    return root
+
+
+def add_offsets(root: Any, on: str, name: str, n_states: int, rows: int) -> None:
+    """Say where each step's rows of a field begin: ``rows`` for each state, 0 if all states share them."""
+    root[f"Steps/{GROUPS[on]}Offsets/{name}"] = rows * np.arange(n_states, dtype=np.int64)
+
+
+def _virtual(
+    root: Any,
+    name: str,
+    shape: tuple[int, ...],
+    kind: np.dtype[Any],
+    places: Mapping[int, tuple[str, str]],
+    rows: int,
+) -> None:
+    """A dataset whose rows ``i rows`` to ``(i + 1) rows`` are the dataset ``places[i]`` of another file."""
+    h5py = import_h5py()
+    stored = h5py.h5t.py_create(kind, logical=True)
+    space, target = (h5py.h5s.create_simple(shape) for _ in range(2))
+    source = h5py.h5s.create_simple((rows, *shape[1:]))
+    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    if kind.kind == "f":
+        plan.set_fill_value(np.array(np.nan, dtype=kind))
+    for i, (file, dataset) in places.items():
+        target.select_hyperslab((i * rows,) + (0,) * (len(shape) - 1), (rows, *shape[1:]))
+        plan.set_virtual(target, file.encode(), dataset.encode(), source)
+    h5py.h5d.create(root.id, name.encode(), stored, space, plan)
+
+
+def _in_memory() -> Any:
+    """A file in memory: one on disk takes the process down if it cannot grow while it is closed."""
+    return import_h5py().File("unnamed", "w", driver="core", backing_store=False)
+
+
+def _content(file: Any) -> bytes:
+    file.flush()
+    return bytes(file.id.get_file_image())

@@ -1,1 +1,0 @@
-"""Distribution of points and elements over ranks; owned and ghost numbering."""

@@ -1,0 +1,113 @@
+"""Wall time of a run by phase, and our names in PETSc's own profile (``-log_view``).
+
+Each phase is a stage of PETSc's profile, too. A stage or an event costs no more than a microsecond unless
+the user asks PETSc to log.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+from petsc4py import PETSc
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+# registered here, as PETSc adds up the stages of all ranks by number: the order must not depend on the way
+# a rank takes
+STAGES = {
+    name: PETSc.Log.Stage(name) for name in ("mesh", "partition", "assembly", "solve", "balance", "output")
+}
+
+RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
+"""Events, the latter once a Newton iteration; PETSc's table has room for names of 16 letters."""
+
+JACOBIAN_AGAIN = "AssembleAgain"
+"""The Jacobian with more regularisation, where the linear solve met negative curvature."""
+
+FROZEN = "AssembleFrozen"
+"""Once an attempt at a step: damping, loads and geometry that stay as they are during it."""
+
+
+@contextmanager
+def stage(name: str) -> Iterator[None]:
+    """Let PETSc charge what happens in the block to the stage ``name``; ended also by an exception."""
+    if name not in STAGES:
+        STAGES[name] = PETSc.Log.Stage(name)
+    STAGES[name].push()
+    try:
+        yield
+    finally:
+        STAGES[name].pop()
+
+
+def logged(name: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Decorate a function to be the event ``name``: each call counts once, also if it raises."""
+    event = PETSc.Log.Event(name)
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        @wraps(function)
+        def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            with event:
+                return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+class Phases:
+    """Charges every second since construction to exactly one phase.
+
+    ``with phases("assembly"):`` charges the block to ``assembly``; a phase entered inside
+    another takes its time out of the outer one, so that all phases add up to the total.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns seconds; the wall clock unless a test brings its own.
+    """
+
+    OTHER = "other"
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self._seconds: dict[str, float] = {}
+        self._open = [self.OTHER]
+        self._start = self._charged_until = clock()
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        self._charge()
+        self._seconds.setdefault(name, 0.0)
+        self._open.append(name)
+        try:
+            with stage(name):
+                yield
+        finally:
+            self._charge()
+            self._open.pop()
+
+    @property
+    def total(self) -> float:
+        """Seconds since construction."""
+        return self._clock() - self._start
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds of each phase in the order of first entry, then ``other``: time in none."""
+        self._charge()
+        other = self._seconds.get(self.OTHER, 0.0)
+        return {
+            **{name: value for name, value in self._seconds.items() if name != self.OTHER},
+            self.OTHER: other,
+        }
+
+    def _charge(self) -> None:
+        now = self._clock()
+        current = self._open[-1]
+        self._seconds[current] = self._seconds.get(current, 0.0) + now - self._charged_until
+        self._charged_until = now

@@ -1,0 +1,255 @@
+"""Materials: the library's names and numbers, and from a scene's block to the constants of the kernels.
+
+Conventions, in one place:
+
+- measured cloths follow the original program, which multiplies its stretching tables by 2 and
+  whose hinge energy k_e l² (θ − θ̄)² / (8 (A0 + A1)) bends a structured mesh with k_e/4:
+  C11, C12, C22 = 2 × table, C33 (engineering shear) = table, B = k_e/4;
+- an isotropic sheet is in plane stress: c11 = c22 = E h/(1 − ν²), c12 = ν c11,
+  c33 = E h/(2 (1 + ν)), B = E h³/(12 (1 − ν²));
+- explicit numbers are used as they stand;
+- then density × density_scale × thicken, membrane × stretching_scale × thicken,
+  bending × bending_scale × thicken³.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+from lyra_petsc.errors import InputError
+
+if TYPE_CHECKING:
+    from lyra_petsc.scene.schema import Material
+
+TABLE_LIBRARIES = ("wang2011.json", "original.json")
+ISOTROPIC_LIBRARIES = ("engineering.json",)
+
+# Smallest eigenvalue a projected membrane stiffness keeps, over the largest: an exactly singular
+# one would let the sheet stretch along one direction without any force.
+PROJECTION_FLOOR = 0.01
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ShellMaterial:
+    """Constants of one shell material, ready for the kernels.
+
+    Attributes
+    ----------
+    density : float
+        Areal density [kg/m²].
+    c11, c12, c22, c33 : float
+        Orthotropic St. Venant-Kirchhoff membrane stiffness [N/m]; energy per rest area is
+        ½ (c11 E_uu² + 2 c12 E_uu E_vv + c22 E_vv² + c33 (2E_uv)²).
+    bending : tuple of three floats
+        Cylindrical bending stiffness B [N·m] for hinges whose rest edge lies at 0°, 45°, 90° to
+        the warp; interpolated linearly in the angle. All three zero: no bending.
+    damping : float
+        γ [s] of stiffness-proportional damping.
+    warp_degrees : float
+        Rotation of the warp direction in the material plane, anticlockwise [°].
+    rest_curvature : tuple of three floats or None
+        κ11, κ22, κ12 [1/m] in the material axes.
+    law : str
+        Name of the membrane law.
+    """
+
+    density: float
+    c11: float
+    c12: float
+    c22: float
+    c33: float
+    bending: Triple = (0.0, 0.0, 0.0)
+    damping: float = 0.0
+    warp_degrees: float = 0.0
+    rest_curvature: Triple | None = None
+    law: str = "stvk"
+
+
+@dataclass(frozen=True)
+class ClothTable:
+    """The part of a measured cloth's tables that a St. Venant-Kirchhoff shell uses.
+
+    Attributes
+    ----------
+    density : float
+        Areal density [kg/m²].
+    c11, c12, c22, c33 : float
+        Small-strain row of the stretching table [N/m].
+    bending : (3,)
+        First column of the bending table, k_e [N·m], edges at 0°, 45°, 90° to the warp.
+    """
+
+    density: float
+    c11: float
+    c12: float
+    c22: float
+    c33: float
+    bending: Triple
+
+
+@dataclass(frozen=True)
+class IsotropicSheet:
+    """A sheet of an isotropic engineering material.
+
+    Attributes
+    ----------
+    young : float [Pa]
+    poisson : float
+    thickness : float [m]
+    density : float
+        Areal density [kg/m²].
+    """
+
+    young: float
+    poisson: float
+    thickness: float
+    density: float
+
+
+def _read(library: str) -> dict[str, Any]:
+    text = files(__package__).joinpath(library).read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+@cache
+def entries() -> dict[str, ClothTable | IsotropicSheet]:
+    """Every material of every library, by name."""
+    found: dict[str, ClothTable | IsotropicSheet] = {}
+    for library in TABLE_LIBRARIES:
+        for name, row in _read(library)["tables"].items():
+            at_0, at_45, at_90 = row["bending"]
+            found[name] = ClothTable(
+                row["density"], row["c11"], row["c12"], row["c22"], row["c33"], (at_0, at_45, at_90)
+            )
+    for library in ISOTROPIC_LIBRARIES:
+        for name, row in _read(library)["isotropic"].items():
+            areal = row["density"] * row["thickness"]
+            found[name] = IsotropicSheet(row["young"], row["poisson"], row["thickness"], areal)
+    return found
+
+
+def names() -> list[str]:
+    """The names a scene's ``cloth`` may take, sorted."""
+    return sorted(entries())
+
+
+def resolve(
+    material: Material, *, file: object | None = None, key: str = "material"
+) -> tuple[ShellMaterial, list[str]]:
+    """Constants of one material block, all conventions and factors applied.
+
+    Parameters
+    ----------
+    material : scene.schema.Material
+    file, key : optional
+        Where the block stands, for messages.
+
+    Returns
+    -------
+    ShellMaterial
+    list of str
+        Notes for the user (a stiffness that had to be changed), one line each.
+
+    Raises
+    ------
+    InputError
+        Numbers so large that they overflow, or so small that they vanish.
+    """
+    notes: list[str] = []
+    if material.cloth is not None:
+        entry = entries()[material.cloth]
+        if isinstance(entry, ClothTable):
+            shell, notes = of_table(entry, material.cloth)
+        else:
+            shell = of_isotropic(entry)
+    else:
+        assert material.density is not None
+        if (c := material.membrane) is not None:
+            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33, _triple(material.bending))
+        else:
+            assert material.young is not None
+            assert material.poisson is not None
+            assert material.thickness is not None
+            sheet = IsotropicSheet(material.young, material.poisson, material.thickness, material.density)
+            shell = of_isotropic(sheet)
+    shell = _scaled(shell, material)
+    numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending)
+    if not all(math.isfinite(value) for value in numbers):
+        raise InputError("numbers too large: stiffness or density is not finite", file=file, key=key)
+    if min(shell.density, shell.c11, shell.c22, shell.c33) <= 0.0:
+        raise InputError("numbers too small: stiffness or density vanishes", file=file, key=key)
+    return shell, notes
+
+
+def of_table(table: ClothTable, name: str) -> tuple[ShellMaterial, list[str]]:
+    """Constants of a measured cloth, and notes; see the module's conventions.
+
+    A negative c12 is kept where the stiffness is positive definite. Where it is not, the
+    eigenvalues of [[c11, c12], [c12, c22]] are raised to at least `PROJECTION_FLOOR` of the
+    largest, which is the nearest such matrix in the Frobenius norm.
+    """
+    c11, c12, c22 = 2 * table.c11, 2 * table.c12, 2 * table.c22
+    notes: list[str] = []
+    if c11 <= 0 or c11 * c22 <= c12 * c12:
+        measured = (c11, c12, c22)
+        c11, c12, c22 = _projected(*measured)
+        was, now = (", ".join(f"{c:.4g}" for c in numbers) for numbers in (measured, (c11, c12, c22)))
+        notes.append(
+            f"{name}: measured c11, c12, c22 = {was} N/m are not positive definite; projected to {now} N/m"
+        )
+    at_0, at_45, at_90 = (k / 4 for k in table.bending)
+    return ShellMaterial(table.density, c11, c12, c22, table.c33, (at_0, at_45, at_90)), notes
+
+
+def of_isotropic(sheet: IsotropicSheet) -> ShellMaterial:
+    """Constants of an isotropic sheet in plane stress."""
+    stretch = sheet.young * sheet.thickness / (1 - sheet.poisson**2)
+    shear = sheet.young * sheet.thickness / (2 * (1 + sheet.poisson))
+    bend = stretch * sheet.thickness * sheet.thickness / 12
+    return ShellMaterial(sheet.density, stretch, sheet.poisson * stretch, stretch, shear, (bend, bend, bend))
+
+
+def _triple(bending: float | Triple | None) -> Triple:
+    if isinstance(bending, tuple):
+        return bending
+    value = bending or 0.0
+    return value, value, value
+
+
+def _projected(c11: float, c12: float, c22: float) -> Triple:
+    """[[c11, c12], [c12, c22]] with both eigenvalues at least the floor; (c11, c12, c22)."""
+    mean, half_difference = (c11 + c22) / 2, (c11 - c22) / 2
+    radius = math.hypot(half_difference, c12)
+    largest = mean + radius
+    smallest = max(mean - radius, PROJECTION_FLOOR * largest)
+    new_mean, new_radius = (largest + smallest) / 2, (largest - smallest) / 2
+    cosine, sine = half_difference / radius, c12 / radius
+    return new_mean + new_radius * cosine, new_radius * sine, new_mean - new_radius * cosine
+
+
+def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
+    thicken = material.thicken
+    stretch = material.stretching_scale * thicken
+    # a product and not a power: too large a factor becomes inf here and is refused above
+    bend = material.bending_scale * thicken * thicken * thicken
+    at_0, at_45, at_90 = (b * bend for b in shell.bending)
+    return replace(
+        shell,
+        density=shell.density * material.density_scale * thicken,
+        c11=shell.c11 * stretch,
+        c12=shell.c12 * stretch,
+        c22=shell.c22 * stretch,
+        c33=shell.c33 * stretch,
+        bending=(at_0, at_45, at_90),
+        damping=material.damping,
+        warp_degrees=material.warp_degrees,
+        rest_curvature=material.rest_curvature,
+    )

@@ -1,0 +1,122 @@
+"""The states that are exported, with the direction that is up and the frames a second; for all formats."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.read_run import Run
+
+Array = NDArray[np.float64]
+
+SINGLE_RATE = 24.0
+"""ExportedStates a second where there is a single state."""
+
+SAME_TIME = 1e-6
+"""A time of ``--times`` may be outside the run by this fraction of its length."""
+
+
+@dataclass(frozen=True)
+class ExportedStates:
+    """Some states of a run.
+
+    Attributes
+    ----------
+    run : Run
+    chosen : tuple of int
+        Numbers of the states, ascending.
+    """
+
+    run: Run
+    chosen: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    @property
+    def times(self) -> Array:
+        """(n,) [s]."""
+        return self.run.times[list(self.chosen)]
+
+    @property
+    def positions(self) -> Iterator[Array]:
+        """(V, 3) positions [m] of each state."""
+        return (self.run.positions[i] for i in self.chosen)
+
+    def field(self, name: str) -> Iterator[NDArray[np.float64]]:
+        """The values of a field in each state."""
+        return (self.run.field(name)[i] for i in self.chosen)
+
+    @property
+    def up(self) -> tuple[int, int]:
+        """Axis (0, 1, 2) and sign of the direction against gravity; +z without gravity."""
+        gravity = np.asarray(self.run.scene.gravity or (0.0, 0.0, -1.0))
+        axis = int(np.abs(gravity).argmax())
+        if gravity[axis] == 0.0:
+            return 2, 1
+        return axis, -1 if gravity[axis] > 0.0 else 1
+
+    @property
+    def rate(self) -> float:
+        """States a second, from the median of their intervals."""
+        spacing = np.diff(self.times)
+        return round(1.0 / float(np.median(spacing)), 6) if len(spacing) else SINGLE_RATE
+
+
+def choose(run: Run, times: str | None, every: int | None) -> ExportedStates:
+    """The states nearest to some times, every nth state, or all.
+
+    Parameters
+    ----------
+    run : Run
+    times : str or None
+        ``--times``: numbers [s] with commas between.
+    every : int or None
+        ``--every``.
+
+    Raises
+    ------
+    InputError
+        If both are given, for text that is not a number, or a time outside the run.
+    """
+    if times is not None and every is not None:
+        raise InputError("choose states either by --times or by --every", key="--every")
+    if every is not None and every < 1:
+        raise InputError(f"must be at least 1, not {every}", key="--every")
+    if times is None:
+        return ExportedStates(run, tuple(range(0, len(run), every or 1)))
+    return ExportedStates(run, tuple(sorted({run.at(time) for time in _numbers(times, run)})))
+
+
+def _numbers(text: str, run: Run) -> list[float]:
+    first, last = float(run.times[0]), float(run.times[-1])
+    slack = SAME_TIME * (last - first)
+    numbers = []
+    for word in text.split(","):
+        try:
+            number = float(word)
+        except ValueError:
+            raise InputError(
+                f"must be numbers [s] with commas between, not {word.strip()!r}", key="--times"
+            ) from None
+        if not first - slack <= number <= last + slack:
+            raise InputError(f"the run goes from {first:g} to {last:g} s, not to {number:g}", key="--times")
+        numbers.append(number)
+    return numbers
+
+
+def turned_up(up: tuple[int, int], target: int) -> tuple[float, float, float, float]:
+    """Quaternion x, y, z, w of the rotation from the axis ``up``, with its sign, to the axis ``target``."""
+    start, end = np.zeros(3), np.zeros(3)
+    start[up[0]], end[target] = up[1], 1.0
+    if start @ end < -0.5:  # half a turn about either of the other axes
+        about = np.zeros(3)
+        about[(target + 1) % 3] = 1.0
+        return (*about.tolist(), 0.0)
+    turn = np.append(np.cross(start, end), 1.0 + start @ end)
+    x, y, z, w = (turn / np.linalg.norm(turn)).tolist()
+    return x, y, z, w

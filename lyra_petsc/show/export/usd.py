@@ -1,0 +1,103 @@
+"""Universal Scene Description: one file with a mesh whose points and fields are sampled over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.show.export.exported_states import ExportedStates, turned_up
+
+ROOT = "/run"
+MESH = f"{ROOT}/cloth"
+
+
+def write_usd(states: ExportedStates, folder: Path, name: str) -> None:
+    """Write ``<name>.usdc``, single precision; metres, seconds times ``timeCodesPerSecond``.
+
+    Up is the direction against gravity. Velocities are the mesh's, other fields primvars of their names.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    from pxr import Tf, Usd
+
+    path = folder / f"{name}.usdc"
+    try:
+        stage = Usd.Stage.CreateNew(str(path))
+        _fill(stage, states)
+        stage.GetRootLayer().Save()
+    except Tf.ErrorException as error:
+        words = " ".join(str(error).split())
+        raise OutputError(f"{path.name}: cannot be written: {words[:200]}") from error
+
+
+def _fill(stage: Any, states: ExportedStates) -> None:
+    from pxr import Gf, Sdf, UsdGeom, Vt
+
+    run = states.run
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, ROOT)
+    root.GetPrim().SetDisplayName(run.scene.title or run.name)
+    stage.SetDefaultPrim(root.GetPrim())
+    if states.up in ((1, 1), (2, 1)):
+        UsdGeom.SetStageUpAxis(stage, "XYZ"[states.up[0]])
+    else:
+        UsdGeom.SetStageUpAxis(stage, "Z")
+        x, y, z, w = turned_up(states.up, 2)
+        root.AddOrientOp().Set(Gf.Quatf(w, x, y, z))
+
+    rate = states.rate
+    codes = states.times * rate
+    whole = np.round(codes)
+    codes = np.where(np.abs(codes - whole) < 1e-6, whole, codes).tolist()
+    stage.SetTimeCodesPerSecond(rate)
+    stage.SetFramesPerSecond(rate)
+    stage.SetStartTimeCode(codes[0])
+    stage.SetEndTimeCode(codes[-1])
+
+    mesh = UsdGeom.Mesh.Define(stage, MESH)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(run.triangles), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(run.triangles.astype(np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr("none")
+    mesh.CreateDoubleSidedAttr(True)
+    primvars = UsdGeom.PrimvarsAPI(mesh)
+    if run.corner_uv is not None:
+        uv, place = run.uv, UsdGeom.Tokens.vertex
+        if uv is None:  # the texture has seams
+            uv, place = run.corner_uv.reshape(-1, 2), UsdGeom.Tokens.faceVarying
+        st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, place)
+        st.Set(Vt.Vec2fArray.FromNumpy(uv.astype(np.float32)))
+
+    points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
+    for code, position in zip(codes, states.positions, strict=True):
+        single = np.ascontiguousarray(position, dtype=np.float32)
+        points.Set(Vt.Vec3fArray.FromNumpy(single), code)
+        extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([single.min(axis=0), single.max(axis=0)])), code)
+    for field in run.fields:
+        _sample(mesh, primvars, states, field, codes)
+
+
+def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes: list[float]) -> None:
+    """A field at each time code."""
+    from pxr import Sdf, UsdGeom, Vt
+
+    attribute: Any = None
+    for code, rows in zip(codes, states.field(field), strict=True):
+        vector = rows.ndim == 2
+        if attribute is None:
+            if field == "velocity":
+                attribute = mesh.CreateVelocitiesAttr()
+            else:
+                kind = Sdf.ValueTypeNames.Float3Array if vector else Sdf.ValueTypeNames.FloatArray
+                on_vertices = states.run.field_on(field) == "vertex"
+                place = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
+                attribute = primvars.CreatePrimvar(field, kind, place).GetAttr()
+            attribute.SetCustomDataByKey("unit", states.run.field_units(field))
+        values: NDArray[np.float32] = np.ascontiguousarray(rows, dtype=np.float32)
+        attribute.Set((Vt.Vec3fArray if vector else Vt.FloatArray).FromNumpy(values), code)

@@ -1,0 +1,213 @@
+"""The files of images: PNG pictures, contact sheets and films; the texture and the colours that are read."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.atomic import replace_bytes
+
+Image = NDArray[np.uint8]
+"""(height, width, 3) red, green, blue."""
+
+TILES = 6
+"""Pictures on a contact sheet."""
+COLUMNS = 3
+GAP = 4
+"""Pixels between them."""
+LARGEST_TEXTURE = 4096
+
+PALETTE = (
+    "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=sierra2_4a:diff_mode=rectangle"
+)
+"""A GIF has 256 colours; ffmpeg chooses those that suit the film."""
+
+FILM_FORMATS: dict[str, tuple[str, str, list[str]]] = {
+    ".mp4": ("libx264", "yuv420p", ["-crf", "20", "-preset", "fast", "-movflags", "+faststart"]),
+    ".webm": ("libvpx-vp9", "yuv420p", ["-crf", "33", "-b:v", "0", "-cpu-used", "5", "-row-mt", "1"]),
+    ".gif": ("gif", "pal8", ["-filter_complex", PALETTE, "-loop", "0"]),
+}
+"""Codec, pixel format and further options of ffmpeg by ending."""
+
+
+def write_png(path: Path, image: Image) -> None:
+    """Write a picture; a file of that name is replaced only when the new one is complete.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    from PIL import Image as Pictures
+
+    buffer = io.BytesIO()
+    Pictures.fromarray(image).save(buffer, format="PNG")
+    replace_bytes(path, buffer.getvalue())
+
+
+def half_size(image: Image) -> Image:
+    """A picture at half its size, for a contact sheet."""
+    from PIL import Image as Pictures
+
+    height, width = image.shape[:2]
+    half = (max(1, width // 2), max(1, height // 2))
+    return np.asarray(Pictures.fromarray(image).resize(half, Pictures.Resampling.LANCZOS))
+
+
+def contact_sheet(tiles: Sequence[Image]) -> Image:
+    """Pictures of one size in rows on white."""
+    columns = min(COLUMNS, len(tiles))
+    height, width = (size + GAP for size in tiles[0].shape[:2])
+    rows = math.ceil(len(tiles) / columns)
+    sheet = np.full((rows * height - GAP, columns * width - GAP, 3), 255, dtype=np.uint8)
+    for i, tile in enumerate(tiles):
+        y, x = height * (i // columns), width * (i % columns)
+        sheet[y : y + height - GAP, x : x + width - GAP] = tile
+    return sheet
+
+
+def check_film(path: Path, size: tuple[int, int]) -> None:
+    """Check that a film can be written, before anything is drawn.
+
+    Raises
+    ------
+    InputError
+        Unknown ending, a folder that is not there, odd sizes.
+    """
+    if path.suffix.lower() not in FILM_FORMATS:
+        raise InputError(f"a film's name ends in {', '.join(FILM_FORMATS)}, not {path.name!r}", key="--film")
+    if path.is_dir():
+        raise InputError("is a folder; give the name of a file in it", file=path, key="--film")
+    if not path.parent.is_dir():
+        raise InputError(f"there is no folder {path.parent}", file=path, key="--film")
+    if path.suffix.lower() != ".gif" and (size[0] % 2 or size[1] % 2):
+        raise InputError(
+            f"{size[0]}x{size[1]}: films need even numbers of pixels ({path.suffix})", key="--size"
+        )
+
+
+@contextmanager
+def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], None]]:
+    """Write a film by ffmpeg; gives a function that adds a frame.
+
+    The file gets its name at the end of the context; after an exception there is no file.
+
+    Parameters
+    ----------
+    path : Path
+    size : (int, int)
+        Width and height [pixels].
+    fps : float
+        Frames a second.
+
+    Raises
+    ------
+    OutputError
+        If ffmpeg cannot be started or fails; also raised by the function.
+    """
+    import imageio_ffmpeg
+
+    # ffmpeg chooses the format by the ending
+    part = path.with_name(f".{path.stem}.part{path.suffix.lower()}")
+    codec, pixels, options = FILM_FORMATS[path.suffix.lower()]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo"]
+    command += ["-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-", "-an"]
+    command += ["-c:v", codec, "-pix_fmt", pixels, *options, f"file:{part}"]
+    with tempfile.TemporaryFile() as messages:
+        try:
+            # a session of its own, so that Ctrl-C reaches this process alone
+            ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages, start_new_session=True)
+        except OSError as error:
+            raise OutputError(f"{path}: ffmpeg cannot be started: {reason(error)}") from error
+        assert ffmpeg.stdin is not None
+        pipe = ffmpeg.stdin
+
+        def add(image: Image) -> None:
+            try:
+                pipe.write(np.ascontiguousarray(image).data)
+            except OSError:
+                ffmpeg.wait()
+                raise failure() from None
+
+        def failure() -> OutputError:
+            messages.seek(0)
+            lines = messages.read().decode(errors="replace").splitlines()
+            # the cause stands behind the last colon of the first line
+            cause = lines[0].rpartition(": ")[2] if lines else "ffmpeg stopped without a word"
+            return OutputError(f"{path}: cannot be written: {cause}")
+
+        try:
+            try:
+                yield add
+            except BaseException:
+                ffmpeg.kill()
+                raise
+            finally:
+                with suppress(BrokenPipeError):
+                    ffmpeg.communicate()
+            if ffmpeg.returncode != 0:
+                raise failure()
+            os.replace(part, path)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def read_texture(path: Path) -> Image:
+    """(h, w, 3) picture from a file, reduced to at most 4096 pixels in each direction.
+
+    Raises
+    ------
+    InputError
+        If the file is not a picture.
+    """
+    from PIL import Image as Pictures
+    from PIL import UnidentifiedImageError
+
+    try:
+        with Pictures.open(path) as picture:
+            picture.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE))
+            return np.asarray(picture.convert("RGB"))
+    except UnidentifiedImageError:
+        raise InputError("is not a picture (PNG, JPEG, …)", file=path, key="--texture") from None
+    except Pictures.DecompressionBombError:
+        raise InputError(
+            "is too large; use a picture below 100 megapixels", file=path, key="--texture"
+        ) from None
+    except (OSError, ValueError, SyntaxError) as error:
+        why = reason(error) if isinstance(error, OSError) and error.errno else "damaged"
+        raise InputError(f"cannot be read: {why}", file=path, key="--texture") from None
+
+
+def colors_of(text: str) -> tuple[str, str]:
+    """Two colours as #rrggbb, from ``FRONT,BACK``.
+
+    Raises
+    ------
+    InputError
+        If they are not two known colours.
+    """
+    from PIL import ImageColor
+
+    names = [name.strip() for name in text.split(",")]
+    try:
+        found = ["#{:02x}{:02x}{:02x}".format(*ImageColor.getrgb(name)[:3]) for name in names]
+        front, back = found
+    except ValueError:
+        raise InputError(
+            f"must be two colours, front and back, as in firebrick,ivory or #c8402f,#f0e2c8, not {text!r}",
+            key="--colors",
+        ) from None
+    return front, back

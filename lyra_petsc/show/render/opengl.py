@@ -1,0 +1,73 @@
+"""OpenGL without a display: whether it works here, and its share of the cores."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from lyra_petsc.errors import InputError
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+REMEDY = (
+    "OpenGL cannot be started without a display; install libegl1 "
+    "(Debian, Ubuntu: apt-get install libegl1; conda: libegl), or libosmesa6"
+)
+
+
+def share_cores(comm: MPI.Comm) -> None:
+    """Divide the cores of a machine among its ranks for drawing; collective, before anything is drawn."""
+    from mpi4py import MPI
+
+    here = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    ranks_here = here.size
+    here.Free()
+    if ranks_here > 1:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        os.environ.setdefault("LP_NUM_THREADS", str(max(1, cores // ranks_here)))
+
+
+def import_pyvista() -> Any:
+    """PyVista, set to draw off-screen and to print no messages."""
+    # Mesa and VTK would print which devices and windows they try in vain
+    os.environ.setdefault("EGL_LOG_LEVEL", "fatal")
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    vtkObject.GlobalWarningDisplayOff()
+    pyvista.OFF_SCREEN = True
+    return pyvista
+
+
+def check_opengl() -> None:
+    """Check that VTK can draw here.
+
+    Raises
+    ------
+    InputError
+        Saying which library to install.
+    """
+    import_pyvista()
+    import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the windows)
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
+
+    window = vtkRenderWindow()
+    window.SetOffScreenRendering(True)
+    # VTK uses OSMesa when nothing else is there, and crashes if that is missing
+    by_osmesa = window.GetClassName() == "vtkOSOpenGLRenderWindow"
+    if not (_has_osmesa() if by_osmesa else window.SupportsOpenGL()):
+        raise InputError(REMEDY, key="render")
+    window.Finalize()
+
+
+def _has_osmesa() -> bool:
+    for name in ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so", ctypes.util.find_library("OSMesa")):
+        with suppress(OSError):
+            if name is not None:
+                ctypes.CDLL(name)
+                return True
+    return False

@@ -1,0 +1,328 @@
+"""What PyVista draws: sheet, lights, floor with shadow, handles, wind, bar of colours and time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
+from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
+from lyra_petsc.show.render.opengl import import_pyvista
+from lyra_petsc.show.render.render_plan import RenderPlan, decimals
+from lyra_petsc.show.render.sheet_geometry import HeldVertices, split_at_seams, vertex_normals
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+SKY, HORIZON = "#d9e2ec", "#ecebe8"
+INK = "#2b2f36"
+HANDLE_COLOR, WIND_COLOR = "#30343b", "#6d8fae"
+MAP, SIGNED_MAP = "viridis", "coolwarm"
+
+FLOOR_PIXELS = 512
+"""Of the picture on the floor, in each direction."""
+BLUR = 0.012
+"""Radius of the shadow's soft edge over the side of the floor."""
+DARKNESS = 0.42
+FLOOR_COLOR = (225, 224, 221)
+FLOOR_GAP = 0.02
+"""Height of the lowest point over the floor, over the size of the motion."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """A box around the whole motion, along the axes to the right, towards the front and up.
+
+    Attributes
+    ----------
+    axes : (3, 3) float64
+        Unit vectors as rows.
+    low, high : (3,) float64
+        Coordinates along them [m].
+    """
+
+    axes: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def axes_of(cls, up: Array) -> Array:
+        """(3, 3) the axes that belong to ``up``."""
+        return np.array([*horizon(up), up])
+
+    @property
+    def size(self) -> float:
+        """Diagonal [m]."""
+        return float(np.linalg.norm(self.high - self.low))
+
+
+class SceneDrawing:
+    """An off-screen window in which one state after another is drawn.
+
+    Parameters
+    ----------
+    plan : RenderPlan
+    view : PerspectiveCamera
+    bounds : Bounds
+        Around the whole motion.
+    quantity : ColourQuantity or None
+        What the sheet is coloured by.
+    limits : (float, float)
+        Range of the colours.
+    wind : (3,) float64 or None
+        Velocity of the wind [m/s], if it is to be drawn.
+    """
+
+    def __init__(
+        self,
+        plan: RenderPlan,
+        view: PerspectiveCamera,
+        bounds: Bounds,
+        quantity: ColourQuantity | None,
+        limits: tuple[float, float],
+        wind: Array | None,
+    ) -> None:
+        self._plan, self._bounds, self._quantity = plan, bounds, quantity
+        self._triangles = plan.run.triangles
+        self._pyvista = pyvista = import_pyvista()
+        self._plotter = plotter = pyvista.Plotter(off_screen=True, window_size=plan.size, lighting="none")
+        plotter.set_background(HORIZON, top=SKY)
+        # as smooth as several samples a pixel, which take a software renderer half as long again
+        plotter.disable_anti_aliasing()
+        plotter.renderer.SetUseFXAA(True)
+        plotter.camera.position, plotter.camera.focal_point = tuple(view.position), tuple(view.target)
+        plotter.camera.up, plotter.camera.view_angle = tuple(view.up), view.angle
+        plotter.camera.SetWindowCenter(0.0, -view.raised)
+        self._scale = plan.size[1] / 720.0
+        key_light = self._add_lights(view)
+        self._add_sheet(limits)
+        self._ground = None
+        if plan.options.ground and plan.scene.gravity is not None:
+            self._ground = Ground(bounds, self._triangles, len(plan.run.rest), key_light)
+            self._floor = plotter.add_mesh(self._ground.mesh(), color="white", lighting=False)
+        self._held = HeldVertices(plan.run) if plan.options.handles else None
+        if self._held is not None:
+            self._add_handles()
+        if wind is not None:
+            arrows = _arrow_mesh(pyvista, *wind_arrows(bounds, wind))
+            plotter.add_mesh(arrows, color=WIND_COLOR, ambient=0.35, reset_camera=False)
+        self._time = self._add_text(" ", (18 * self._scale, 14 * self._scale), font="arial")
+        digits = f"{{:.{decimals(plan.run.times)}f}}"
+        static = plan.scene.time.analysis == "static"
+        self._label = f"load = {digits}" if static else f"t = {digits} s"
+        self._first = True
+
+    def image(self, state: int) -> Image:
+        """(height, width, 3) picture of the state with a number."""
+        run = self._plan.run
+        time, x = float(run.times[state]), run.positions[state]
+        self._sheet.points = x[self._source]
+        normals = vertex_normals(x, self._triangles)[self._source]
+        self._sheet.point_data.active_normals = normals.astype(np.float32)
+        if self._quantity is not None:
+            values = self._quantity.values(state)
+            if self._quantity.on_triangles:
+                self._sheet.cell_data["colour"] = values
+            else:
+                self._sheet.point_data["colour"] = values[self._source]
+        if self._ground is not None:
+            floor = self._pyvista.Texture(self._ground.picture(x))
+            floor.interpolate = True
+            self._floor.texture = floor
+        if self._held is not None:
+            vertices, edges = self._held.at(time)
+            single = np.setdiff1d(vertices, edges)
+            self._handles.points = self._rods.points = x
+            self._handles.verts = np.column_stack([np.ones_like(single), single]).ravel()
+            self._rods.lines = np.column_stack([np.full(len(edges), 2), edges]).ravel()
+        self._time.input = self._label.format(time) if self._plan.options.label else ""
+        if self._first:
+            self._plotter.show(auto_close=False)
+            self._first = False
+        self._plotter.reset_camera_clipping_range()
+        self._plotter.render()
+        return np.ascontiguousarray(self._plotter.image)
+
+    def close(self) -> None:
+        """Close the windows."""
+        self._plotter.close()
+        if self._ground is not None:
+            self._ground.close()
+
+    def _add_sheet(self, limits: tuple[float, float]) -> None:
+        plan, quantity, triangles = self._plan, self._quantity, self._triangles
+        self._source, corners, uv = np.arange(len(plan.run.rest)), triangles, None
+        if plan.texture is not None:
+            uv = plan.run.corner_uv
+            corner_uv = _over_whole_sheet(material_coordinates(plan.run)) if uv is None else uv
+            self._source, corners, uv = split_at_seams(triangles, corner_uv)
+        points = np.zeros((len(self._source), 3))
+        self._sheet = sheet = self._pyvista.PolyData.from_regular_faces(points, corners)
+        light: dict[str, Any] = {"interpolation": "phong", "specular_power": 14.0}
+        light |= {"ambient": 0.2, "diffuse": 0.8, "specular": 0.08}
+        look: dict[str, Any]
+        if quantity is not None:
+            # brighter, so that colours can be told apart in the shade
+            light |= {"ambient": 0.45, "diffuse": 0.6, "specular": 0.05}
+            if quantity.on_triangles:
+                sheet.cell_data["colour"] = np.zeros(sheet.n_cells)
+            else:
+                sheet.point_data["colour"] = np.zeros(sheet.n_points)
+            colours = SIGNED_MAP if quantity.signed else MAP
+            look = {"scalars": "colour", "clim": limits, "cmap": colours, "show_scalar_bar": False}
+        elif uv is not None:
+            sheet.active_texture_coordinates = uv
+            texture = self._pyvista.Texture(plan.texture)
+            texture.interpolate = True
+            # a texture that repeats would show its left edge at the right one
+            texture.repeat = bool(uv.min() < 0.0 or uv.max() > 1.0)
+            look = {"texture": texture, "color": "white"}
+        else:
+            front, back = plan.colors
+            look = {"color": front, "backface_params": {**light, "color": back}}
+        self._plotter.add_mesh(sheet, reset_camera=False, **light, **look)
+        if quantity is not None:
+            self._add_bar(quantity)
+
+    def _add_bar(self, quantity: ColourQuantity) -> None:
+        left = 0.64
+        place = {"width": 0.32, "height": 0.07, "position_x": left, "position_y": 0.04}
+        font = {"color": INK, "font_family": "arial", "label_font_size": round(20 * self._scale)}
+        self._add_text(quantity.label, (left, 0.125), viewport=True)
+        self._plotter.add_scalar_bar(title="", vertical=False, n_labels=5, fmt="%.3g", **place, **font)
+
+    def _add_text(self, text: str, position: tuple[float, float], **options: Any) -> Any:
+        added = self._plotter.add_text(text, position=position, font_size=1, color=INK, **options)
+        added.prop.font_size = round(25 * self._scale)
+        return added
+
+    def _add_lights(self, view: PerspectiveCamera) -> Array:
+        """Four lights placed relative to the camera; the direction of the main one."""
+        sight = view.position - view.target
+        up = self._bounds.axes[2]
+        level = sight - (sight @ up) * up
+        front = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-6 else self._bounds.axes[1]
+        right = np.cross(up, front)
+        lights = [(-40.0, 55.0, 0.76), (55.0, 20.0, 0.3), (-10.0, 10.0, 0.2), (10.0, -50.0, 0.22)]
+        directions: list[Array] = []
+        for azimuth, elevation, intensity in lights:
+            a, e = math.radians(azimuth), math.radians(elevation)
+            towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
+            self._plotter.add_light(self._pyvista.Light(position=tuple(towards), intensity=intensity))
+            directions.append(towards)
+        return directions[0]
+
+    def _add_handles(self) -> None:
+        """Held vertices as spheres, and held edges as rods."""
+        self._handles = self._pyvista.PolyData(np.zeros((1, 3)))
+        self._rods = self._pyvista.PolyData(np.zeros((1, 3)))
+        self._rods.verts = np.zeros(0, dtype=np.int64)
+        width = 5.0 * self._scale
+        spheres = {"style": "points", "point_size": 1.8 * width, "render_points_as_spheres": True}
+        tubes = {"style": "wireframe", "line_width": width, "render_lines_as_tubes": True}
+        for mesh, style in ((self._handles, spheres), (self._rods, tubes)):
+            self._plotter.add_mesh(mesh, color=HANDLE_COLOR, reset_camera=False, **style)
+
+
+class Ground:
+    """A floor that fades into the background, with the shadow of the sheet.
+
+    Parameters
+    ----------
+    bounds : Bounds
+    triangles : (F, 3) int64
+    n_vertices : int
+    light : (3,) float64
+        Unit vector towards the light.
+    """
+
+    def __init__(self, bounds: Bounds, triangles: NDArray[np.int64], n_vertices: int, light: Array) -> None:
+        self._bounds = bounds
+        self._height = bounds.low[2] - FLOOR_GAP * bounds.size
+        towards = bounds.axes @ light
+        self._slope = towards[:2] / towards[2]
+        # how far to the side a shadow falls, at most
+        reach = (bounds.high[2] - self._height) * np.abs(self._slope).max()
+        self._centre = (bounds.low + bounds.high)[:2] / 2.0
+        self._half = 0.75 * float(np.linalg.norm((bounds.high - bounds.low)[:2])) + 1.1 * reach
+        self._pyvista = pyvista = import_pyvista()
+        # the sheet projected onto the floor, seen from above: white on black
+        self._shadow = pyvista.PolyData.from_regular_faces(np.zeros((n_vertices, 3)), triangles)
+        pixels = (FLOOR_PIXELS, FLOOR_PIXELS)
+        self._above = above = pyvista.Plotter(off_screen=True, window_size=pixels, lighting="none")
+        above.disable_anti_aliasing()  # the shadow is blurred anyway
+        above.set_background("black")
+        above.add_mesh(self._shadow, color="white", lighting=False)
+        above.camera.parallel_projection = True
+        above.camera.position, above.camera.focal_point = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+        above.camera.up, above.camera.parallel_scale = (0.0, 1.0, 0.0), 1.0
+        above.camera.clipping_range = (0.1, 2.0)
+        above.show(auto_close=False)
+        # opacity: full in the middle, none at the rim
+        line = np.linspace(-1.0, 1.0, FLOOR_PIXELS)
+        ramp = np.clip((1.0 - np.hypot(line[:, None], line[None, :])) / 0.45, 0.0, 1.0)
+        self._opacity = (255.0 * ramp * ramp * (3.0 - 2.0 * ramp)).astype(np.uint8)
+
+    def mesh(self) -> Any:
+        """The floor as a square with texture coordinates."""
+        square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        at = np.column_stack([self._centre + self._half * square, np.full(4, self._height)])
+        floor = self._pyvista.PolyData.from_regular_faces(at @ self._bounds.axes, np.array([[0, 1, 2, 3]]))
+        floor.active_texture_coordinates = (square + 1.0) / 2.0
+        return floor
+
+    def picture(self, x: Array) -> Image:
+        """(n, n, 4) texture of the floor with the shadow of the sheet at positions ``x`` (V, 3) [m]."""
+        from PIL import Image as Pictures
+        from PIL import ImageFilter
+
+        at = x @ self._bounds.axes.T
+        flat = np.zeros_like(x)
+        flat[:, :2] = (at[:, :2] - (at[:, 2:] - self._height) * self._slope - self._centre) / self._half
+        self._shadow.points = flat
+        self._above.render()
+        mask = Pictures.fromarray(np.ascontiguousarray(self._above.image[:, :, 0]))
+        blurred = mask.filter(ImageFilter.GaussianBlur(BLUR * FLOOR_PIXELS))
+        shade = DARKNESS * (np.asarray(blurred, dtype=np.float32) / 255.0)
+        floor = np.empty((FLOOR_PIXELS, FLOOR_PIXELS, 4), dtype=np.uint8)
+        floor[:, :, :3] = np.asarray(FLOOR_COLOR, dtype=np.float32) * (1.0 - shade[:, :, None])
+        floor[:, :, 3] = self._opacity
+        return floor
+
+    def close(self) -> None:
+        """Close the window."""
+        self._above.close()
+
+
+def wind_arrows(bounds: Bounds, wind: Array) -> tuple[Array, Array]:
+    """Feet (n, 3) of arrows upwind of the motion, and the arrow (3,), all [m]."""
+    length = 0.16 * bounds.size
+    towards = wind / np.linalg.norm(wind)
+    middle = (bounds.low + bounds.high) / 2.0 @ bounds.axes
+    fractions = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
+    corners = (bounds.low + fractions * (bounds.high - bounds.low)) @ bounds.axes
+    upwind = middle + towards * ((corners - middle) @ towards).min()
+    across = np.cross(towards, bounds.axes[2])
+    across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else bounds.axes[0]
+    over = np.cross(across, towards)
+    steps = 0.14 * bounds.size * np.array([-1.0, 0.0, 1.0])
+    feet = [upwind - 1.3 * length * towards + a * across + b * over for a in steps for b in steps]
+    return np.array(feet), length * towards
+
+
+def _arrow_mesh(pyvista: Any, feet: Array, arrow: Array) -> Any:
+    cloud = pyvista.PolyData(feet)
+    cloud["along"] = np.tile(arrow, (len(feet), 1))
+    shape = pyvista.Arrow(tip_length=0.22, tip_radius=0.045, shaft_radius=0.014)
+    return cloud.glyph(orient="along", scale=False, factor=float(np.linalg.norm(arrow)), geom=shape)
+
+
+def _over_whole_sheet(corner_uv: Array) -> Array:
+    """Texture coordinates scaled so that a picture covers the sheet once."""
+    low, high = corner_uv.min(axis=(0, 1)), corner_uv.max(axis=(0, 1))
+    scaled: Array = (corner_uv - low) / np.where(high > low, high - low, 1.0)
+    return scaled

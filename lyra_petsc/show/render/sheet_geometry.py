@@ -1,0 +1,99 @@
+"""The geometry that pictures show: smooth normals, vertices doubled along texture seams, held vertices."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.mesh import Group, Mesh
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.terms.motion import Window
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+def split_at_seams(triangles: Indices, corner_uv: Array) -> tuple[Indices, Indices, Array]:
+    """Give each vertex one copy for every texture coordinate that it has.
+
+    Parameters
+    ----------
+    triangles : (F, 3) int64
+    corner_uv : (F, 3, 2) float64
+        Texture coordinates of the triangles' corners.
+
+    Returns
+    -------
+    source : (n,) int64
+        Vertex of the mesh that each copy stands for.
+    corners : (F, 3) int64
+        The triangles in the numbering of the copies.
+    uv : (n, 2) float64
+        Texture coordinates of the copies.
+    """
+    rows = np.column_stack([triangles.ravel().astype(np.float64), corner_uv.reshape(-1, 2)])
+    copies, corners = np.unique(rows, axis=0, return_inverse=True)
+    return copies[:, 0].astype(np.int64), corners.reshape(triangles.shape).astype(np.int64), copies[:, 1:]
+
+
+def vertex_normals(x: Array, triangles: Indices) -> Array:
+    """(V, 3) unit normals of vertices at ``x`` (V, 3): the mean of their triangles', weighted by area.
+
+    Zero where the triangles have no area.
+    """
+    corners = x[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    ends, repeated = triangles.ravel(), np.repeat(normals, 3, axis=0)
+    summed = np.stack([np.bincount(ends, repeated[:, k], len(x)) for k in range(3)], axis=1)
+    lengths = np.linalg.norm(summed, axis=1, keepdims=True)
+    return np.asarray(np.divide(summed, lengths, out=np.zeros_like(summed), where=lengths > 0.0))
+
+
+class HeldVertices:
+    """The vertices that the handles of a run's scene hold.
+
+    Raises
+    ------
+    InputError
+        If the run's mesh.h5 does not hold what a handle names.
+    """
+
+    def __init__(self, run: Run) -> None:
+        mesh, path = _stored_mesh(run), run.folder / MESH_FILE
+        self._n_vertices = mesh.n_vertices
+        self._handles = [
+            (Window.of(handle), select_vertices(mesh, handle, key=f"handles[{i}]", file=path))
+            for i, handle in enumerate(run.scene.handles)
+        ]
+        sides = np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+        self._edges: Indices = np.unique(np.sort(sides, axis=1), axis=0)
+
+    def at(self, time: float) -> tuple[Indices, Indices]:
+        """Vertices (n,) held at a time [s], and the edges (k, 2) between them."""
+        held = np.zeros(self._n_vertices, dtype=bool)
+        for window, vertices in self._handles:
+            if window.holds(time, time):
+                held[vertices] = True
+        return np.flatnonzero(held), self._edges[held[self._edges].all(axis=1)]
+
+
+def _stored_mesh(run: Run) -> Mesh:
+    """Start positions and groups, from which the handles are selected."""
+    path = run.folder / MESH_FILE
+    groups: dict[str, Group] = {}
+    none = np.empty(0, dtype=np.int64)
+    try:
+        with import_h5py().File(path, "r") as file:
+            start = file["start"][()]
+            for stored in file["groups"].values() if "groups" in file else ():
+                vertices = stored["vertices"][()] if "vertices" in stored else none
+                groups[str(stored.attrs["name"])] = Group(0, vertices, none, none.reshape(0, 2))
+    except HDF5_ERRORS as error:
+        raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+    no_uv, no_rest = np.empty((0, 3, 2)), np.empty(0, dtype=bool)
+    return Mesh(start, start, run.triangles, triangle_uv=no_uv, flat_rest=no_rest, groups=groups)

@@ -1,0 +1,212 @@
+"""A report as a list of blocks, written as self-contained HTML and as Markdown.
+
+::
+
+    report = Report("Error against run time")
+    report.heading("What ran")
+    report.paragraph("Twelve combinations, three repeats each.")
+    report.table(["integrator", "error"], [["beuler", 0.01]], caption="Errors")
+    report.figure(drawing)              # from report.plots
+    report.write(Path("studies/flag"))  # report.html, report.md, the figures' PNG and SVG
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.errors import OutputError
+from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.show.report.numbers import cell
+
+_NUMBER = r"-?\d[\d.]*(e[+-]?\d+)?( ?(s|ms|µs|%))?"
+NUMBER = re.compile(rf"(|–|[<≤] {_NUMBER}|{_NUMBER}( – {_NUMBER})?)")
+"""Cells that are set to the right: nothing, numbers, times and their ranges."""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A finished figure.
+
+    Attributes
+    ----------
+    name : str
+        Its file name without ending.
+    caption : str
+    png : bytes
+    svg : bytes
+        Empty for a picture that is no line drawing.
+    """
+
+    name: str
+    caption: str
+    png: bytes
+    svg: bytes
+
+
+@dataclass
+class Block:
+    """One piece of a report; which fields count depends on ``kind``."""
+
+    kind: str
+    text: str = ""
+    items: list[str] = field(default_factory=list)
+    columns: list[str] = field(default_factory=list)
+    rows: list[list[str]] = field(default_factory=list)
+    numeric: list[bool] = field(default_factory=list)
+    marked: list[bool] = field(default_factory=list)
+    drawing: Drawing | None = None
+
+
+class Report:
+    """A title and blocks in order.
+
+    Parameters
+    ----------
+    title : str
+    """
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self.blocks: list[Block] = []
+
+    def heading(self, text: str) -> None:
+        """A section's title."""
+        self.blocks.append(Block("heading", text))
+
+    def paragraph(self, text: str) -> None:
+        """Plain text."""
+        self.blocks.append(Block("paragraph", text))
+
+    def bullets(self, items: Sequence[str]) -> None:
+        """A list of plain sentences; nothing if there are none."""
+        if items:
+            self.blocks.append(Block("bullets", items=list(items)))
+
+    def code(self, text: str) -> None:
+        """A command, to be copied."""
+        self.blocks.append(Block("code", text))
+
+    def table(
+        self,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[Any]],
+        *,
+        caption: str = "",
+        marked: Sequence[bool] | None = None,
+    ) -> None:
+        """A table; numbers are written with few digits and stand to the right.
+
+        Parameters
+        ----------
+        columns : sequence of str
+        rows : sequence of rows
+            Text, numbers, or None for an empty cell.
+        caption : str
+        marked : sequence of bool, optional
+            Rows to be set in bold.
+        """
+        texts = [[cell(value) for value in row] for row in rows]
+        numeric = [
+            any(row[i] for row in texts) and all(NUMBER.fullmatch(row[i]) for row in texts)
+            for i in range(len(columns))
+        ]
+        bold = list(marked) if marked is not None else [False] * len(rows)
+        block = Block("table", caption, columns=list(columns), rows=texts, numeric=numeric, marked=bold)
+        self.blocks.append(block)
+
+    def figure(self, drawing: Drawing) -> None:
+        """A figure with its caption."""
+        self.blocks.append(Block("figure", drawing.caption, drawing=drawing))
+
+    @property
+    def drawings(self) -> list[Drawing]:
+        """The figures in order."""
+        return [block.drawing for block in self.blocks if block.drawing is not None]
+
+    # -- writing ---------------------------------------------------------------------------------------
+
+    def html(self) -> str:
+        """One page that needs no other file: figures are inside, nothing is fetched."""
+        from jinja2 import Environment
+
+        source = files("lyra_petsc.show.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+        page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+        return str(page.render(title=self.title, blocks=self.blocks, inline=_inline))
+
+    def markdown(self) -> str:
+        """Markdown that refers to the figures' PNG files beside it."""
+        parts = [f"# {self.title}"]
+        for block in self.blocks:
+            parts.append(_MARKDOWN[block.kind](block))
+        return "\n\n".join(parts) + "\n"
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write ``report.html``, ``report.md`` and the figures into ``folder``. Call on one rank.
+
+        Returns
+        -------
+        list of Path
+            What was written.
+
+        Raises
+        ------
+        OutputError
+        """
+        written = []
+        for drawing in self.drawings:
+            for ending, content in (("png", drawing.png), ("svg", drawing.svg)):
+                path = folder / f"{drawing.name}.{ending}"
+                try:
+                    path.write_bytes(content)
+                except OSError as error:
+                    raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+                written.append(path)
+        for name, text in (("report.md", self.markdown()), ("report.html", self.html())):
+            replace_text(folder / name, text)
+            written.append(folder / name)
+        return written
+
+
+def _inline(drawing: Drawing) -> str:
+    # as an image and not as tags: the ids of several SVGs in one page would clash
+    kind, content = ("svg+xml", drawing.svg) if drawing.svg else ("png", drawing.png)
+    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
+
+
+def _plain(text: str) -> str:
+    """Text that Markdown must not take for markup."""
+    for sign in ("\\", "`", "*", "_", "<", "|"):
+        text = text.replace(sign, "\\" + sign)
+    return text
+
+
+def _table_markdown(block: Block) -> str:
+    lines = [f"{_plain(block.text)}\n"] if block.text else []
+    lines.append("| " + " | ".join(_plain(name) for name in block.columns) + " |")
+    lines.append("|" + "|".join(" ---: " if right else " --- " for right in block.numeric) + "|")
+    for row, bold in zip(block.rows, block.marked, strict=True):
+        cells = [f"**{_plain(text)}**" if bold and text else _plain(text) for text in row]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _figure_markdown(block: Block) -> str:
+    assert block.drawing is not None
+    return f"![{_plain(block.text)}]({block.drawing.name}.png)\n\n{_plain(block.text)}"
+
+
+_MARKDOWN = {
+    "heading": lambda block: f"## {_plain(block.text)}",
+    "paragraph": lambda block: _plain(block.text),
+    "bullets": lambda block: "\n".join(f"- {_plain(item)}" for item in block.items),
+    "code": lambda block: f"```sh\n{block.text}\n```",
+    "table": _table_markdown,
+    "figure": _figure_markdown,
+}

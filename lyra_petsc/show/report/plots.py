@@ -1,0 +1,254 @@
+"""Figures: errors against resolution with slopes, errors against run time with the Pareto front.
+
+Drawn with matplotlib's Agg and SVG backends alone: no display, no global state.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lyra_petsc.show.report.document import Drawing
+from lyra_petsc.show.report.numbers import short
+
+COLOURS = ("#0b62a4", "#d1495b", "#2a9d5c", "#e08e0b", "#7b4fa6", "#14858f", "#8c5a3c", "#5b6470")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+WIDTH, HEIGHT = 7.2, 4.6  # inches
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line of a figure.
+
+    Attributes
+    ----------
+    name : str
+    x, y : sequences of float
+        Points, joined in this order; those that are not finite and positive are left out.
+    low, high : sequences of float
+        Spread of x, optional.
+    labels : sequence of str
+        Beside each point, optional.
+    """
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] = ()
+    high: Sequence[float] = ()
+    labels: Sequence[str] = field(default_factory=tuple)
+
+    def shown(self) -> list[int]:
+        """Numbers of the points that a logarithmic figure can show."""
+        return [i for i in range(len(self.x)) if _visible(self.x[i]) and _visible(self.y[i])]
+
+
+def convergence(
+    series: Sequence[Series],
+    *,
+    name: str,
+    caption: str,
+    x_label: str,
+    y_label: str,
+    floor: float | None = None,
+    floor_label: str = "",
+) -> Drawing:
+    """Errors against a step or mesh size, log-log, with the fitted slope of each line in the legend.
+
+    Parameters
+    ----------
+    series : sequence of Series
+    name, caption : str
+        Of the drawing.
+    x_label, y_label : str
+    floor : float, optional
+        Below it no error can be told; shaded.
+    floor_label : str
+    """
+    figure, axes = _axes(x_label, y_label)
+    for number, line in enumerate(series):
+        shown = line.shown()
+        if not shown:
+            continue
+        x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
+        slope = fitted_slope(x, y)
+        words = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
+        axes.plot(x, y, marker=_marker(number), color=colour(number), label=words, lw=1.6, ms=5)
+    _triangles(axes, series)
+    _floor(axes, floor, floor_label)
+    _finish(axes)
+    return drawn(figure, name, caption)
+
+
+def work_precision(
+    series: Sequence[Series],
+    *,
+    name: str,
+    caption: str,
+    y_label: str,
+    x_label: str = "run time [s]",
+    front: Sequence[tuple[float, float]] = (),
+    bounds: Sequence[tuple[float, float]] = (),
+    recommended: tuple[float, float] | None = None,
+    recommendation: str = "",
+    floor: float | None = None,
+    floor_label: str = "",
+) -> Drawing:
+    """Error against run time, log-log: spread of the time, Pareto front, recommended setting.
+
+    Parameters
+    ----------
+    series : sequence of Series
+    front : sequence of (time, error)
+        Points that no other beats in both; drawn as a staircase.
+    bounds : sequence of (time, error)
+        Points of which is known only that their error is at most so large.
+    recommended : (time, error), optional
+    recommendation : str
+        Its name.
+    """
+    figure, axes = _axes(x_label, y_label)
+    for number, line in enumerate(series):
+        shown = line.shown()
+        if not shown:
+            continue
+        x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
+        spread = None
+        if line.low and line.high:
+            spread = [
+                [max(0.0, line.x[i] - line.low[i]) for i in shown],
+                [max(0.0, line.high[i] - line.x[i]) for i in shown],
+            ]
+        axes.errorbar(
+            x, y, xerr=spread, marker=_marker(number), color=colour(number), label=line.name,
+            lw=1.4, ms=5, capsize=2, elinewidth=1.0,
+        )  # fmt: skip
+        for i in shown:
+            if i < len(line.labels):
+                axes.annotate(
+                    line.labels[i], (line.x[i], line.y[i]), xytext=(5, 4), textcoords="offset points",
+                    fontsize=7, color=colour(number),
+                )  # fmt: skip
+    best = sorted(point for point in front if all(map(_visible, point)))
+    if best:
+        times, errors = zip(*best, strict=True)
+        axes.step(
+            times, errors, where="post", color="#1b1f24", lw=5, alpha=0.13, label="Pareto front", zorder=0
+        )
+        axes.plot(times, errors, "o", ms=10, mfc="none", mec="#1b1f24", mew=0.9, zorder=0)
+    at_most = [point for point in bounds if all(map(_visible, point))]
+    if at_most:
+        times, errors = zip(*at_most, strict=True)
+        axes.plot(times, errors, "v", ms=7, mfc="none", mec="#5b6470", label="not resolved: at most")
+    if recommended is not None and all(map(_visible, recommended)):
+        axes.plot(
+            *recommended, "*", ms=17, mfc="#f6c344", mec="#1b1f24", mew=0.9, zorder=5,
+            label=f"recommended: {recommendation}",
+        )  # fmt: skip
+    _floor(axes, floor, floor_label)
+    _finish(axes)
+    return drawn(figure, name, caption)
+
+
+def fitted_slope(x: Sequence[float], y: Sequence[float]) -> float:
+    """Least-squares slope of log y over log x; NaN for fewer than two different x."""
+    points = [(math.log(a), math.log(b)) for a, b in zip(x, y, strict=True) if _visible(a) and _visible(b)]
+    if len(points) < 2:
+        return math.nan
+    mean_x = math.fsum(a for a, _ in points) / len(points)
+    mean_y = math.fsum(b for _, b in points) / len(points)
+    width = math.fsum((a - mean_x) ** 2 for a, _ in points)
+    if width < 1e-24:
+        return math.nan
+    return math.fsum((a - mean_x) * (b - mean_y) for a, b in points) / width
+
+
+def _visible(value: float) -> bool:
+    return math.isfinite(value) and value > 0.0
+
+
+def colour(number: int) -> str:
+    """Of a figure's line of that number."""
+    return COLOURS[number % len(COLOURS)]
+
+
+def _marker(number: int) -> str:
+    return MARKERS[number % len(MARKERS)]
+
+
+def empty_figure(height: float) -> Any:
+    """A figure of the usual width and a height [inches], without axes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _axes(x_label: str, y_label: str) -> tuple[Any, Any]:
+    figure = empty_figure(HEIGHT)
+    axes = figure.add_subplot(xscale="log", yscale="log", xlabel=x_label, ylabel=y_label)
+    axes.grid(True, which="major", color="#dfe3e8", lw=0.8)
+    axes.grid(True, which="minor", color="#eef0f3", lw=0.5)
+    axes.set_axisbelow(True)
+    axes.margins(x=0.09, y=0.07)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    return figure, axes
+
+
+def _triangles(axes: Any, series: Sequence[Series]) -> None:
+    """Dashed lines of slope 1 and 2 through the largest point, to compare by eye."""
+    points = [(line.x[i], line.y[i]) for line in series for i in line.shown()]
+    if len({x for x, _ in points}) < 2:
+        return
+    low, high = min(x for x, _ in points), max(x for x, _ in points)
+    top = max(y for _, y in points)
+    bottom = min(y for _, y in points)
+    for order, dashes in ((1, (4, 3)), (2, (1, 2))):
+        end = max(low, high * (0.5 * bottom / top) ** (1.0 / order))
+        axes.plot(
+            [end, high], [top * (end / high) ** order, top], color="#8a939c", lw=1.0, dashes=dashes,
+            label=f"slope {order}", zorder=1,
+        )  # fmt: skip
+
+
+def _floor(axes: Any, floor: float | None, label: str) -> None:
+    """Shade what is below ``floor``, without letting a far one stretch the figure."""
+    if floor is None or not _visible(floor):
+        return
+    low, high = axes.get_ylim()
+    if floor < low / 30.0:
+        return
+    axes.axhspan(min(low, floor / 10.0), floor, color="#9aa3ad", alpha=0.18, lw=0, label=label or None)
+    axes.set_ylim(min(low, floor / 3.0), high)
+
+
+def _finish(axes: Any) -> None:
+    """Legend, and labelled ticks also where an axis spans less than a decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        decades = math.log10(limits[1] / limits[0])
+        marks = (1.0,) if decades > 3 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(base=10.0, subs=marks, numticks=30))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+        axis.set_minor_formatter(NullFormatter())
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, framealpha=0.9, edgecolor="#d5d9de")
+
+
+def drawn(figure: Any, name: str, caption: str) -> Drawing:
+    """A matplotlib figure as PNG and SVG."""
+    from matplotlib import rc_context
+
+    png, svg = io.BytesIO(), io.BytesIO()
+    figure.savefig(png, format="png", dpi=150, metadata={"Software": None})
+    # without date and with a fixed salt the same data give the same file
+    with rc_context({"svg.hashsalt": name}):
+        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
+    return Drawing(name, caption, png.getvalue(), svg.getvalue())

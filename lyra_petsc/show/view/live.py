@@ -1,0 +1,133 @@
+"""The page of ``run --live``: a process of its own, which reads the run's folder.
+
+``python -m lyra_petsc.show.view.live HOST PORT`` reads the folder from its standard input and writes one line
+to its standard output: the address of the page, or why there is none. When its standard input ends, the run
+has ended, in whatever way; the process ends when no page is open any more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from lyra_petsc.api.mpirun import environment
+from lyra_petsc.errors import LyraError
+
+READY, FAILED = "ready ", "failed "
+"""Beginnings of that line."""
+
+NICENESS = 15
+"""On Linux 36 / (1024 + 36) = 3.4 % of a processor's time beside a busy rank, all of it on an idle one."""
+
+NICENESS_AT_START = 10
+"""Until the page is there: 10 % of the time, for work of a second that falls mostly into the set-up."""
+
+
+class LivePage:
+    """Starts the page's process before the set-up of a run, which never waits for it; for one rank.
+
+    Parameters
+    ----------
+    host : str
+    port : int
+    ready : callable
+        Called in a thread with the page's address.
+    failed : callable
+        Called in a thread with the reason, if there will be no page.
+    """
+
+    def __init__(
+        self, host: str, port: int, ready: Callable[[str], None], failed: Callable[[str], None]
+    ) -> None:
+        self._process: subprocess.Popen[str] | None = None
+        self._ready, self._failed = ready, failed
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "lyra_petsc.show.view.live", host, str(port)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=environment(),  # it is no rank of the run
+                start_new_session=True,  # Ctrl-C is for the run
+                text=True,
+            )
+        except OSError as error:
+            failed(str(error))
+        else:
+            threading.Thread(target=self._listen, args=[self._process], daemon=True).start()
+
+    def _listen(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        line = process.stdout.readline().strip()
+        if line.startswith(READY):
+            self._ready(line.removeprefix(READY))
+        elif process.stdin is not None and not process.stdin.closed:  # else the run was over before
+            self._failed(line.removeprefix(FAILED) or "its process ended")
+
+    def show(self, folder: Path) -> None:
+        """Serve the page of a run whose first state has been written."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):  # `failed` is told
+                self._process.stdin.write(f"{folder.absolute()}\n")
+                self._process.stdin.flush()
+
+    def end(self) -> None:
+        """Tell the process that the run has ended; it shows the last state until no page is open."""
+        if self._process is not None and self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+
+def main(host: str, port: int) -> None:
+    """Serve the page of the run whose folder is the first line of the standard input."""
+    _lower_priority(NICENESS_AT_START)
+    # the imports take a second, in which the run sets itself up
+    from lyra_petsc.show.view.server import LONGEST_STAY, find_run, serve
+
+    line = sys.stdin.readline()
+    if not line:
+        return
+    folder = Path(line.removesuffix("\n"))
+
+    def tell(line: str) -> None:
+        with suppress(OSError):  # the run is gone already
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+
+    def ended() -> str:
+        sys.stdin.read()
+        return (
+            f"The run has ended. This page stays for as long as it is open, at most {LONGEST_STAY / 60:.0f} "
+            f"minutes; later: lyra-petsc view {folder}"
+        )
+
+    def ready(url: str) -> None:
+        _lower_priority(NICENESS)
+        tell(READY + url)
+
+    try:
+        asyncio.run(serve(find_run(folder), host, port, ready, ended))
+    except LyraError as error:
+        tell(FAILED + str(error))
+
+
+def _lower_priority(niceness: int) -> None:
+    """Lower this process's priority, and undo a binding to processors that it has inherited from rank 0."""
+    os.setpriority(os.PRIO_PROCESS, 0, max(niceness, os.getpriority(os.PRIO_PROCESS, 0)))
+    if os.getsid(0) == os.getpid():
+        # Linux may divide the time among sessions first, and this process has its own
+        with suppress(OSError):
+            Path("/proc/self/autogroup").write_text(str(niceness), encoding="ascii")
+    if hasattr(os, "sched_setaffinity"):
+        with suppress(OSError):
+            os.sched_setaffinity(0, range(os.cpu_count() or 1))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))

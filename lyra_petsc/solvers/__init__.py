@@ -1,1 +1,0 @@
-"""PETSc options: presets per problem, precedence, unused ones; and failures in words."""

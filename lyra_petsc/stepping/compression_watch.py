@@ -1,0 +1,54 @@
+"""Where the membrane model itself softens: seen in every step, said once in a run."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from lyra_petsc.stepping.problem import Model
+from lyra_petsc.terms.stretch import SOFTENS_BELOW, principal_stretches
+
+
+class Compression:
+    """Watches the principal stretches of a model; collective.
+
+    Parameters
+    ----------
+    model : Model
+
+    Attributes
+    ----------
+    smallest, largest : float
+        Principal stretches of the state looked at last; 1 before the first.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._told = False
+        self.smallest = self.largest = 1.0
+
+    def look(self, when: str) -> str | None:
+        """Measure the present state, ``when`` in words; what there is to tell, the first time there is."""
+        membrane, comm = self._model.membrane, self._model.points.comm
+        n = membrane.n_owned
+        stretches = principal_stretches(
+            self._model.system.x, membrane.stencil, membrane.elements.data["inverse"], n
+        )
+        local = np.array([np.inf, -np.inf])
+        if n:
+            local[:] = stretches[:, 0].min(), stretches[:, 1].max()
+        ends = np.array([local[0], -local[1]])
+        comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
+        self.smallest, self.largest = float(ends[0]), float(-ends[1])
+        if self._told or not self.smallest < SOFTENS_BELOW:
+            return None
+        self._told = True
+        mine = n > 0 and local[0] == self.smallest
+        index = int(membrane.elements.index[np.argmin(stretches[:, 0])]) if mine else np.iinfo(np.int64).max
+        triangle = comm.allreduce(index, MPI.MIN)
+        return (
+            f"{when}: triangle {triangle} (counted from 0, in the mesh's order) is compressed to "
+            f"{self.smallest:.3g} of its length; below {SOFTENS_BELOW:.3f} the St. Venant-Kirchhoff model "
+            "softens under further compression, where a real sheet would buckle: a finer mesh lets it, "
+            "more bending stiffness or a smaller load avoids it"
+        )

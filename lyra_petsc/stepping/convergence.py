@@ -1,0 +1,118 @@
+"""When Newton's method stops: by the scene's tolerances, ``-snes_*tol``, or at the floor of round-off."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from lyra_petsc.linear.reasons import NOT_A_NUMBER
+from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.stage_equations import StageEquations
+
+Reason = PETSc.SNES.ConvergedReason
+
+STALLED = 0.5
+"""Fraction of the residual left by an iteration above which, at the round-off floor, it falls no more."""
+
+FELL = 0.1
+"""Fraction of the residual left by an iteration below which the preconditioner stays."""
+
+SLOWEST = 0.5
+"""Fraction of the increment before above which an increment says nothing of the next ones."""
+
+RECENT = 0.1
+"""Weight of the last Newton iteration in the mean of linear iterations that judges the linear solver."""
+
+
+class Convergence:
+    """The convergence test of one SNES.
+
+    Parameters
+    ----------
+    equations : StageEquations
+    tolerances : Solver
+        The scene's block.
+    spacing : float
+        Mean edge length [m], for the step tolerance.
+    floor : float
+        Norm [N] of the residual's round-off.
+    linear_limit : float
+        Linear iterations per Newton iteration above which another preconditioner is cheaper.
+
+    Attributes
+    ----------
+    norm : float
+        Last residual norm [N].
+    fell : bool
+        Whether the last iteration lessened it much.
+    at_roundoff : bool
+        Whether the solve ended because only round-off was left.
+    left : float
+        Estimated remaining correction of any coordinate [m].
+    too_slow : bool
+        Whether the solve was given up since its linear iterations passed the limit.
+    """
+
+    def __init__(
+        self,
+        equations: StageEquations,
+        tolerances: Solver,
+        spacing: float,
+        floor: float,
+        *,
+        linear_limit: float,
+    ) -> None:
+        self._equations, self._tolerances, self._spacing, self._floor = equations, tolerances, spacing, floor
+        self._linear_limit = linear_limit
+        self._usual = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """A new solve."""
+        self.norm, self.fell, self.at_roundoff = 0.0, False, False
+        self.left, self.too_slow = np.inf, False
+        self._first_norm = self._increment = 0.0
+        self._stalled = self._spent = 0
+
+    def test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
+        """SNES's reason to stop after so many linear iterations ``spent``, or None."""
+        before, self.norm = self.norm, residual
+        self.fell = residual < FELL * before
+        if not np.isfinite(residual):
+            return NOT_A_NUMBER
+        if iteration > 0:
+            increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
+            self._moved_by(increment * self._equations.stage.reach)
+            self._usual += RECENT * (spent - self._spent - self._usual)
+        stalls = iteration > 0 and STALLED * before < residual <= self._floor
+        self._stalled = self._stalled + 1 if stalls else 0
+        if self._stalled > 1 or residual == 0.0:
+            self.at_roundoff = residual > 0.0
+            return int(Reason.CONVERGED_FNORM_ABS)
+        self._spent = spent
+        if self._usual > self._linear_limit:
+            self.too_slow = True
+            return int(Reason.DIVERGED_LINEAR_SOLVE)
+        rtol, atol, stol, _ = snes.getTolerances()
+        if residual <= atol:
+            return int(Reason.CONVERGED_FNORM_ABS)
+        if iteration == 0:
+            self._first_norm = residual
+            return None
+        if residual <= rtol * self._first_norm:
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        balanced = residual <= self._tolerances.force_tolerance * self._equations.largest_force()
+        if balanced and self.left <= self._tolerances.step_tolerance * self._spacing:
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
+        if 0.0 < self.left <= stol * self._spacing:
+            return int(Reason.CONVERGED_SNORM_RELATIVE)
+        return None
+
+    def _moved_by(self, increment: float) -> None:
+        """Expect increments to go on falling as they fell last, where the residual shows that they may.
+
+        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.)
+        """
+        fell = increment / self._increment if self.fell and self._increment > 0.0 else 1.0
+        self._increment = increment
+        self.left = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)

@@ -1,0 +1,156 @@
+"""Energies of the state and the work done in a step, as in the energy identity of backward Euler::
+
+Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt vᵀ D v + bracket + work of handles and loads
+bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is convex)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.term import Pulling
+
+Array = NDArray[np.float64]
+
+REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
+
+
+ENERGIES = ("membrane_energy", "bending_energy", "potential_energy")
+"""Columns of history.csv that energies of registered terms are added to; others come after these."""
+
+
+@dataclass
+class Budget:
+    """Energies [J] at a state, and cumulative works [J] up to it.
+
+    ``external_work`` is that of handles, springs and loads other than gravity, ``dissipation`` that of
+    material damping; ``more`` are the energies of terms with a column of their own.
+    """
+
+    kinetic: float = 0.0
+    membrane: float = 0.0
+    bending: float = 0.0
+    potential: float = 0.0
+    external_work: float = 0.0
+    dissipation: float = 0.0
+    more: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def total(self) -> float:
+        """All energies [J] of the state."""
+        return self.kinetic + self.membrane + self.bending + self.potential + sum(self.more.values())
+
+
+class Ledger:
+    """Keeps the budget over the steps; collective.
+
+    Attributes
+    ----------
+    budget : Budget
+    """
+
+    def __init__(self, system: StageEquations) -> None:
+        self._system = system
+        named = dict.fromkeys(term.registration.energy for term in system.elastic)
+        self._more = [name for name in named if name not in (*ENERGIES, "")]
+        self.budget = Budget()
+        self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
+        self._moving = 0.0
+        self._pull: Array | float = 0.0
+        self.measure()
+
+    @property
+    def reaction(self) -> Array:
+        """Force (n_owned, 3) [N] of exact handles on the sheet in the last step; 0 in free coordinates."""
+        out = np.zeros((self._system.points.n_owned, 3))
+        np.put(out, self._at, self._reactions)
+        return out
+
+    def measure(self) -> Budget:
+        """Energies of the present state into the budget."""
+        system = self._system
+        n = system.points.n_owned
+        columns = [*ENERGIES, *self._more]
+        local = np.zeros(len(columns) + 1)
+        local[-1] = 0.5 * float(np.sum(system.mass[:, None] * system.v[:n] ** 2))
+        self._moving = 0.0
+        for term in system.elastic:
+            entry = term.registration
+            if entry.energy:
+                energy = float(term.energies(system.x, system.frozen[term]).sum())
+                local[columns.index(entry.energy)] += energy
+                self._moving += energy if entry.moving else 0.0
+        for load in system.loads:
+            if load.registration.energy:
+                local[columns.index(load.registration.energy)] += load.potential(system.x)
+        budget, sums = self.budget, [float(value) for value in system.points.summed(*local)]
+        budget.membrane, budget.bending, budget.potential = sums[:3]
+        budget.more, budget.kinetic = dict(zip(self._more, sums[3:-1], strict=True)), sums[-1]
+        return budget
+
+    def record(self, x_before: Array) -> Budget:
+        """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
+        system = self._system
+        parts, self._at = system.forces_at_stage(), system.prescribed.at
+        self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
+        external = -parts.pop("loads")
+        system.prescribed.put(external, external.take(self._at) + self._reactions)
+        for load in system.loads:
+            if load.registration.energy:  # it has a potential, and does no work from outside
+                weight = np.zeros((system.points.n_local, 3))
+                load.add_force(system.x, 0.0, 0.0, weight)
+                external -= system.load_factor * weight[: len(external)]
+        if "wind" in parts:
+            external -= parts["wind"]
+        if "springs" in parts:
+            external -= parts["springs"]
+        if not system.integrator.moves:  # the way to an equilibrium has no stage in its middle
+            external, self._pull = 0.5 * (external + self._pull), external
+        # targets that move with a handle let it work on the sheet
+        turned = system.moving_energy_before - self._moving + system.turn_targets_to_end()
+        moved = system.x[: len(x_before)] - x_before
+        local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
+        if "damping" in parts:
+            local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
+        del parts, external, moved  # energies need the room
+        work, heat = system.points.summed(*local)
+        self.budget.external_work += float(work)
+        self.budget.dissipation += float(heat)
+        return self.measure()
+
+    @property
+    def column_names(self) -> list[str]:
+        """Columns of history.csv that terms add, in the order of the terms."""
+        of_terms = [name for term in self._system.elastic for name in term.registration.columns]
+        return [*self._more, *of_terms]
+
+    def columns(self) -> dict[str, float]:
+        """Further columns of history.csv that terms add, by name; collective."""
+        system = self._system
+        found: dict[str, float] = dict(self.budget.more)
+        for term in system.elastic:
+            reductions = term.registration.columns
+            if not reductions:
+                continue
+            mine = term.history(system.x, system.frozen[term])
+            for name, how in reductions.items():
+                found[name] = float(system.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
+        return found
+
+    def handle_forces(self, count: int) -> list[Array]:
+        """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""
+        system = self._system
+        local, reaction = np.zeros((count, 3)), self.reaction
+        for number in system.held.active(system.t0, system.t1):
+            local[number] = reaction[system.held.vertices(number)].sum(axis=0)
+        for term in system.elastic:
+            if isinstance(term, Pulling):
+                local += term.handle_forces(system.x, system.frozen[term], count)
+        total = np.empty_like(local)
+        system.points.comm.Allreduce(local, total)
+        return list(total)

@@ -1,0 +1,278 @@
+"""Where a failed solve is worst, and what is odd there: from each rank's arrays to a few numbers.
+
+Everything here is collective, and every rank gets the same answer. Vertices and triangles are named by
+their numbers in the mesh; of several that are equally bad, the one of the smallest number is named, so
+that the answer does not depend on the number of ranks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.stepping.newton_trace import Stuck
+from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.prescribed_handles import Held
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Result = TypeVar("Result")
+
+TIE = 1e-6
+"""Relative difference up to which two residuals count as equally large."""
+
+
+@dataclass(frozen=True)
+class Vertex:
+    """The vertex with the largest residual.
+
+    Attributes
+    ----------
+    number : int
+    tag : int
+        What the .msh file calls it, where that is another number; else 0.
+    position, before : tuple of 3 floats
+        At the failing iterate and before the step [m].
+    residual : tuple of 3 floats
+        [N].
+    forces : dict of name → float
+        Norms [N] of the parts of the residual.
+    moved : float
+        Way from the position before the step [m].
+    mass : float
+        [kg].
+    """
+
+    number: int
+    tag: int
+    position: tuple[float, ...]
+    before: tuple[float, ...]
+    residual: tuple[float, ...]
+    forces: dict[str, float]
+    moved: float
+    mass: float
+
+
+@dataclass(frozen=True)
+class Triangle:
+    """The triangle with the largest residual at its vertices (root of the sum of squares).
+
+    Attributes
+    ----------
+    number : int
+    vertices : tuple of 3 ints
+    centre : tuple of 3 floats
+        At the failing iterate [m].
+    residual : float
+        [N].
+    aspect : float
+        Longest side over shortest height, at rest; 1.15 if equilateral.
+    stretches : tuple of 2 floats
+        Principal stretches at the failing iterate, the smaller first.
+    """
+
+    number: int
+    vertices: tuple[int, ...]
+    centre: tuple[float, ...]
+    residual: float
+    aspect: float
+    stretches: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What a failed solve looks like.
+
+    Attributes
+    ----------
+    norm : float
+        Of the residual on the free coordinates [N].
+    scale : float
+        Norm of the largest of its parts [N], of those that are finite.
+    not_finite : int
+        Vertices whose residual is not a finite number.
+    iterate_finite : bool
+        Whether the velocities are finite.
+    overflowing : list of str
+        Parts of the residual that hold such numbers.
+    vertex : Vertex
+    triangle : Triangle
+    handle : int or None
+        The handle that moves its vertices furthest in the step; None if none moves any.
+    jump : float
+        That way [m].
+    """
+
+    norm: float
+    scale: float
+    not_finite: int
+    iterate_finite: bool
+    overflowing: list[str]
+    vertex: Vertex
+    triangle: Triangle
+    handle: int | None
+    jump: float
+
+
+def diagnose(
+    points: Layout, membrane: Membrane, held: Held, stuck: Stuck, x: Array, mass: Array, tags: Array | None
+) -> Diagnosis:
+    """Look at where a solve stands.
+
+    Parameters
+    ----------
+    points : Layout
+    membrane : Membrane
+        For its triangles.
+    held : Held
+    stuck : Stuck
+    x : (n_owned, 3) or more rows
+        Positions before the step [m].
+    mass : (n_owned,) [kg]
+    tags : (n_owned,) or None
+        Of the .msh file.
+    """
+    comm, n = points.comm, points.n_vertices
+    stuck = stuck.of_vertices(n)
+    free = ~stuck.prescribed
+    residual = np.where(free, stuck.residual, 0.0)
+    wrong = ~np.isfinite(residual).all(axis=1)
+    forces = {name: np.where(free, part, 0.0) for name, part in stuck.forces.items()}
+    squares = {name: _square(comm, part) for name, part in forces.items()}
+    finite = [square for square in squares.values() if np.isfinite(square)]
+    handle, jump = _furthest(comm, held, stuck, x[:n])
+    return Diagnosis(
+        norm=float(np.sqrt(_square(comm, residual))),
+        scale=float(np.sqrt(max(finite, default=0.0))),
+        not_finite=int(comm.allreduce(int(wrong.sum()))),
+        iterate_finite=not comm.allreduce(int(not np.isfinite(stuck.velocity).all())),
+        overflowing=[name for name, square in squares.items() if not np.isfinite(square)],
+        vertex=_vertex(points, stuck, residual, forces, x[:n], mass, tags),
+        triangle=_triangle(points, membrane, stuck, residual),
+        handle=handle,
+        jump=jump,
+    )
+
+
+def _square(comm: MPI.Comm, rows: Array) -> float:
+    return float(comm.allreduce(float(np.sum(rows * rows))))
+
+
+def _size(rows: Array) -> Array:
+    """Norms of the rows, whose squares may overflow; infinite where a number is not finite."""
+    largest = np.abs(rows).max(axis=-1, initial=0.0)
+    usable = np.isfinite(largest) & (largest > 0.0)
+    scale = np.where(usable, largest, 1.0)[..., None]
+    sizes = scale[..., 0] * np.sqrt(np.sum(np.where(np.isfinite(rows), rows / scale, 0.0) ** 2, axis=-1))
+    return np.where(np.isfinite(largest), sizes, np.inf)
+
+
+def worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int], Result]) -> Result:
+    """``describe`` the row of the largest size, of the smallest number among equals; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    sizes : (n,)
+        Of this rank's rows; not NaN, may be infinite. Some rank has a row.
+    numbers : (n,) int64
+        Unique over all ranks.
+    describe : callable
+        From a row to what all ranks shall know; called on the rank that has it.
+    """
+    largest = comm.allreduce(float(sizes.max(initial=-np.inf)), MPI.MAX)
+    bad = np.flatnonzero(sizes >= largest * (1.0 - TIE)) if len(sizes) else np.empty(0, np.int64)
+    none = np.iinfo(np.int64).max
+    first = int(numbers[bad].min()) if len(bad) else none
+    number, rank = comm.allreduce((first, comm.rank), MPI.MIN)
+    mine = describe(int(bad[np.argmin(numbers[bad])])) if rank == comm.rank and number != none else None
+    told: Result | None = comm.bcast(mine, root=rank)
+    assert told is not None
+    return told
+
+
+def _vertex(
+    points: Layout,
+    stuck: Stuck,
+    residual: Array,
+    forces: dict[str, Array],
+    x: Array,
+    mass: Array,
+    tags: Array | None,
+) -> Vertex:
+    def describe(row: int) -> Vertex:
+        return Vertex(
+            number=int(points.original[row]),
+            tag=0 if tags is None else int(tags[row]),
+            position=_numbers(stuck.position[row]),
+            before=_numbers(x[row]),
+            residual=_numbers(residual[row]),
+            forces={name: float(_size(part[row])) for name, part in forces.items()},
+            moved=float(_size(stuck.position[row] - x[row])),
+            mass=float(mass[row]),
+        )
+
+    return worst(points.comm, _size(residual), points.original, describe)
+
+
+def _triangle(points: Layout, membrane: Membrane, stuck: Stuck, residual: Array) -> Triangle:
+    n, owned = points.n_vertices, membrane.n_owned
+    # with the ghosts: residual norms and mesh numbers, and positions
+    known, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
+    known[:n, 0], known[:n, 1] = _size(residual), points.original
+    position[:n] = stuck.position
+    points.update_ghosts(known)
+    points.update_ghosts(position)
+    stencil = membrane.stencil[:owned]
+    sizes = _size(known[:, 0][stencil])
+    inverse = membrane.elements.data["inverse"]
+
+    def describe(row: int) -> Triangle:
+        corners = position[stencil[row]]
+        return Triangle(
+            number=int(membrane.elements.index[row]),
+            vertices=tuple(int(number) for number in known[stencil[row], 1]),
+            centre=_numbers(corners.mean(axis=0)),
+            residual=float(sizes[row]),
+            aspect=_aspect(inverse[row]),
+            stretches=_stretches(corners, inverse[row]),
+        )
+
+    return worst(points.comm, sizes, membrane.elements.index[:owned].astype(np.int64), describe)
+
+
+def _aspect(inverse: Array) -> float:
+    """Longest side over shortest height of a triangle of this inverse rest matrix (2, 2)."""
+    first, second = np.linalg.inv(inverse).T
+    longest = max(float(side @ side) for side in (first, second, second - first))
+    return longest * abs(float(np.linalg.det(inverse)))
+
+
+def _stretches(corners: Array, inverse: Array) -> tuple[float, ...]:
+    gradient = np.column_stack([corners[1] - corners[0], corners[2] - corners[0]]) @ inverse
+    if not np.isfinite(gradient).all():
+        return (float("nan"), float("nan"))
+    return _numbers(np.linalg.svd(gradient, compute_uv=False)[::-1])
+
+
+def _furthest(comm: MPI.Comm, held: Held, stuck: Stuck, x: Array) -> tuple[int | None, float]:
+    """The handle that moves its vertices furthest, and how far [m]."""
+    ways = _size(np.where(stuck.prescribed, stuck.goal - x, 0.0))
+    numbers = held.numbers
+    if not numbers:
+        return None, 0.0
+    local = np.array([ways[held.vertices(number)].max(initial=0.0) for number in numbers])
+    furthest = np.empty_like(local)
+    comm.Allreduce(local, furthest, MPI.MAX)
+    first = int(np.argmax(furthest))
+    return (numbers[first], float(furthest[first])) if furthest[first] > 0.0 else (None, 0.0)
+
+
+def _numbers(row: Array) -> tuple[float, ...]:
+    return tuple(float(value) for value in row)

@@ -1,0 +1,202 @@
+"""Why a run cannot go on, in words: one sentence, a few lines, and the whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.mesh.mesh import Source
+from lyra_petsc.stepping.failure_diagnosis import Diagnosis
+from lyra_petsc.stepping.newton_trace import Iteration, Stuck
+from lyra_petsc.stepping.stepper import Attempt
+
+FEW = 8
+"""Iterations, and attempts, that are all shown in the few lines."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One attempt that failed: its Δt [s] (increment of the load factor), linear solver, and end."""
+
+    dt: float
+    solver: str
+    newton_iterations: int
+    linear_iterations: int
+    residual: float
+    words: str
+
+    @classmethod
+    def of(cls, attempt: Attempt, dt: float, solver: str) -> Tried:
+        """From the stepper's outcome."""
+        iterations = attempt.newton_iterations, attempt.linear_iterations
+        norm = attempt.residual if attempt.stuck is None else attempt.stuck.norm
+        return cls(dt, solver, *iterations, norm, attempt.words)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A step that did not converge.
+
+    Attributes
+    ----------
+    step : int
+        Its number, from 1.
+    time, dt : float
+        Start and length [s] of the last attempt; load factors in a static analysis.
+    static : bool
+    kind : str
+        ``overflow``, ``linear trouble`` or ``nonlinear trouble``.
+    tried : list of Tried
+        All attempts at this step, the last one last.
+    diagnosis : Diagnosis
+    advice : list of str
+    sources : list of Source
+        Of the mesh.
+    stuck : Stuck
+        The last attempt's arrays, of this rank.
+    """
+
+    step: int
+    time: float
+    dt: float
+    static: bool
+    kind: str
+    tried: list[Tried]
+    diagnosis: Diagnosis
+    advice: list[str]
+    sources: list[Source]
+    stuck: Stuck
+
+    @property
+    def now(self) -> str:
+        """Where the step starts."""
+        return f"load factor {self.time:g}" if self.static else f"t = {self.time:g} s"
+
+    @property
+    def sentence(self) -> str:
+        """What happened, where, and what to try, in one line."""
+        last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
+        return (
+            f"step {self.step} ({self.now}) did not converge even with {last}: "
+            f"{self.tried[-1].words} ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
+            f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
+            f"and {self._triangle()}; "
+            f"the state at {self.now} is kept; try {self.advice[0]}"
+        )
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The rest, short."""
+        history = ", ".join(_shortened([_iterate(each) for each in self.stuck.iterations]))
+        found = [f"residual [N] by iteration (linear iterations): {history}"] if history else []
+        found += [line for line in (self._linear(), self._earlier()) if line]
+        found += self._places()
+        return (*found, *(f"or try {words}" for words in self.advice[1:4]))
+
+    @property
+    def text(self) -> str:
+        """Everything, for a file."""
+        rows = [self.sentence, "", "Attempts at this step:"]
+        rows += [f"  {self._attempt(each)}: {each.words}" for each in self.tried]
+        rows += ["", "The last attempt, Newton iteration by iteration:"]
+        rows += [f"  {'it':>4}  {'residual [N]':>12}  {'linear its':>10}  {'KSP reason':>10}  part taken"]
+        for number, each in enumerate(self.stuck.iterations):
+            part = "" if each.taken is None else f"{each.taken:.3g}"
+            linear = f"{each.linear_iterations:10d}  {each.linear_reason:10d}"
+            rows += [f"  {number:4d}  {each.residual:12.5e}  {linear}  {part:>10}".rstrip()]
+        rows += ["", "Where (vertices and triangles are counted from 0, in file order):"]
+        rows += [f"  {line}" for line in self._places()]
+        rows += ["", "What to try:", *(f"  {words}" for words in self.advice)]
+        if self._linear():
+            rows += ["", "The last linear solve, residual norm by iteration:"]
+            norms = self.stuck.linear_residuals
+            rows += [f"  {number:4d}  {norm:12.5e}" for number, norm in enumerate(norms)]
+        return "\n".join(rows) + "\n"
+
+    def content(self) -> dict[str, Any]:
+        """For the summary."""
+        return {
+            "step": self.step,
+            "load_factor" if self.static else "time": self.time,
+            "kind": self.kind,
+            "attempts": [asdict(each) for each in self.tried],
+            "iterations": [asdict(each) for each in self.stuck.iterations],
+            **asdict(self.diagnosis),
+            "advice": self.advice,
+        }
+
+    # -- pieces ----------------------------------------------------------------------------------------
+
+    def _attempt(self, tried: Tried) -> str:
+        length = f"increment {tried.dt:.3g}" if self.static else f"Δt {tried.dt:.3g} s"
+        return (
+            f"{length} ({tried.solver}): {tried.newton_iterations} Newton and {tried.linear_iterations} "
+            f"linear iterations, residual {tried.residual:.3g} N"
+        )
+
+    def _earlier(self) -> str:
+        """The attempts before the last one."""
+        each = [
+            f"{tried.dt:.3g}: {tried.residual:.3g} ({tried.newton_iterations})" for tried in self.tried[:-1]
+        ]
+        step = "increment" if self.static else "Δt [s]"
+        shown = ", ".join(_shortened(each))
+        return f"attempts before, {step}: residual [N] (Newton iterations): {shown}" if each else ""
+
+    def _linear(self) -> str:
+        """The linear solve, where it is what failed."""
+        norms = self.stuck.linear_residuals
+        if self.kind != "linear trouble" or len(norms) < 2:
+            return ""
+        return f"last linear solve: residual {norms[0]:.3g} → {norms[-1]:.3g} in {len(norms) - 1} iterations"
+
+    def _places(self) -> list[str]:
+        vertex, triangle = self.diagnosis.vertex, self.diagnosis.triangle
+        forces = ", ".join(f"{name} {size:.3g}" for name, size in vertex.forces.items())
+        size = math.hypot(*vertex.residual)
+        many = self.diagnosis.not_finite
+        return [
+            *([f"{many} vertices have a residual that is not finite"] if many else []),
+            f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
+            f"residual {size:.3g} N of forces [N] {forces}",
+            f"{self._triangle()} of vertices {', '.join(map(str, triangle.vertices))} around "
+            f"{_point(triangle.centre)} m: stretched to {triangle.stretches[0]:.3g} and "
+            f"{triangle.stretches[1]:.3g}, aspect ratio at rest {triangle.aspect:.3g}",
+        ]
+
+    def _vertex(self) -> str:
+        vertex = self.diagnosis.vertex
+        label, number = self._within(vertex.number, [each.n_vertices for each in self.sources])
+        words = [f"node {vertex.tag}"] if vertex.tag else []
+        words += [f"vertex {number}"] if len(self.sources) > 1 and not vertex.tag else []
+        more = f" ({words[0]} of {label})" if words else ""
+        return f"vertex {vertex.number}{more}"
+
+    def _triangle(self) -> str:
+        whole = self.diagnosis.triangle.number
+        label, number = self._within(whole, [each.n_triangles for each in self.sources])
+        return f"triangle {whole}" + (f" (triangle {number} of {label})" if len(self.sources) > 1 else "")
+
+    def _within(self, number: int, counts: Sequence[int]) -> tuple[str, int]:
+        """The source that has a vertex or triangle, and its number there."""
+        ends = np.cumsum(counts)
+        which = int(np.searchsorted(ends, number, side="right"))
+        return self.sources[which].label, number - int(ends[which] - counts[which])
+
+
+def _iterate(each: Iteration) -> str:
+    linear = f" ({each.linear_iterations})" if each.taken is not None else ""
+    part = f" ×{each.taken:.2g}" if each.taken is not None and each.taken < 0.995 else ""
+    return f"{each.residual:.3g}{linear}{part}"
+
+
+def _shortened(entries: list[str]) -> list[str]:
+    return entries if len(entries) <= FEW else [*entries[:3], "…", *entries[-4:]]
+
+
+def _point(position: Sequence[float], digits: int = 6) -> str:
+    return "(" + ", ".join(f"{value:.{digits}g}" for value in position) + ")"

@@ -1,0 +1,33 @@
+"""Where Newton starts: with the velocities of the last step, or at rest where it stands.
+
+The former is right where the motion is smooth, as those who choose a second-order integrator expect it to be.
+In stiff sheets that crumple, going on along the tangents stretches the sheet by far more than the step will,
+and staying is nearer; the objective tells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.stage_equations import StageEquations
+
+Array = NDArray[np.float64]
+
+
+def first_guess(system: StageEquations, out: Array) -> None:
+    """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
+    n = system.points.n_owned
+    if system.integrator.lagged_loads:
+        out[:] = 0.0
+        system.prescribe(out)
+        return
+    going_on = system.v[:n].copy()
+    system.prescribe(going_on)
+    if system.integrator.order > 1:
+        out[:] = going_on
+        return
+    staying = system.velocity_of_staying()
+    system.prescribe(staying)
+    less = system.objective(staying)[0] < system.objective(going_on)[0]
+    out[:] = staying if less else going_on

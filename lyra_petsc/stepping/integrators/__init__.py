@@ -1,0 +1,1 @@
+"""integrators: one module each, and the registry that a scene picks from."""

@@ -1,0 +1,33 @@
+"""Backward Euler, the Lyra paper eq. 10-18, in full and as the paper's one linear solve a step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
+
+Array = NDArray[np.float64]
+
+
+class BackwardEuler(Integrator):
+    """x_{n+1} = x_n + Δt v_{n+1}: first order, damps every motion it does not resolve."""
+
+    name = "beuler"
+    error_constant = 0.5
+
+    def stage_after(self, dt: float) -> float:
+        return dt
+
+    def stage(self, x: Array, v: Array, dt: float) -> Stage:
+        return Stage(1.0 / dt, dt, dt)
+
+    def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
+        return x + dt * stage_velocity, stage_velocity
+
+
+class SemiImplicit(BackwardEuler):
+    """One Newton iteration of backward Euler from the start of the step, the paper's method."""
+
+    name = "semi-implicit"
+    lagged_loads = True

@@ -1,0 +1,133 @@
+"""What every integrator is: one implicit solve a step, for the velocity of its stage.
+
+Every integrator is a choice of what the stage's accelerations and positions are in its velocities v::
+
+    v̇ = σ (v − v_h)        x = x_h + c v
+
+with the history v_h, x_h and the numbers σ [1/s], c [s] of the step; and of what the stage says about
+the end of the step. Arrays only, rows of the owned vertices.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Arrays = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The implicit system of one step.
+
+    Attributes
+    ----------
+    sigma : float
+        dv̇/dv [1/s].
+    reach : float
+        dx/dv [s].
+    after : float
+        Time [s] from the start of the step to the stage.
+    x, v : (n_owned, 3) or None
+        Histories x_h [m] and v_h [m/s]; None: positions and velocities at the start of the step.
+    """
+
+    sigma: float
+    reach: float
+    after: float
+    x: Array | None = None
+    v: Array | None = None
+
+
+class Follower(Protocol):
+    """What depends on the accelerations at the start of a step."""
+
+    @property
+    def needs_acceleration(self) -> bool:
+        """Whether it must be told them now."""
+
+    def start_from(self, acceleration: Array) -> None:
+        """Take them, (n_owned, 3) [m/s²]."""
+
+    def disturbed(self) -> None:
+        """Forces jump at the start of the coming step."""
+
+
+class Forgetful:
+    """What a integrator answers that remembers nothing between steps."""
+
+    @property
+    def needs_acceleration(self) -> bool:
+        """Whether `start_from` must be called before `Integrator.stage`."""
+        return False
+
+    def start_from(self, acceleration: Array) -> None:
+        """Take the accelerations (n_owned, 3) [m/s²] at the start of the step."""
+
+    def disturbed(self) -> None:
+        """Forces jump at the start of the coming step: forget accelerations."""
+
+    def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
+        """Remember the step that led from x, v; ``free`` marks the coordinates nothing prescribed."""
+
+    def memory(self) -> tuple[Arrays, dict[str, float]]:
+        """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
+        return {}, {}
+
+    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
+        """Go on with a memory."""
+
+
+class Integrator(Forgetful, ABC):
+    """One integrator and what it remembers between steps.
+
+    Attributes
+    ----------
+    name : str
+        As in a scene's ``time.integrator``.
+    order : int
+        Of the positions at a fixed time in Δt.
+    ts_type : str
+        The TS that solves the stage: ``theta`` (½) for the midpoint rule, else ``beuler``, which is given the
+        history in place of the last velocities.
+    lagged_loads : bool
+        Velocity-dependent loads are taken at the start of the step.
+    moves : bool
+        It is a motion in time, with damping.
+    centred : bool
+        What is frozen during a step is frozen at the extrapolated stage, as second order needs.
+    given : bool
+        Prescribed coordinates take part in the stage with their exact position and velocity at its
+        time; else with the velocity that the integrator gives them for their position at the end.
+    """
+
+    name: ClassVar[str]
+    order: ClassVar[int] = 1
+    ts_type: ClassVar[str] = "beuler"
+    lagged_loads: ClassVar[bool] = False
+    moves: ClassVar[bool] = True
+    centred: ClassVar[bool] = False
+    given: bool = False
+
+    @property
+    @abstractmethod
+    def error_constant(self) -> float:
+        """Local error of the positions in the last step over Δt² ẍ (order 1) or Δt³ x⃛ (order 2)."""
+
+    @abstractmethod
+    def stage_after(self, dt: float) -> float:
+        """Time [s] from the start of a step of length dt to its stage."""
+
+    @abstractmethod
+    def stage(self, x: Array, v: Array, dt: float) -> Stage:
+        """The implicit system of a step of length dt [s] from positions x and velocities v."""
+
+    @abstractmethod
+    def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
+        """Positions and velocities at the end of the step."""

@@ -1,0 +1,30 @@
+"""The implicit midpoint rule."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
+
+Array = NDArray[np.float64]
+
+
+class Midpoint(Integrator):
+    """Implicit midpoint rule: second order, keeps energy, damps nothing."""
+
+    name = "midpoint"
+    order = 2
+    error_constant = 1.0 / 12.0
+    ts_type = "theta"
+    centred = True
+    given = True
+
+    def stage_after(self, dt: float) -> float:
+        return 0.5 * dt
+
+    def stage(self, x: Array, v: Array, dt: float) -> Stage:
+        return Stage(2.0 / dt, 0.5 * dt, 0.5 * dt)
+
+    def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
+        return x + dt * stage_velocity, 2.0 * stage_velocity - v

@@ -1,0 +1,37 @@
+"""The proximal step of a static analysis, in the form of a integrator."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
+
+Array = NDArray[np.float64]
+
+
+class Static(Integrator):
+    """Not a motion: the proximal step of `stepping.equilibrium`, backward Euler from rest.
+
+    Attributes
+    ----------
+    pseudo : float
+        Pseudo time step [s]: the larger, the closer to equilibrium a solve gets.
+    """
+
+    name = "static"
+    error_constant = 0.0
+    lagged_loads = True
+    moves = False
+
+    def __init__(self) -> None:
+        self.pseudo = 1.0
+
+    def stage_after(self, dt: float) -> float:
+        return dt
+
+    def stage(self, x: Array, v: Array, dt: float) -> Stage:
+        return Stage(1.0 / self.pseudo, self.pseudo, dt)
+
+    def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
+        return x + self.pseudo * stage_velocity, np.zeros_like(v)

@@ -1,0 +1,283 @@
+"""Set-up: from a checked scene to one rank's part of the discretised problem; collective."""
+
+from __future__ import annotations
+
+import ctypes
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.linear.hierarchy import Surface
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.linear.petsc_options import petsc_number
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.distribute import Part, Whole, distribute
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.measures import mean_edge_length
+from lyra_petsc.mesh.mesh import Mesh, Source
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.parallel import on_root
+from lyra_petsc.phases import Phases
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.initial_state import start_positions, start_velocities
+from lyra_petsc.stepping.integrators.registry import integrator_of
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.motion import Window
+from lyra_petsc.terms.prescribed_handles import Held, is_exact, select_held
+from lyra_petsc.terms.registry import Role, active, registered
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Term
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass
+class Outline:
+    """What every rank knows of the whole: a few numbers and names."""
+
+    n_vertices: int
+    n_triangles: int
+    spacing: float
+    """Mean rest edge length [m]."""
+    size: float
+    """Diagonal [m] of the rest shape's bounding box."""
+    reach: float
+    """Largest coordinate [m] of the start and rest shape."""
+    terms: list[str]
+    sources: list[Source]
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Model:
+    """One rank's part of a scene, ready to step.
+
+    Attributes
+    ----------
+    scene, outline
+    discretisation : Discretisation
+    terms : dict of name → Term
+        The active ones.
+    system : StageEquations
+    surface : Surface
+        The mesh as it was before the scene's start moved it.
+    probes : dict of name → (n,) int
+        Owned vertices of each probe, local numbering.
+    mesh : Mesh or None
+        The whole mesh, on rank 0, until ``release``.
+    partitioner : str
+    tags : (n_vertices,) or None
+        Node tags that a .msh file gives the owned vertices, 0 for others, as float64.
+    """
+
+    scene: Scene
+    outline: Outline
+    discretisation: Discretisation
+    terms: dict[str, Term]
+    system: StageEquations
+    surface: Surface
+    probes: dict[str, Ints]
+    mesh: Mesh | None
+    partitioner: str
+    tags: Array | None
+
+    def release(self) -> None:
+        """Let go of the whole mesh; from here on no rank holds a global array."""
+        self.mesh = None
+        _give_back_freed()
+
+    @property
+    def points(self) -> Layout:
+        """The rows of this rank and their ghosts."""
+        return self.discretisation.layout
+
+    @property
+    def pattern(self) -> BlockPattern:
+        """Of the matrix."""
+        return self.discretisation.rows.pattern
+
+    @property
+    def membrane(self) -> Membrane:
+        """The membrane term, which every scene has."""
+        return next(term for term in self.terms.values() if isinstance(term, Membrane))
+
+
+def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
+    """Mesh, partition, terms and matrix pattern of a scene; collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks alike, for whatever in the scene or its meshes cannot be simulated.
+    """
+    whole: Whole | None = None
+    mesh: Mesh | None = None
+
+    def prepare() -> Outline:
+        nonlocal whole, mesh
+        mesh = build_mesh(scene.mesh, file=scene.source)
+        outline, whole = _whole(scene, mesh)
+        return outline
+
+    with phases("mesh"):
+        outline = on_root(comm, prepare)
+        assert outline is not None
+    with phases("partition"):
+        part = distribute(comm, whole)
+        whole = None
+    with phases("assembly"):
+        model = _local(scene, outline, part, mesh)
+        del part
+        _give_back_freed()
+        return model
+
+
+def _give_back_freed() -> None:
+    """Let the system have the memory that was freed."""
+    # a library of PETSc's (SuperLU_dist) tells malloc to keep it
+    with suppress(AttributeError, OSError):  # glibc only
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def events(scene: Scene) -> list[float]:
+    """Times [s] on which a step must end: handles and loads begin and end there."""
+    windows = [Window.of(handle) for handle in scene.handles]
+    windows += [Window(load.start, load.until) for load in scene.loads]
+    return [t for window in windows for t in window.events()]
+
+
+def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
+    """Everything there is to distribute (rank 0)."""
+    rest = RestShape(scene, mesh)
+    light = np.flatnonzero(~(rest.mass > 0.0))
+    if len(light):
+        raise InputError(
+            f"{len(light)} vertices without mass (first: {light[:5].tolist()}); "
+            "give their material a density > 0",
+            file=scene.source,
+            key="material",
+        )
+    elements: dict[str, Elements] = {}
+    names: list[str] = []
+    for entry in active(scene, rest.shells):
+        found = entry.module().elements(rest)
+        if found is not None and len(found.stencil) == 0:
+            continue
+        names.append(entry.name)
+        if found is not None:
+            elements[entry.name] = found
+    held = select_held(scene, mesh)
+    for number, vertices in held.items():
+        elements[f"held {number}"] = Elements(vertices[:, None])
+    for name, selector in scene.probes.items():
+        vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
+        elements[f"probe {name}"] = Elements(vertices[:, None])
+    data = {"position": mesh.positions, "mass": rest.mass}
+    if scene.initial is not None:
+        data |= start_positions(scene.initial, mesh, held) | start_velocities(scene.initial, mesh, rest.mass)
+    if mesh.tags is not None:
+        data["tag"] = mesh.tags.astype(np.float64)
+    outline = Outline(
+        n_vertices=mesh.n_vertices,
+        n_triangles=mesh.n_triangles,
+        spacing=mean_edge_length(mesh),
+        size=float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
+        reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
+        terms=names,
+        sources=mesh.sources,
+        notes=[*mesh.notes, *rest.notes],
+    )
+    on_edges = any(each.edges is not None for each in elements.values())
+    edges = rest.edges if on_edges else None
+    return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges)
+
+
+def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Model:
+    layout = part.layout
+    terms: dict[str, Term] = {}
+    for name in outline.terms:
+        entry = registered(name)
+        terms[name] = entry.module().make(part.elements.get(name), scene, part.vertex_data["mass"])
+        terms[name].registration = entry
+    integrator = integrator_of(scene.time.scheme, _spectral_radius(scene))
+    roles = {Role.ELASTIC, Role.CONSTRAINT} | (set() if integrator.lagged_loads else {Role.VISCOUS})
+    coupling = [term for term in terms.values() if term.registration.role in roles]
+    discretisation = Discretisation(layout, coupling)
+    _check_indices(layout, discretisation.rows.pattern.n_couplings)
+    held = Held(
+        scene,
+        {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
+    )
+    mass = np.zeros(layout.n_owned)
+    mass[: layout.n_vertices] = part.vertex_data["mass"]
+    system = StageEquations(
+        discretisation,
+        mass,
+        list(terms.values()),
+        held,
+        integrator=integrator,
+        starts=[Window.of(handle).start for handle in scene.handles],
+        events=events(scene),
+    )
+    data, rows = part.vertex_data, slice(0, layout.n_vertices)
+    system.x[rows] = data["position"]
+    layout.update_ghosts(system.x)
+    surface = Surface(system.x.copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil)
+    # handles set out from the undisturbed shape
+    system.begin(0.0)
+    system.x[rows] = data.get("start", data["position"])
+    system.v[rows] = data.get("velocity", 0.0)
+    system.state.update_ghosts()
+    system.rest_at(0.0)
+    probes = {name: _own(part, f"probe {name}") for name in scene.probes}
+    return Model(
+        scene,
+        outline,
+        discretisation,
+        terms,
+        system,
+        surface,
+        probes,
+        mesh,
+        part.partitioner,
+        data.get("tag"),
+    )
+
+
+def _check_indices(points: Layout, n_blocks: int) -> None:
+    """Refuse more unknowns, or more entries on a rank, than PETSc's integers count; collective."""
+    largest = int(np.iinfo(PETSc.IntType).max)
+    most_entries = 9 * points.comm.allreduce(n_blocks, MPI.MAX)
+    if 3 * points.n_global <= largest and most_entries <= largest:
+        return
+    remedy = "a PETSc with 64-bit indices" if 3 * points.n_global > largest else "more ranks"
+    raise InputError(
+        f"{points.n_global} vertices make {3 * points.n_global} unknowns and up to {most_entries} matrix "
+        f"entries on a rank, of which this PETSc counts {largest}; take {remedy}, or make the mesh coarser",
+        key="mesh",
+    )
+
+
+def _spectral_radius(scene: Scene) -> float | None:
+    """That of the scene, or PETSc's ``-ts_alpha_radius``."""
+    if scene.time.spectral_radius is None:
+        return None
+    radius = petsc_number("ts_alpha_radius", scene.time.spectral_radius)
+    if not 0.0 <= radius <= 1.0:
+        raise InputError(f"must be from 0 to 1, not {radius:g}", key="-ts_alpha_radius")
+    return radius
+
+
+def _own(part: Part, name: str) -> Ints:
+    """Owned vertices of a set of single-vertex elements, local numbering."""
+    elements = part.elements[name]
+    return elements.stencil[: elements.n_owned, 0].astype(np.int64)

@@ -1,1 +1,0 @@
-"""Time schemes: one module each, and the registry that a scene picks from."""

@@ -1,0 +1,367 @@
+"""A scene in motion: steps with retries, no files."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number
+from lyra_petsc.phases import Phases
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.compression_watch import Compression
+from lyra_petsc.stepping.energy_balance import Budget, Ledger
+from lyra_petsc.stepping.equilibrium import Equilibrium
+from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
+from lyra_petsc.stepping.failure_diagnosis import diagnose
+from lyra_petsc.stepping.failure_report import Failure, Tried
+from lyra_petsc.stepping.local_error import LocalError
+from lyra_petsc.stepping.problem import Model, build_model, events
+from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.step_control import LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.stepping.ts_options import with_ts_options
+
+Array = NDArray[np.float64]
+
+SMALLEST_FRACTION = 2.0**-12
+"""Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""
+
+LARGEST_FRACTION = 0.1
+"""Largest Δt of an adaptive run over its length (``-ts_adapt_dt_max`` overrides it)."""
+
+SMALLEST_ADAPTED = 1e-6
+"""Smallest Δt of an adaptive run over the largest (``-ts_adapt_dt_min`` overrides it)."""
+
+
+@dataclass
+class StepReport:
+    """One accepted step; ``left`` [m] is what more Newton iterations would move."""
+
+    step: int
+    time: float
+    dt: float
+    newton_iterations: int
+    linear_iterations: int
+    rejected: int
+    residual: float
+    wall_seconds: float
+    smallest_stretch: float = 1.0
+    largest_stretch: float = 1.0
+    left: float = math.inf
+
+
+def _positive(name: str, seconds: float) -> float:
+    """A time [s] from PETSc's options, or from the scene and then positive anyway."""
+    if not 0.0 < seconds < math.inf:
+        raise InputError(f"must be a finite number of seconds > 0, not {seconds:g}", key=name)
+    return seconds
+
+
+class Simulation:
+    """Set up a scene and step through it; every method is collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    scene : Scene
+    phases : Phases, optional
+        Where wall time is charged.
+
+    Attributes
+    ----------
+    scene : Scene
+        With the integrator and the kind of steps that PETSc's options chose.
+    model : Model
+    time : float
+        [s]
+    step_number : int
+    failure : Failure or None
+        Why the last step could not be taken.
+    notes : list of str
+        What the user should know: mesh repairs, changed linear solver, …
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the scene cannot be simulated.
+    """
+
+    def __init__(self, comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> None:
+        self.comm, self.scene = comm, scene
+        self.phases = phases or Phases()
+        self._filled = fill_gaps(scene.petsc)
+        try:
+            self.scene = with_ts_options(scene)
+            self._set_up(self.scene)
+        except BaseException:
+            self._take_back_options()
+            raise
+
+    def _set_up(self, scene: Scene) -> None:
+        self.model: Model = build_model(self.comm, scene, self.phases)
+        self.notes = list(self.model.outline.notes)
+        outline, system = self.model.outline, self.model.system
+        with self.phases("solve"):
+            floor = residual_roundoff(system, outline.reach)
+            if not math.isfinite(floor):
+                raise InputError(
+                    "stiffness times size overflows; give smaller numbers or another unit of length",
+                    file=scene.source,
+                    key="material",
+                )
+            self.stepper = Stepper(scene, system, self.model.surface, outline.spacing, floor)
+        self._floor = floor
+        ts = self.stepper.ts
+        self.max_steps = ts.getMaxSteps()
+        self.control = self._control(
+            _positive("-ts_dt", petsc_number("ts_dt", ts.getTimeStep())),
+            _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
+        )
+        self.time, self.step_number = 0.0, 0
+        self.local_error = LocalError(system) if scene.time.adaptive else None
+        self.estimated_error = 0.0
+        self.compression = Compression(self.model)
+        self._told_of_error = self._told_of_roundoff = False
+        self.failure: Failure | None = None
+        self._tried: list[Tried] = []
+        self.stepper.start(0.0, 0)
+        self.ledger = Ledger(system)
+        self._seek: Equilibrium | Stepper = self.stepper
+        if scene.time.analysis == "static":
+            self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
+
+    def _control(self, step: float, end: float) -> StepControl:
+        """Plan of the steps: fixed, by a tolerance, or of a load factor."""
+        time, every = self.scene.time, self.scene.output.every
+        largest = LARGEST_FRACTION * end if time.adaptive else step
+        largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
+        smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
+        smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
+        if time.analysis == "static":
+            return LoadControl(largest, end, None, events(self.scene), smallest)
+        if time.adaptive:
+            return ToleranceControl(step, largest, end, every, events(self.scene), smallest)
+        return StepControl(largest, end, every, events(self.scene), smallest)
+
+    @property
+    def budget(self) -> Budget:
+        """Energies and works up to the present state."""
+        return self.ledger.budget
+
+    @property
+    def finished(self) -> bool:
+        """Whether the end of the scene, or ``-ts_max_steps``, is reached."""
+        return self.control.is_end(self.time) or self.step_number >= self.max_steps
+
+    def step(self) -> StepReport:
+        """One accepted step, retried with a smaller Δt where needed.
+
+        Raises
+        ------
+        SolverError
+            If even the smallest Δt fails; the state is that before the step.
+        """
+        started = clock.perf_counter()
+        system, n = self.model.system, self.model.points.n_owned
+        x_before = system.x.copy()
+        v_before = system.v.copy() if self.local_error is not None else system.v  # else no step is undone
+        newton = linear = rejected = 0
+        self._tried = []
+        while True:
+            end = self.control.next_end(self.time)
+            past = system.integrator.memory()
+            with self.phases("solve"):
+                attempt = self._seek.attempt(self.time, end)
+            newton += attempt.newton_iterations
+            linear += attempt.linear_iterations
+            if not attempt.converged:
+                self._recover(attempt, end)
+            elif self._accurate(v_before[:n], end - self.time):
+                break
+            else:
+                system.state.set(x_before[:n], v_before[:n])
+                system.integrator.restore(*past)
+                self.stepper.start(self.time, self.step_number)
+            rejected += 1
+        self.control.succeeded(newton)
+        dt, self.time = end - self.time, end
+        self.step_number += 1
+        with self.phases("balance"):
+            self.ledger.record(x_before[:n])
+            note = self.compression.look(f"step {self.step_number} ({self._now()})")
+        if note:
+            self.notes.append(note)
+        if attempt.at_roundoff and not self._told_of_roundoff:
+            self._tell_of_roundoff(attempt.residual)
+        for term in system.elastic:
+            if term.registration.state:
+                term.accept(system.x, system.frozen[term])
+        system.begin(self.time)
+        self.stepper.monitor()
+        seconds = clock.perf_counter() - started
+        took = newton, linear, rejected, attempt.residual, seconds
+        stretch = self.compression.smallest, self.compression.largest
+        return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.left)
+
+    def _tell_of_roundoff(self, residual: float) -> None:
+        """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
+        loads = float(np.sum(self.model.system.loads_now**2))
+        driving = math.sqrt(self.comm.allreduce(loads))
+        if residual > self.scene.solver.force_tolerance * driving > 0.0:
+            self._told_of_roundoff = True
+            self.notes.append(
+                f"step {self.step_number} ({self._now()}) ended at round-off: double precision leaves a "
+                f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads"
+            )
+
+    def _now(self) -> str:
+        """The present time, or load factor, in words."""
+        moves = self.model.system.integrator.moves
+        return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
+
+    def _accurate(self, v_before: Array, dt: float) -> bool:
+        """Whether the step just taken keeps its share of the tolerance."""
+        control = self.control
+        if self.local_error is None or not isinstance(control, ToleranceControl):
+            return True
+        size = self.model.outline.size
+        error = self.local_error.of(v_before, dt) / size
+        share = (self.scene.time.tolerance or 0.0) * dt / control.end
+        stands = control.judge(dt, error / share, self.model.system.integrator.order)
+        if stands:
+            self.local_error.accepted(v_before, dt)
+            self.estimated_error += error
+            if error > share and not self._told_of_error:
+                self._told_of_error = True
+                self.notes.append(
+                    f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
+                    f"the smallest Δt = {dt:.3g} s (-ts_adapt_dt_min)"
+                )
+        return stands
+
+    def _recover(self, attempt: Attempt, end: float) -> None:
+        self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
+        if self.stepper.linear_solver_failed:
+            previous, slow = self.stepper.preset, self.stepper.linear_solver_slow
+            following = self.stepper.next_preset()
+            if following is not None:
+                why = "took too many iterations" if slow else "broke down"
+                self.notes.append(
+                    f"step {self.step_number + 1}: linear solver '{previous}' {why}, "
+                    f"going on with '{following}'"
+                )
+                return
+        in_vain = isinstance(self._seek, Equilibrium) and self._seek.in_vain
+        if in_vain or not self.control.failed():
+            self.failure = self._explain(attempt, end)
+            raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
+
+    def _explain(self, attempt: Attempt, end: float) -> Failure:
+        """Why the last attempt at a step failed; collective."""
+        model, scene, stuck = self.model, self.scene, attempt.stuck
+        assert stuck is not None
+        system, outline, stepper = model.system, model.outline, self.stepper
+        diagnosis = diagnose(
+            model.points, model.membrane, system.held, stuck, system.x, system.mass, model.tags
+        )
+        now = Circumstances(
+            dt=end - self.time,
+            nominal=self.control.step,
+            spacing=outline.spacing,
+            floor=self._floor,
+            max_iterations=stepper.snes.getTolerances()[3],
+            iterations_key="-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations",
+            linear_iterations=stepper.ksp.getTolerances()[3],
+            preconditioner=stepper.ksp.getPC().getType(),
+            ranks=self.comm.size,
+        )
+        return Failure(
+            step=self.step_number + 1,
+            time=self.time,
+            dt=now.dt,
+            static=not system.integrator.moves,
+            kind=trouble(diagnosis, stuck),
+            tried=self._tried,
+            diagnosis=diagnosis,
+            advice=advice(diagnosis, stuck, scene, now),
+            sources=outline.sources,
+            stuck=stuck,
+        )
+
+    def memory(self) -> dict[str, Any]:
+        """What a checkpoint must hold beside positions and velocities to go on as if never stopped."""
+        return {
+            "time": self.time,
+            "step": self.step_number,
+            "budget": asdict(self.budget),
+            **self.control.memory(),
+            "estimated_error": self.estimated_error,
+            "integrator": self._numbers(),
+            "blend": self.stepper.blend,
+            "preset": self.stepper.preset,
+            "late_starts": sorted(self.model.system.reference.late),
+        }
+
+    def _numbers(self) -> dict[str, float]:
+        numbers = self.model.system.integrator.memory()[1]
+        return numbers if self.local_error is None else numbers | self.local_error.memory()[1]
+
+    def arrays(self) -> dict[str, Array]:
+        """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
+        arrays = dict(self.model.system.integrator.memory()[0])
+        if self.local_error is not None:
+            arrays |= self.local_error.memory()[0]
+        return arrays
+
+    def term_states(self) -> dict[str, Array]:
+        """Vertex arrays (n_vertices, 3) that terms with a state keep in a checkpoint, by ``term.name``."""
+        return {
+            f"{term.name}.{name}": values
+            for term in self.model.system.elastic
+            for name, values in term.state().items()
+        }
+
+    def resume(self, memory: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+        """Go on from a state already put into ``model.system`` (x and v of owned rows)."""
+        system = self.model.system
+        system.state.update_ghosts()
+        self.time, self.step_number = float(memory["time"]), int(memory["step"])
+        for name, value in memory["budget"].items():
+            if name != "more":
+                setattr(self.budget, name, float(value))
+        # what a changed scene lets begin before now sets out from here; else all has begun already
+        system.begin(self.time)
+        system.rest_at(self.time)
+        self.ledger.measure()
+        self.control.restore(memory)
+        self.estimated_error = float(memory["estimated_error"])
+        system.integrator.restore(arrays, memory["integrator"])
+        if self.local_error is not None:
+            self.local_error.restore(arrays, memory["integrator"])
+        for term in system.elastic:
+            names = term.registration.state
+            if names:
+                term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
+        while memory["preset"] in self.stepper.presets[1:]:
+            self.stepper.next_preset()
+        self.stepper.blend = float(memory["blend"])
+        self.stepper.start(self.time, self.step_number)
+
+    def destroy(self) -> None:
+        """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""
+        self.stepper.destroy()
+        self.model.discretisation.destroy()
+        self._take_back_options()
+
+    def _take_back_options(self) -> None:
+        for name in self._filled:
+            PETSc.Options().delValue(name)

@@ -1,0 +1,488 @@
+"""The implicit equations of one step: residual, Jacobian and objective in the velocities of the stage.
+
+Unknown v (the velocity of the integrator's stage), with its history x_h, v_h and numbers σ, c::
+
+    F(v, v̇) = M v̇ + ∇E(x_h + c v) + D v + ∇P(v) − f,  v̇ = σ (v − v_h)       Jacobian  σ M + c K + D + ∇∇P
+
+with the elastic energy E, damping D = γ K⁺, the wind's potential P and the loads f. It is the gradient
+of ``objective``. Backward Euler has x_h = x_n, v_h = v_n, σ = 1/c = 1/Δt: the Lyra paper, eq. 10-18, as
+a Newton iteration. The geometry of D, P and f is frozen during a step: at x_n for first-order integrators,
+at the extrapolated stage x_n + (t_s − t_n) v_n for second-order ones.
+
+Unknowns of edges have no mass: their part of F is ∂E/∂φ, and they are in equilibrium at the stage. Where that
+is not the end of the step they are sought once more there (`StageEquations.begin_edges`).
+
+Arrays only: no PETSc here. Collective where sums over ranks are returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, partial, reduce
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.linear.discretisation import Discretisation
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.stepping.damping import Damping
+from lyra_petsc.stepping.integrators.integrator import Follower, Integrator, Stage
+from lyra_petsc.stepping.prescribed import Prescribed
+from lyra_petsc.stepping.reference_positions import ReferencePositions
+from lyra_petsc.stepping.state import State, fitted
+from lyra_petsc.terms.prescribed_handles import Held
+from lyra_petsc.terms.registry import Role
+from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
+
+Array = NDArray[np.float64]
+
+
+class StageEquations:
+    """One rank's part of the equations, and the state (x_n, v_n) a step starts from.
+
+    Parameters
+    ----------
+    discretisation : Discretisation
+    mass : (n_owned,) [kg]
+        Of block rows: the lumped mass of vertices, 0 of edges.
+    terms : sequence of Term
+    held : Held
+    integrator : Integrator
+    starts : list of float
+        Times [s] at which handles start to act.
+    events : list of float
+        Times [s] at which forces may jump.
+
+    Attributes
+    ----------
+    state : State
+    history : (n_owned, 3)
+        The stage's v_h [m/s].
+    reference : ReferencePositions
+    prescribed : Prescribed
+        Unknowns that are held in the step.
+    moving_energy_before : float
+        Energy [J] of this rank's terms with moving targets at the start of the step, with these where they
+        stand at its stage.
+    dt, t0, t1 : float
+        Length, start and end of the step [s].
+    followers : list of Follower
+        Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
+    load_factor : float
+        Factor on all loads (1 in a motion).
+    unbalanced, given_loads : (n_owned, 3) or None
+        Static: force [N] of the start shape, let go of with the load factor; loads in place of the present.
+    """
+
+    def __init__(
+        self,
+        discretisation: Discretisation,
+        mass: Array,
+        terms: Sequence[Term],
+        held: Held,
+        *,
+        integrator: Integrator,
+        starts: list[float],
+        events: list[float],
+    ) -> None:
+        self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
+        self.elastic = [term for term in terms if isinstance(term, Elastic)]
+        self.viscous = [term for term in terms if isinstance(term, Viscous)]
+        self.loads = [term for term in terms if isinstance(term, Load)]
+        self.held, self._events = held, events
+        rows = np.concatenate([held.reference_rows, *(term.reference_rows for term in terms)])
+        self.reference = ReferencePositions(self.points, rows, starts)
+        self.prescribed = Prescribed(discretisation, held, self.reference)
+        pulling = [term for term in self.elastic if term.registration.role is Role.CONSTRAINT]
+        sheet = [term for term in self.elastic if term.registration.role is Role.ELASTIC]
+        self._constraints, self._moving = pulling, [t for t in sheet if t.registration.moving]
+        self._limiting = [term for term in self.elastic if term.registration.limits_step]
+        internal = partial(self._sum, sheet)  # moving targets change the forces at one and the same place
+        self._internal = internal if self._moving else Remembered(internal)
+        once = integrator.lagged_loads
+        self._damping = Damping(discretisation, self.elastic, moves=integrator.moves, once=once)
+        last = (self._internal, self._damping.product) if once else ()
+        self._asked_once = [each for each in last if isinstance(each, Remembered)]
+        self.state = State(discretisation)
+        n_local = self.points.n_local
+        self._xs, self._vs, self._gradient, self._force = (np.zeros((n_local, 3)) for _ in range(4))
+        self._xh, self.history = self.x, self.v[: self.points.n_owned]
+        self.stage = Stage(1.0, 1.0, 1.0)
+        self.frozen: dict[Term, Any] = dict.fromkeys(terms)
+        self._objectives: list[tuple[Array, tuple[float, float]]] = []
+        self.dt = self.t0 = self.t1 = self.moving_energy_before = self._size = 0.0
+        self.followers: list[Follower] = [integrator]
+        self.load_factor = 1.0
+        self.unbalanced: Array | None = None
+        self.given_loads: Array | None = None
+        self._iterates: tuple[Array | None, Array | None] = (None, None)
+        self._last_parts: dict[str, Array] = {}
+
+    @property
+    def points(self) -> Layout:
+        """The layout of the rows, with the ghosts of the present stencils."""
+        return self.discretisation.layout
+
+    @property
+    def x(self) -> Array:
+        """Positions (n_local, 3) [m] of the state."""
+        return self.state.x
+
+    @property
+    def v(self) -> Array:
+        """Velocities (n_local, 3) [m/s] of the state."""
+        return self.state.v
+
+    def begin(self, time: float) -> None:
+        """Let everything that starts to act by ``time`` [s] set out from the present positions."""
+        self.reference.until(time, self.x)
+
+    def rest_at(self, time: float) -> None:
+        """Let moving targets stand where they are at ``time`` [s], between two steps."""
+        self.t0 = self.t1 = time
+        step = Step(time, time, time, self.x, self.reference.at)
+        self.frozen |= {term: term.freeze(step) for term in self.elastic}
+
+    # -- a step ------------------------------------------------------------------------------------
+
+    def begin_step(self, t0: float, t1: float) -> None:
+        """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
+        self.t0, self.t1, self.dt = t0, t1, t1 - t0
+        self.new_iterate(None)
+        self._follow(self.x)
+        after = self.integrator.stage_after(self.dt)
+        changed = self.prescribed.begin_step(t0, t1)
+        self._freeze(t0 + after)
+        if changed or t0 in self._events:
+            for follower in self.followers:
+                follower.disturbed()
+        asking = [follower for follower in self.followers if follower.needs_acceleration]
+        acceleration = self._accelerations() if asking else self.history
+        for follower in asking:
+            follower.start_from(acceleration)
+        n = self.points.n_owned
+        self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
+        self.history = self.v[:n].copy() if stage.v is None else stage.v
+        self._set_history(stage, t0 + after)
+        self.moving_energy_before = self.moving_energy()
+
+    def _accelerations(self) -> Array:
+        force, mass = self.out_of_balance()[0], self.mass[:, None]
+        return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
+
+    def _freeze(self, at: float) -> None:
+        """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
+        n = self.points.n_owned
+        x = self._frozen_positions(at)
+        self.frozen = {}  # there is no room for both
+        self.frozen = self._frozen_at(at, x)
+        self._objectives, self._size = [], float(np.abs(self.x).max(initial=0.0))
+        if self.integrator.moves or self.given_loads is None:
+            self._load(x)
+        else:
+            self._force[:n] = self.given_loads
+        if self._damping.acts:
+            self._damping.freeze(x, self.frozen)
+
+    def _frozen_at(self, at: float, x: Array) -> dict[Term, Any]:
+        step = Step(self.t0, self.t1, at, x, self.reference.at)
+        return {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
+
+    def _frozen_positions(self, at: float) -> Array:
+        """Positions (n_local, 3) whose geometry stays as it is during the step."""
+        if not self.integrator.centred:
+            return self.x
+        x = self.x + (at - self.t0) * self.v
+        if self.points.n_edges_global:  # unknowns of edges are never extrapolated
+            edges = ~self._vertex_rows
+            x[edges] = self.x[edges]
+        return x
+
+    @cached_property
+    def _vertex_rows(self) -> NDArray[np.bool_]:
+        """Which local rows (n_local,) are vertices; ghosts that contact adds are."""
+        return self.points.are_vertices(self.points.global_number)
+
+    def _load(self, x: Array) -> None:
+        """Loads that stay as they are during the step."""
+        n, t0, t1 = self.points.n_owned, self.t0, self.t1
+        self._force[:] = 0.0
+        for load in self.loads:
+            load.add_force(x, t0, t1, self._force)
+        if self.viscous and self.integrator.lagged_loads:
+            self._force[:n] -= self._sum(self.viscous, self.v)
+        self._force[n:] = 0.0
+        self._force *= self.load_factor
+        if self.unbalanced is not None:
+            self._force[:n] += (1.0 - self.load_factor) * self.unbalanced
+
+    def _set_history(self, stage: Stage, at: float) -> None:
+        """x_h with its ghosts, and the velocities of the prescribed unknowns."""
+        n = self.points.n_owned
+        given = bool(self.held) and self.integrator.given
+        if stage.x is None and not given:
+            self._xh = self.x
+            self.prescribed.solve(self.x[:n], stage.reach)
+            return
+        self._xh = np.empty_like(self.x)
+        self._xh[:n] = self.x[:n] if stage.x is None else stage.x
+        if given:
+            self.prescribed.give(at, self._xh[:n], stage.reach)
+        else:
+            self.prescribed.solve(self._xh[:n], stage.reach)
+        self.points.update_ghosts(self._xh)
+
+    @property
+    def loads_now(self) -> Array:
+        """The loads in force (n_owned, 3) [N]."""
+        return self._force[: self.points.n_owned].copy()
+
+    def out_of_balance(self) -> tuple[Array, float]:
+        """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
+        parts = self._parts(self.x, self.v, np.zeros_like(self.history))
+        return np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
+
+    @property
+    def stage_velocity(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
+        return self._vs[: self.points.n_owned]
+
+    def prescribe(self, v: Array) -> None:
+        """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
+        self.prescribed.put(v, self.prescribed.velocity)
+
+    def velocity_of_staying(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
+        return ((self.x - self._xh) / self.stage.reach)[: self.points.n_owned]
+
+    def accept(self, v: Array) -> None:
+        """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
+        n, given, free = self.points.n_owned, self.integrator.given, self.prescribed.free
+        self._evaluate_at(v)  # what the step's forces are taken at afterwards
+        before, rate_before = self.x[:n].copy(), self.v[:n].copy()
+        moved, rate = self.integrator.end(before, rate_before, v, self.dt)
+        self.integrator.accepted(before, rate_before, free, self.dt)
+        self.prescribed.put(moved, self.prescribed.goal)
+        if given:
+            self.prescribed.overwrite_with_rates(rate)
+        self.state.set(moved, rate)
+
+    # -- unknowns of edges at the end of a step ----------------------------------------------------
+
+    @property
+    def edges_lag(self) -> bool:
+        """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
+        return bool(self.points.n_edges_global) and self.integrator.moves and self.stage.after < self.dt
+
+    def begin_edges(self, x_before: Array) -> None:
+        """Seek the edges' unknowns at the end of the step just accepted, from x_before (n_owned, 3);
+        collective.
+
+        A stage of backward Euler in which the vertices go where they are now.
+        """
+        n = self.points.n_owned
+        self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.frozen
+        self.new_iterate(None)
+        self._objectives = []
+        self.stage = Stage(1.0 / self.dt, self.dt, self.dt)
+        self.history = np.zeros((n, 3))
+        self._xh = fitted(x_before, n, self.points.n_local)
+        self.points.update_ghosts(self._xh)
+        self.frozen = self.frozen | self._frozen_at(self.t1, self.x)
+        self.prescribed.hold_vertices(self.x[:n])
+        self.prescribed.solve(self._xh[:n], self.dt)
+
+    def end_edges(self, v: Array | None) -> None:
+        """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""
+        n = self.points.n_owned
+        moved = None if v is None else self._xh[:n] + self.stage.reach * v
+        self.stage, self.history, self._xh, stage_velocity, self.frozen = self._kept
+        self.prescribed.release_vertices()
+        self._objectives = []
+        self.new_iterate(None)
+        if moved is not None:
+            rows = slice(self.points.n_vertices, n)
+            self.x[rows] = moved[rows]
+            self.state.update_ghosts()
+        self._evaluate_at(stage_velocity)
+
+    # -- terms -------------------------------------------------------------------------------------
+
+    def written_velocity(self) -> Array:
+        """Velocities (n_owned, 3) to write out: those of prescribed unknowns are ẋ*(t)."""
+        self.prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
+        return velocity
+
+    def moving_energy(self) -> float:
+        """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
+        return sum(float(term.energies(self.x, self.frozen[term]).sum()) for term in self._moving)
+
+    def turn_targets_to_end(self) -> float:
+        """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""
+        if self.stage.after == self.dt or not (self._moving or self._constraints):
+            return 0.0
+        before = self.moving_energy()
+        step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)
+        self.frozen |= {term: term.freeze(step) for term in (*self._moving, *self._constraints)}
+        return self.moving_energy() - before
+
+    @cached_property
+    def _stiffnesses(self) -> dict[Term, Array]:
+        fixed = [term for term in self.elastic if not term.registration.neighbours]
+        return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}
+
+    @property
+    def limits_step(self) -> bool:
+        """Whether terms limit how far a Newton iteration may go."""
+        return bool(self._limiting)
+
+    def largest_step(self, v: Array, way: Array) -> float:
+        """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
+        x = self._evaluate_at(v)[0]
+        ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
+        self.points.update_ghosts(ahead)
+        fraction = min(term.largest_step(x, ahead, self.frozen[term]) for term in self._limiting)
+        return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
+
+    # -- what Newton asks for ----------------------------------------------------------------------
+
+    def _follow(self, x: Array) -> None:
+        """Let stencils be those at positions x (n_owned or more, 3), and make room for their ghosts."""
+        if not self.discretisation.changes or not self.discretisation.follow(x[: self.points.n_owned]):
+            return
+        layout = self.points
+        n, n_local = layout.n_owned, layout.n_local
+        same = self._xh is self.x
+        self.state.fit()
+        self._xh = self.x if same else fitted(self._xh, n, n_local)
+        self._xs, self._vs = fitted(self._xs, n, n_local), fitted(self._vs, n, n_local)
+        for values in (self._xh, self._xs, self._vs):
+            layout.update_ghosts(values)
+        self._gradient, self._force = np.zeros((n_local, 3)), fitted(self._force, n, n_local)
+        self.__dict__.pop("_vertex_rows", None)
+        self.prescribed.fit()
+
+    def _evaluate_at(self, v: Array) -> tuple[Array, Array]:
+        """Positions and velocities (n_local, 3) of the stage, ghosts up to date; collective."""
+        self._vs[: self.points.n_owned] = v
+        self.points.update_ghosts(self._vs)
+        np.multiply(self._vs, self.stage.reach, out=self._xs)
+        self._xs += self._xh
+        self._follow(self._xs)
+        return self._xs, self._vs
+
+    def forces_at_stage(self) -> dict[str, Array]:
+        """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
+        rate = self.stage.sigma * (self._vs[: self.points.n_owned] - self.history)
+        parts, self._last_parts = self._parts(self._xs, self._vs, rate), {}
+        return parts
+
+    def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
+        n, self._last_parts = self.points.n_owned, {}  # there is no room for both
+        parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
+        if self._constraints:
+            parts["springs"] = self._sum(self._constraints, x)
+        parts["loads"] = -self._force[:n]
+        if self._damping.acts:
+            parts["damping"] = self._damping.product(vs)
+        if self.viscous and not self.integrator.lagged_loads:
+            parts["wind"] = self._sum(self.viscous, vs)
+        self._last_parts = parts
+        return parts
+
+    def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
+        self._gradient[:] = 0.0
+        for term in terms:
+            term.add_gradient(at, self.frozen[term], self._gradient)
+        return self._gradient[: self.points.n_owned].copy()
+
+    def residual(self, v: Array, vdot: Array, out: Array) -> None:
+        """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
+        parts = self._parts(*self._evaluate_at(v), vdot).values()
+        reduce(lambda total, part: np.add(total, part, out=out), parts)
+        at, velocity = self.prescribed.at, self.prescribed.velocity
+        self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
+
+    def largest_force(self) -> float:
+        """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
+        parts = (np.where(self.prescribed.free, part, 0.0) for part in self._last_parts.values())
+        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
+
+    def new_iterate(self, v: Array | None) -> None:
+        """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
+
+        Its stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
+        """
+        if v is None:
+            self._iterates = None, None
+        else:
+            self._iterates = self._iterates[1], self._evaluate_at(v)[0].copy()
+
+    def forget_rows(self) -> None:
+        """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
+        self._damping.let_go()
+
+    def jacobian(self, v: Array, blend: float, values: Array) -> None:
+        """Let block rows (n_blocks, 3, 3) be σ M + c K + D + ∇∇P, prescribed unknowns decoupled.
+
+        ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
+        """
+        x, vs = self._evaluate_at(v)
+        rows, before = self.discretisation.rows, self._iterates[0]
+        if before is not None and len(before) != len(x):
+            before = None  # an iterate with other ghosts
+        lagged = self.integrator.lagged_loads
+        self._last_parts = {} if lagged else self._last_parts
+        for remembered in self._asked_once:  # the linear solve needs the room
+            remembered.forget()
+        inertia, reach = self.stage.sigma * self.mass, self.stage.reach
+        blocks = self.prescribed.blocks
+        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, blocks):
+            self._damping.into(values, inertia)
+            for term in self.elastic:
+                rows.add_stiffness(term, x, self.frozen[term], blend, reach, values, before)
+        if not lagged:
+            for wind in self.viscous:
+                wind.add_hessian(vs, self.frozen[wind], rows.pattern.offsets, values)
+        if len(self.prescribed.rows):
+            rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
+
+    def objective(self, v: Array) -> tuple[float, float]:
+        """The function whose gradient F is, and what its round-off is relative to [W].
+
+        Collective. The latter is the size of its summands, and for each elastic energy the root of itself
+        times the energy at which strains are of order one: small strains are small differences of large
+        coordinates.
+        """
+        if self._objectives:
+            # a line search ends, and a first guess begins, where it was asked for already
+            same = np.array([int(np.array_equal(v, at)) for at, _ in self._objectives])
+            self.points.comm.Allreduce(MPI.IN_PLACE, same, MPI.MIN)
+            if same.any():
+                return self._objectives[int(same.argmax())][1]
+        result = self._objective(v)
+        self._objectives = [*self._objectives[-1:], (v.copy(), result)]
+        return result
+
+    def _objective(self, v: Array) -> tuple[float, float]:
+        n, sigma, rate = self.points.n_owned, self.stage.sigma, 1.0 / self.stage.reach
+        x, vs = self._evaluate_at(v)
+        change = v - self.history
+        parts, square = [0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))], 0.0
+        for term in self.elastic:
+            each = term.energies(x, self.frozen[term])
+            parts.append(rate * float(each.sum()))
+            stiffness = self._stiffnesses.get(term)
+            if stiffness is None:
+                stiffness = term.force_scale(1.0)[: term.n_owned]
+            square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
+        parts.append(-rate * float(np.vdot(self._force[:n], x[:n] - self.x[:n])))
+        if self._damping.acts:
+            parts.append(0.5 * float(np.vdot(v, self._damping.product(vs))))
+        if not self.integrator.lagged_loads:
+            parts += [float(wind.potentials(vs, self.frozen[wind]).sum()) for wind in self.viscous]
+        value, size, square = self.points.summed(sum(parts), sum(abs(part) for part in parts), square)
+        return float(value), float(size) + float(np.sqrt(square))

@@ -1,0 +1,53 @@
+"""Positions and velocities between two steps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.linear.discretisation import Discretisation
+
+Array = NDArray[np.float64]
+
+
+class State:
+    """This rank's rows of a state, ghosts up to date.
+
+    Attributes
+    ----------
+    x, v : (n_local, 3)
+        Positions [m] and velocities [m/s]; rows of edges hold their unknowns and the rates of these.
+    """
+
+    def __init__(self, discretisation: Discretisation) -> None:
+        self._discretisation = discretisation
+        n_local = discretisation.layout.n_local
+        self.x, self.v = np.zeros((n_local, 3)), np.zeros((n_local, 3))
+
+    def update_ghosts(self) -> None:
+        """Let ghosts be what their owners have; collective."""
+        layout = self._discretisation.layout
+        for values in (self.x, self.v):
+            layout.update_ghosts(values)
+
+    def fit(self) -> None:
+        """Follow the layout to other ghosts; collective."""
+        layout = self._discretisation.layout
+        self.x, self.v = (
+            fitted(self.x, layout.n_owned, layout.n_local),
+            fitted(self.v, layout.n_owned, layout.n_local),
+        )
+        self.update_ghosts()
+
+    def set(self, x: Array, v: Array) -> None:
+        """Take positions and velocities (n_owned, 3); collective."""
+        n = self._discretisation.layout.n_owned
+        self.x[:n], self.v[:n] = x, v
+        self.update_ghosts()
+
+
+def fitted(values: Array, n_owned: int, n_local: int) -> Array:
+    """The owned rows of an array, with room for so many local rows."""
+    out = np.zeros((n_local, 3))
+    out[:n_owned] = values[:n_owned]
+    return out

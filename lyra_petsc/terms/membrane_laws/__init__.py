@@ -1,0 +1,1 @@
+"""Laws of the membrane by Green strain; one file each, registered in ``registry``."""

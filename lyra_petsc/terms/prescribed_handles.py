@@ -1,0 +1,112 @@
+"""Handles as exact constraints: which coordinates are prescribed in a step, and where to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.capacity import available_memory
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.scene.schema import Handle, Scene
+from lyra_petsc.terms.motion import Motion, Window, motion_of
+
+Array = NDArray[np.float64]
+Selection = dict[int, NDArray[np.int64]]
+Reference = Callable[[float, NDArray[np.int64]], Array]
+"""Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time."""
+
+BYTES_PER_HELD_VERTEX = 100
+"""Memory [B] of a vertex in a handle, while it is distributed and then held."""
+
+
+def is_exact(handle: Handle) -> bool:
+    """Whether a handle is a constraint (else it is a spring, see ``terms.spring``)."""
+    return handle.stiffness is None
+
+
+def select_held(scene: Scene, mesh: Mesh) -> Selection:
+    """Vertices of every exact handle of a scene, by its number, on the whole mesh (rank 0)."""
+    selection: Selection = {}
+    memory, held = available_memory(), 0
+    for number, handle in enumerate(scene.handles):
+        if not is_exact(handle):
+            continue
+        key = f"handles[{number}]"
+        selection[number] = select_vertices(mesh, handle, key=key, file=scene.source)
+        held += len(selection[number])
+        if held * BYTES_PER_HELD_VERTEX > memory:
+            raise InputError(
+                f"the handles up to this one hold {held} vertices in all, more than fit into "
+                f"{memory / 2**30:.3g} GiB of memory; let fewer handles hold the same vertices",
+                file=scene.source,
+                key=key,
+            )
+    return selection
+
+
+class Held:
+    """The exact handles of a scene on one rank.
+
+    Where two handles prescribe the same coordinate at the same time, the later one in the scene counts.
+
+    Parameters
+    ----------
+    scene : Scene
+    owned : mapping of handle number → (n,) int
+        Owned vertices of each exact handle, local numbering.
+    """
+
+    def __init__(self, scene: Scene, owned: Selection) -> None:
+        self._vertices = owned
+        self._axes = {
+            number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
+        }
+        self._places = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
+        self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
+        self._windows = {number: Window.of(scene.handles[number]) for number in owned}
+
+    def __bool__(self) -> bool:
+        return bool(self._vertices)
+
+    def active(self, t0: float, t1: float) -> tuple[int, ...]:
+        """Numbers of the handles that hold through the step from t0 to t1 [s]."""
+        return tuple(number for number, window in self._windows.items() if window.holds(t0, t1))
+
+    def mask(self, t0: float, t1: float, n_owned: int) -> NDArray[np.bool_]:
+        """Prescribed coordinates (n_owned, 3) of the step from t0 to t1 [s]."""
+        mask = np.zeros((n_owned, 3), dtype=bool)
+        for number in self.active(t0, t1):
+            mask[self._places[number]] = True
+        return mask
+
+    def targets(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
+        """Write the positions [m] prescribed at time ``at`` of the step t0..t1 into ``out`` (n_owned, 3)."""
+        for number in self.active(t0, t1):
+            start = self._windows[number].start
+            goal = self._motions[number].carried(reference(start, self._vertices[number]), start, at)
+            out[self._places[number]] = goal[:, self._axes[number]]
+
+    def velocities(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
+        """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
+        for number in self.active(t0, t1):
+            start = self._windows[number].start
+            rate = self._motions[number].velocity(reference(start, self._vertices[number]), start, at)
+            out[self._places[number]] = rate[:, self._axes[number]]
+
+    @property
+    def reference_rows(self) -> NDArray[np.int64]:
+        """Local rows (n,) whose reference positions are asked for."""
+        return np.concatenate([np.empty(0, dtype=np.int64), *self._vertices.values()])
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the exact handles in the scene."""
+        return list(self._vertices)
+
+    def vertices(self, number: int) -> NDArray[np.int64]:
+        """Owned vertices of a handle, local numbering."""
+        return self._vertices[number]

@@ -1,1 +1,0 @@
-"""One file per case, each holding ``CASE``; the registry lists them by name."""

@@ -1,0 +1,207 @@
+"""The balances of real steps, and that a broken kernel or an unsolved step shows in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.experiments.stress.base import sheet
+from lyra_petsc.experiments.stress.case import Case, Level, Setting
+from lyra_petsc.experiments.stress.changes import as_it_is, blow, damp
+from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.experiments.stress.registry import selected
+from lyra_petsc.experiments.stress.runner import Outcome, run_case
+from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.membrane import Membrane
+
+Array = np.ndarray
+CELLS = 8
+
+
+def run(comm: MPI.Comm, *, steps: int = 4, **changes: Any) -> Outcome:
+    """A small hanging sheet in a breeze, or what ``changes`` make of it."""
+    content = blow(sheet(CELLS), 3.0) | changes
+    case = Case("try", "a try", as_it_is, steps=steps)
+    return run_case(comm, case, Setting(content, False, Level.QUICK))
+
+
+def handled(seconds: float) -> dict[str, Any]:
+    """A handle that swings, a spring, and a load."""
+    motion = [{"time": 0.0}, {"time": seconds, "translate": [0.02, -0.03, 0.05]}]
+    return {
+        "handles": [
+            {"nodes": [0], "motion": "shake"},
+            {"nodes": [CELLS], "stiffness": 50.0, "motion": "shake"},
+        ],
+        "motions": {"shake": motion},
+        "loads": [{"nodes": [40], "force": [0.1, 0.0, 0.0]}, {"pressure": 2.0}],
+    }
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        handled(0.02),
+        {"handles": [{"group": "bottom", "clamp": True, "motion": "turn"}], "motions": {
+            "turn": [{"time": 0.0}, {"time": 0.02, "rotate": {"axis": [1, 0, 0], "degrees": 20}}]}},
+        {"handles": [], "initial": {"angular_velocity": [5, 20, 3], "noise": 0.01}},
+    ],
+    ids=["hung", "handles, spring and loads", "clamp that turns", "tumbling"],
+)  # fmt: skip
+def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
+    outcome = run(comm, **changes)
+    assert len(outcome.record.balances) == 4
+    assert outcome.failures == {}
+    assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
+    assert not any(balance.jumped for balance in outcome.record.balances)
+
+
+@pytest.mark.parallel
+def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
+    record = run(comm, **handled(0.02)).record
+    found = np.cumsum([balance.change for balance in record.balances])
+    np.testing.assert_allclose(found, np.subtract(record.energies, record.start_energy), rtol=1e-9)
+
+
+def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
+    [case] = selected(["pressed"], Level.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(10), False, Level.QUICK))
+    assert any(balance.jumped for balance in outcome.record.balances)
+    assert "jumped" in outcome.verdicts["energy"].words
+    assert outcome.failures == {}
+
+
+@pytest.mark.parallel
+def test_every_balance_holds_where_triangles_collapse(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = [1.0]
+    real = Bending.energies
+
+    def energies(self: Bending, x: Array, *more: Any) -> Array:
+        left.append(float(self.weights(x).min(initial=1.0)))
+        return real(self, x, *more)
+
+    monkeypatch.setattr(Bending, "energies", energies)
+    [case] = selected(["wind-200"], Level.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(CELLS), False, Level.QUICK))
+    assert comm.allreduce(min(left), op=MPI.MIN) < 0.1
+    assert outcome.failures == {}
+
+
+def broken(term: type, factor: float) -> Callable[[Any, Array, Any, Array], None]:
+    """A gradient that is not quite that of the energy."""
+    real = term.add_gradient
+
+    def add_gradient(self: Any, x: Array, frozen: Any, out: Array) -> None:
+        mine = np.zeros_like(out)
+        real(self, x, frozen, mine)
+        out += factor * mine
+
+    return add_gradient
+
+
+@pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])
+def test_forces_that_are_no_gradient_break_the_identity(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, term: type, factor: float
+) -> None:
+    monkeypatch.setattr(term, "add_gradient", broken(term, factor))
+    stiff = {"solver": {"force_tolerance": 1e-9, "step_tolerance": 1e-6}}
+    assert "energy" in run(comm, initial={"noise": 0.01}, **stiff).failures
+
+
+def add_a_net_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the membrane's forces not add up to zero."""
+    real = Membrane.add_gradient
+
+    def add_gradient(self: Membrane, x: Array, frozen: Any, out: Array) -> None:
+        real(self, x, frozen, out)
+        out[20, 0] += 1e-3
+
+    monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
+
+
+def test_forces_that_do_not_add_up_break_the_momentum(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_a_net_force(monkeypatch)
+    assert "momentum" in run(comm).failures
+
+
+def test_a_torque_from_within_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Membrane.add_gradient
+
+    def add_gradient(self: Membrane, x: Array, frozen: Any, out: Array) -> None:
+        real(self, x, frozen, out)
+        out[20, 0] += 1e-3
+        out[60, 0] -= 1e-3
+
+    monkeypatch.setattr(Membrane, "add_gradient", add_gradient)
+    failures = run(comm).failures
+    assert "angular" in failures["momentum"].words
+
+
+def test_a_step_that_was_not_solved_is_seen(comm: MPI.Comm) -> None:
+    assert "equations" in run(comm, petsc={"snes_rtol": 0.1}).failures
+
+
+def test_negative_damping_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Membrane.__init__
+
+    def init(self: Membrane, elements: Any, *more: Any) -> None:
+        elements.data["damping"][:] *= -1.0
+        real(self, elements, *more)
+
+    monkeypatch.setattr(Membrane, "__init__", init)
+    content = damp(sheet(CELLS), 1e-3)
+    case = Case("try", "a try", as_it_is, steps=4)
+    outcome = run_case(comm, case, Setting(content, False, Level.QUICK))
+    assert "no gain" in outcome.failures
+
+
+def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> Outcome:
+    content = blow(sheet(CELLS), 3.0) | changes
+    content["time"]["integrator"] = integrator
+    return run_case(comm, Case("a", "b", as_it_is, steps=4), Setting(content, True, Level.QUICK))
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
+def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: str) -> None:
+    outcome = stepped_by(comm, integrator, **handled(0.02))
+    assert outcome.failures == {}
+    assert {"equations", "resolved", "energy", "momentum"} < set(outcome.verdicts)
+    assert "no gain" not in outcome.verdicts
+    assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
+
+
+@pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])
+def test_a_broken_kernel_shows_in_other_integrators(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, term: type, factor: float
+) -> None:
+    monkeypatch.setattr(term, "add_gradient", broken(term, factor))
+    assert "energy" in stepped_by(comm, "bdf2", initial={"noise": 0.01}).failures
+
+
+def test_an_unbalanced_force_shows_in_other_integrators(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add_a_net_force(monkeypatch)
+    assert "momentum" in stepped_by(comm, "midpoint").failures
+
+
+def test_the_semi_implicit_method_promises_no_balance(comm: MPI.Comm) -> None:
+    outcome = stepped_by(comm, "semi-implicit")
+    assert outcome.passed
+    assert outcome.record.balances == []
+    assert set(outcome.verdicts) == {"converged", "softening"}
+
+
+def test_an_empty_record_is_no_success() -> None:
+    assert not Outcome(Case("a", "b", as_it_is), record=Record(1, 1.0, 1.0)).passed

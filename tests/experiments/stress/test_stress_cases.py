@@ -1,0 +1,227 @@
+"""The cases: what they make of a scene, and the answers they know."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.stress.base import setting_of, sheet
+from lyra_petsc.experiments.stress.case import Level, NotHere, Setting
+from lyra_petsc.experiments.stress.cases import chain, rigid_plate, start
+from lyra_petsc.experiments.stress.changes import anisotropic, blow, move, scale
+from lyra_petsc.experiments.stress.registry import FAMILIES, selected
+from lyra_petsc.scene.schema import Scene
+
+CLOTH = """\
+mesh: {grid: {width: 2.0, height: 1.0, nx: 4, ny: 2}}
+material:
+- {cloth: gray-interlock, stretching_scale: 2.0}
+- {group: sheet, cloth: gray-interlock, damping: 0.1}
+gravity: [0, -9.81, 0]
+handles: [{nodes: [0, 4], until: 0.5, fade: 0.1}, {nodes: [2], from: 1.0}]
+initial: {noise: 0.001}
+time: {end: 4, step: auto}
+output: {every: 0.1}
+probes: {tip: {nodes: [3]}}
+"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.yaml"
+    path.write_text(CLOTH, encoding="utf-8")
+    return path
+
+
+def test_names_are_unique_and_speak_for_themselves() -> None:
+    found = FAMILIES.all()
+    assert [family.name for family in found] == list(FAMILIES.modules)
+    names = [case.name for family in found for case in family.cases]
+    assert len(names) == len(set(names))
+    assert not set(names) & set(FAMILIES.modules)
+    assert all(family.title and all(case.title for case in family.cases) for family in found)
+
+
+def test_levels_include_each_other_and_every_family_is_in_the_usual_one() -> None:
+    quick, usual, full = (
+        [case.name for case in selected([], level)] for level in (Level.QUICK, Level.USUAL, Level.FULL)
+    )
+    assert set(quick) < set(usual) < set(full)
+    assert {case.family for case in selected([], Level.USUAL)} == set(FAMILIES.modules) - {"products"}
+
+
+def test_a_case_is_found_by_name_at_any_level_and_a_family_by_level() -> None:
+    assert [case.name for case in selected(["plate-1e8-1e3-1ms"], Level.QUICK)] == ["plate-1e8-1e3-1ms"]
+    assert [case.name for case in selected(["wind"], Level.QUICK)] == ["wind-200"]
+    assert len(selected(["wind"], Level.USUAL)) == 2
+
+
+def test_a_family_without_a_case_at_the_level_is_refused() -> None:
+    with pytest.raises(InputError, match="--full"):
+        selected(["products"], Level.QUICK)
+
+
+@pytest.mark.parametrize("name", ["stiff-1e7-5ms", "winds"])
+def test_an_unknown_name_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="did you mean"):
+        selected([name], Level.QUICK)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None:
+    setting = setting_of(scene if given else None, (), Level.QUICK)
+    made, left_out = 0, []
+    with Bench(comm, exact=False) as bench:
+        for case in selected([], Level.FULL):
+            try:
+                content = case.content(setting, bench)
+            except NotHere:
+                left_out.append(case.name)
+                continue
+            checked = Scene.model_validate(content)
+            assert checked.time.end == pytest.approx(case.steps * float(checked.time.step))
+            assert checked.solver == Scene.model_validate(setting.base).solver
+            assert checked.petsc == {}
+            made += 1
+    assert setting.base == setting_of(scene if given else None, (), Level.QUICK).base
+    assert made > 200
+    assert bool(left_out) is given
+
+
+def test_a_given_scene_keeps_what_it_is_made_of(scene: Path) -> None:
+    setting = setting_of(scene, ("gravity=[0, 0, -1]",), Level.QUICK)
+    assert setting.base["gravity"] == [0, 0, -1]
+    assert setting.step == 0.005
+    assert not {"output", "probes"} & setting.base.keys()
+    scaled = scale(setting.content(), stretching=1e3, bending=0.0, density=10.0)["material"]
+    assert [block["stretching_scale"] for block in scaled] == [2e3, 1e3]
+    assert [block["bending_scale"] for block in scaled] == [0.0, 0.0]
+    assert [block["density_scale"] for block in scaled] == [10.0, 10.0]
+
+
+def test_a_static_scene_is_refused(scene: Path) -> None:
+    scene.write_text(CLOTH.replace("{end: 4, step: auto}", "{analysis: static}"), encoding="utf-8")
+    with pytest.raises(InputError, match="analysis"):
+        setting_of(scene, (), Level.QUICK)
+
+
+def test_anisotropy_of_a_library_cloth(scene: Path) -> None:
+    setting = setting_of(scene, (), Level.QUICK)
+    for block in anisotropic(setting.content(), 1e4)["material"]:
+        assert block["membrane"]["c11"] / block["membrane"]["c22"] == pytest.approx(1e4)
+        assert block["membrane"]["c12"] == 0.0
+    assert anisotropic(setting.content(), 1e4)["material"][1]["group"] == "sheet"
+
+
+def test_wind_has_its_speed_and_keeps_the_scenes_air() -> None:
+    content = blow(sheet(4) | {"wind": {"velocity": [1, 0, 0], "density": 0.5, "drag": 0.1}}, 50.0)["wind"]
+    assert math.hypot(*content["velocity"]) == pytest.approx(50.0)
+    assert (content["density"], content["drag"]) == (0.5, 0.1)
+
+
+def test_handles_move_for_ever_and_a_sheet_without_cannot() -> None:
+    content = sheet(4)
+    content["handles"][0] |= {"until": 1.0, "fade": 0.1}
+    moved = move(content, [{"time": 0.0}])["handles"][0]
+    assert moved["motion"] == "stress"
+    assert not {"until", "fade"} & moved.keys()
+    with pytest.raises(NotHere):
+        move(sheet(4) | {"handles": []}, [{"time": 0.0}])
+
+
+# -- start shapes --------------------------------------------------------------------------------------
+
+
+def flat(n: int = 40) -> np.ndarray:
+    i, j = np.meshgrid(np.arange(n + 1) / n, np.arange(n + 1) / n)
+    return np.column_stack([i.ravel(), j.ravel(), 0.0 * i.ravel()])
+
+
+def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
+    x = flat()
+    y = start._crumpled(x, 0.025)
+    assert np.ptp(y, axis=0).max() < 0.4
+    assert np.ptp(y, axis=0).min() > 0.05
+    # folds only ever shorten a way
+    random = np.random.default_rng(0).integers(0, len(x), (500, 2))
+    before = np.linalg.norm(x[random[:, 0]] - x[random[:, 1]], axis=1)
+    after = np.linalg.norm(y[random[:, 0]] - y[random[:, 1]], axis=1)
+    assert np.all(after <= before + 1e-12)
+    rows = np.linalg.norm(np.diff(y.reshape(41, 41, 3), axis=1), axis=2)
+    assert np.median(rows) == pytest.approx(0.025, rel=1e-3)
+
+
+def test_a_folded_sheet_lies_on_itself_with_its_crease_on_vertices() -> None:
+    y = start._folded(flat(), 0.025).reshape(41, 41, 3)
+    np.testing.assert_allclose(y[:, 20, 0], 0.5)
+    np.testing.assert_allclose(y[:, :20], y[:, :20:-1], atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(y, axis=1), axis=2), 0.025)
+
+
+def test_a_fold_spares_an_odd_number_of_cells() -> None:
+    y = start._folded(flat(15), 1 / 15).reshape(16, 16, 3)
+    assert np.linalg.norm(np.diff(y, axis=1), axis=2).min() == pytest.approx(1 / 15)
+
+
+def test_noise_has_its_size_and_is_always_the_same() -> None:
+    x = flat()
+    shift = start._noisy(x, 0.025) - x
+    assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
+    np.testing.assert_array_equal(start._noisy(x, 0.025), x + shift)
+
+
+def test_a_mirrored_shell_keeps_its_rim() -> None:
+    x = np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.3]])
+    np.testing.assert_allclose(start._mirrored(x, 1.0)[:, 2], [0.1, -0.1])
+
+
+# -- known answers -------------------------------------------------------------------------------------
+
+
+def test_the_rigid_plates_time() -> None:
+    assert pytest.approx(0.4836, abs=5e-5) == rigid_plate.QUARTER
+
+
+def test_the_first_vertical_is_interpolated() -> None:
+    angle = np.array([0.0, 0.4, 1.2, 1.7, 2.0])
+    places = [(math.cos(a), -math.sin(a)) for a in angle]
+    found = rigid_plate.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], places)
+    assert found == pytest.approx(0.2 + 0.1 * (math.pi / 2 - 1.2) / 0.5)
+    assert math.isnan(rigid_plate.first_vertical([0.0, 0.1, 0.2], places[:3]))
+
+
+def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
+    angle = np.linspace(0.0, 0.9, 6)
+    x = np.column_stack([np.cumsum(np.cos(angle)), np.cumsum(np.sin(angle))])
+    v = np.zeros_like(x)
+    for _ in range(5):
+        aim = x + 0.05 * v + 0.05**2 * np.array([0.0, -chain.G])
+        before, (x, v) = x, chain.inextensible(x, v, 0.05, 1.0)
+    links = np.diff(x, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(links, axis=1), 1.0, rtol=1e-13)
+    np.testing.assert_allclose(x[[0, -1]], before[[0, -1]])
+    np.testing.assert_allclose(v, (x - before) / 0.05)
+    # what pulls each inner joint away from where it would go acts along its two links
+    pull = (x - aim)[1:-1].ravel()
+    lines = np.zeros((pull.size, len(links)))
+    for k, link in enumerate(links):
+        for joint, sign in ((k, -1.0), (k + 1, 1.0)):
+            if 0 < joint < len(x) - 1:
+                lines[2 * joint - 2 : 2 * joint, k] = sign * link
+    _, left, _, _ = np.linalg.lstsq(lines, pull, rcond=None)
+    assert np.abs(pull).max() > 1e-3
+    assert left.sum() < 1e-24
+
+
+def test_the_base_sheet_is_of_the_size_that_is_promised() -> None:
+    grid = Scene.model_validate(setting_of(None, (), Level.USUAL).base).mesh[0].grid
+    assert grid is not None
+    assert (grid.nx + 1) * (grid.ny + 1) == 1681
+    assert grid.pattern == "alternating"
+    assert Setting(sheet(4), False, Level.QUICK).step == 0.005

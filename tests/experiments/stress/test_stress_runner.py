@@ -1,0 +1,144 @@
+"""Cases run on any number of ranks, and end in a record whatever happens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.experiments.stress import runner
+from lyra_petsc.experiments.stress.base import setting_of, sheet
+from lyra_petsc.experiments.stress.case import Case, Level, Setting
+from lyra_petsc.experiments.stress.changes import as_it_is
+from lyra_petsc.experiments.stress.launch import restore, save
+from lyra_petsc.experiments.stress.registry import selected
+from lyra_petsc.experiments.stress.runner import BaseClock, Outcome, run_case
+from lyra_petsc.experiments.stress.view import PICTURES, Stress, release_shapes, row_of
+
+SMALL = Setting(sheet(6), False, Level.QUICK)
+
+
+def run(comm: MPI.Comm, name: str) -> Outcome:
+    [case] = selected([name], Level.QUICK)
+    return run_case(comm, case, SMALL)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["chain-1e6", "stiff-1e6-40ms", "one-triangle", "jump", "folded"])
+def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None:
+    outcome = run(comm, name)
+    assert outcome.failures == {}
+    assert outcome.passed
+    assert outcome.record.balances
+    told = comm.allgather((outcome.verdicts, outcome.record.newton, outcome.seconds))
+    assert all(one == told[0] for one in told)
+
+
+@pytest.mark.parallel
+def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
+    case = Case("a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x)
+    record = run_case(comm, case, SMALL).record
+    assert record.observed[0].min() == pytest.approx(record.observed[0][0, 0])
+    assert np.ptp(record.observed[0], axis=0) == pytest.approx([0.5, 0.5, 0.0])
+    assert (record.last is not None) is (comm.rank == 0)
+
+
+def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
+    outcomes = [run_case(comm, Case("a", "b", as_it_is, steps=1), SMALL) for _ in range(PICTURES + 2)]
+    outcomes[-1].record.stopped = "at once"
+    release_shapes(outcomes)
+    assert outcomes[-1].record.last is not None
+    assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
+
+
+@pytest.mark.parallel
+def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
+    content = sheet(6) | {"petsc": {"snes_max_it": 0}}
+    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    assert not outcome.passed
+    assert "did not converge" in outcome.failures["converged"].words
+    row = row_of(outcome)
+    assert (row["steps"], row["converged"]) == (0, False)
+    # where it stood is kept to be drawn
+    assert (outcome.record.last is not None) is (comm.rank == 0)
+
+
+@pytest.mark.parallel
+def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
+    content = sheet(6) | {"petsc": {"snes_atol": 1e9}}
+    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    assert "move the sheet" in outcome.failures["resolved"].words
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("scale", [1e9, 1e16])
+def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
+    content = sheet(6)
+    content["material"]["stretching_scale"] = scale
+    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    assert outcome.passed
+    assert min(report.newton_iterations for report in outcome.record.reports) > 1
+
+
+@pytest.mark.parallel
+def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
+    content = sheet(6)
+    content["handles"] = [{"group": "nowhere"}]
+    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    assert "nowhere" in outcome.failures["converged"].words
+
+
+@pytest.mark.parallel
+def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(runner.LONGEST, Level.QUICK, 0.0)
+    outcome = run_case(comm, Case("a", "b", as_it_is), SMALL)
+    assert "has had its time" in outcome.failures["converged"].words
+
+
+def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> None:
+    [case] = selected(["slivers"], Level.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(4), True, Level.QUICK))
+    assert outcome.left_out
+    assert outcome.passed
+    assert outcome.record.reports == []
+
+
+@pytest.mark.parallel
+def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
+    clock = BaseClock(comm, SMALL)
+    assert np.all(clock.latest > 0.0)
+    assert clock.size == pytest.approx(np.sqrt(2.0))
+    outcome = run_case(comm, Case("same", "the base itself", as_it_is), SMALL, clock)
+    # about 1 on a machine that does nothing else
+    assert 0.0 < outcome.ratio < 1e3
+    assert 0.0 < outcome.busy_ratio < 1e3
+
+
+def test_an_outcome_goes_through_files(comm: MPI.Comm, tmp_path: Path) -> None:
+    outcome = run(comm, "pressed")
+    assert restore(tmp_path, outcome.case) is None
+    save(outcome, tmp_path)
+    back = restore(tmp_path, outcome.case)
+    assert back is not None
+    assert back.verdicts == outcome.verdicts
+    mine, theirs = row_of(outcome), row_of(back)
+    assert tuple(mine) == tuple(theirs) == Stress.columns
+    np.testing.assert_equal(list(theirs.values()), list(mine.values()))
+    np.testing.assert_array_equal(back.record.last, outcome.record.last)
+    np.testing.assert_array_equal(back.record.triangles, outcome.record.triangles)
+
+
+def test_library_cloth_in_a_given_scene(comm: MPI.Comm, tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "mesh: {grid: {width: 0.5, height: 0.5, nx: 4, ny: 4}}\n"
+        "material: {cloth: gray-interlock}\ngravity: [0, 0, -9.81]\nhandles: [{nodes: [0]}]\n"
+        "time: {end: 1, step: 0.01}\n",
+        encoding="utf-8",
+    )
+    setting = setting_of(path, (), Level.QUICK)
+    for name in ("membrane-1e9", "bending-0", "stiff-warp", "wind-200", "jump", "folded"):
+        [case] = selected([name], Level.QUICK)
+        assert run_case(comm, case, setting).failures == {}, name

@@ -1,0 +1,129 @@
+"""The verdicts on fabricated records: good ones pass, and each kind of bad one fails for its own reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from lyra_petsc.experiments.stress.balance import Balance
+from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.experiments.stress.verdicts import of_physics, speed
+from lyra_petsc.stepping.simulation import StepReport
+
+GOOD = Balance(
+    energy=1.0, change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
+    tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, push=1e-3, momentum=1e-8,
+    momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
+)  # fmt: skip
+STEP = StepReport(1, 0.01, 0.01, 5, 100, 0, 1e-6, 0.1, 0.9, 1.1)
+NOTE = "step 1: triangle 3 …; below 0.577 the St. Venant-Kirchhoff model softens"
+
+
+def record(balance: Balance = GOOD, report: StepReport = STEP, **more: object) -> Record:
+    """Three steps, the middle one as given."""
+    good = Record(3, 0.01, 0.03, 1.0, [STEP, report, STEP], [GOOD, balance, GOOD])
+    return replace(good, **more)  # type: ignore[arg-type]
+
+
+def failures(found: Record) -> dict[str, str]:
+    return {name: verdict.words for name, verdict in of_physics(found).items() if not verdict.passed}
+
+
+def test_a_good_record_passes() -> None:
+    assert set(of_physics(record())) == {
+        "converged",
+        "equations",
+        "resolved",
+        "energy",
+        "no gain",
+        "momentum",
+        "softening",
+    }
+    assert failures(record()) == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"defect": 1.1e-9}, "energy"),
+        ({"defect": -1.1e-9}, "energy"),
+        ({"defect": math.nan}, "energy"),
+        ({"tolerance": math.nan}, "energy"),
+        ({"tolerance": 0.0}, "energy"),
+        ({"residual": 2.1e-6}, "equations"),
+        ({"residual": math.nan}, "equations"),
+        ({"driving": 0.9e-5}, "resolved"),
+        ({"driving": math.nan}, "resolved"),
+        ({"change": 0.1 + 1.1e-9}, "no gain"),
+        ({"viscous": -1e-6}, "no gain"),
+        ({"momentum": 1.1e-7}, "momentum"),
+        ({"spin": 1.1e-7}, "momentum"),
+        ({"spin": math.nan}, "momentum"),
+    ],
+)
+def test_each_broken_balance_fails_its_verdict(change: dict[str, float], name: str) -> None:
+    broken = failures(record(replace(GOOD, **change)))  # type: ignore[arg-type]
+    assert name in broken
+    assert set(broken) <= {name, "no gain", "resolved" if name == "equations" else name}
+    if name != "no gain":
+        assert "step 2" in broken[name]
+
+
+@pytest.mark.parametrize(("left", "good"), [(0.9e-4, True), (1.1e-4, False), (math.nan, False)])
+def test_forces_left_at_roundoff_may_be_large_if_they_move_nothing(left: float, good: bool) -> None:
+    stiff = replace(GOOD, residual=1e-6, driving=1e-6, promised=1e-9, floor=2e-6)
+    found = failures(record(stiff, replace(STEP, left=left)))
+    assert ("resolved" in found) is not good
+
+
+def test_a_gain_is_allowed_where_the_energy_is_not_convex() -> None:
+    buckling = replace(GOOD, bracket=0.7, change=0.4)
+    assert failures(record(buckling)) == {}
+    assert "buckling" in of_physics(record(buckling))["no gain"].words
+
+
+def test_round_off_as_the_promise_is_said() -> None:
+    words = of_physics(record(replace(GOOD, promised=1e-12, residual=1e-12)))["equations"].words
+    assert "floor of round-off" in words
+
+
+def test_a_run_that_stopped_has_not_converged() -> None:
+    assert "step 4 failed" in failures(record(stopped="step 4 failed"))["converged"]
+    assert "converged" in failures(Record(3, 0.01, 0.03))
+
+
+def test_rejected_steps_are_told_and_allowed() -> None:
+    verdict = of_physics(record(report=replace(STEP, rejected=2, dt=0.0025)))["converged"]
+    assert verdict.passed
+    assert "2 attempts rejected" in verdict.words
+    assert "0.0025 s" in verdict.words
+
+
+def test_softening_must_be_told() -> None:
+    pressed = replace(STEP, smallest_stretch=0.57)
+    assert "NOTHING" in failures(record(report=pressed))["softening"]
+    assert failures(record(report=pressed, notes=[NOTE])) == {}
+
+
+@pytest.mark.parametrize(
+    ("newton", "ratio", "busy", "good"),
+    [
+        ([10, 10, 30], 5.0, 9.0, True),
+        ([10, 10, 30], 9.0, 5.0, True),
+        ([10, 10, 31], 1.0, 1.0, False),
+        ([11, 11, 11], 1.0, 1.0, False),
+        ([1, 1, 1], 5.1, 5.1, False),
+        ([1, 1, 1], math.nan, math.nan, False),
+    ],
+)
+def test_speed_is_judged_by_iterations_and_time(
+    newton: list[int], ratio: float, busy: float, good: bool
+) -> None:
+    reports = [replace(STEP, newton_iterations=n) for n in newton]
+    assert speed(record(reports=reports), ratio, busy).passed is good
+
+
+def test_what_stopped_is_not_fast() -> None:
+    assert not speed(record(stopped="at once"), 1.0, 1.0).passed

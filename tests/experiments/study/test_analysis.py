@@ -1,0 +1,172 @@
+"""Orders, Pareto front and advice on made-up rows: all computed from the data, nothing beyond them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from lyra_petsc.experiments.study.advice import advise, choose_recommended
+from lyra_petsc.experiments.study.analysis import Row, mark_front, mark_unresolved, observed_orders
+from lyra_petsc.experiments.study.axes import Axis
+from lyra_petsc.experiments.study.case import Result, Timing
+from lyra_petsc.experiments.study.combination import combinations
+from lyra_petsc.experiments.study.refine import Chain, Estimate, joined, of_chain, richardson
+
+AXES = [
+    Axis("integrator", "time.integrator", ("beuler", "bdf2")),
+    Axis("dt", "time.step", (0.04, 0.02, 0.01)),
+]
+
+
+def made_up(own: float = 0.0) -> list[Row]:
+    """Backward Euler errs by Δt, in 1 s/(100 Δt); BDF2 by 25 Δt², half as fast."""
+    rows = []
+    for combination in combinations(AXES):
+        integrator, dt = combination.values
+        assert isinstance(dt, float)
+        first = integrator == "beuler"
+        seconds = (0.01 if first else 0.02) / dt
+        timings = [Timing(0.5, seconds * factor) for factor in (1.0, 0.95, 1.3)]
+        result = Result("", integrator=str(integrator), steps=round(1.0 / dt), end=1.0, timings=timings)
+        row = Row(combination, result, {"position_max": dt if first else 25.0 * dt * dt})
+        row.own = {"position_max": own}
+        mark_unresolved(row)
+        rows.append(row)
+    return rows
+
+
+def test_orders_between_neighbours_and_fitted() -> None:
+    rows = made_up()
+    orders = observed_orders(rows, AXES, ["position_max"])
+    assert [(o.axis, o.family) for o in orders] == [("dt", "beuler"), ("dt", "bdf2")]
+    assert orders[0].fitted == pytest.approx(1.0)
+    assert orders[1].neighbours == pytest.approx((2.0, 2.0))
+    assert ("dt", "position_max") not in rows[0].orders
+    assert rows[5].orders["dt", "position_max"] == pytest.approx(2.0)
+
+
+def test_orders_are_those_of_the_steps_really_taken() -> None:
+    rows = made_up()
+    for row in rows:  # as if all steps had been cut to half
+        row.result.steps *= 2 if row.combination.settings["dt"] == 0.04 else 1
+    orders = observed_orders(rows[:3], AXES, ["position_max"])
+    assert math.isnan(orders[0].neighbours[0])  # both took the same steps
+    assert orders[0].neighbours[1] == pytest.approx(1.0)
+
+
+def test_median_and_spread() -> None:
+    row = made_up()[0]
+    assert row.run == pytest.approx(0.25)
+    assert row.total == pytest.approx(0.75)
+
+
+def test_the_front() -> None:
+    rows = made_up()
+    mark_front(rows, "position_max")
+    # beuler 0.04 in .25 s, 0.02 in .5, 0.01 in 1.; bdf2 0.04 in .5, 0.01 in 1., 0.0025 in 2.
+    assert [row.on_front for row in rows] == [True, True, True, False, True, True]
+
+
+def test_advice_names_the_fastest_and_the_others() -> None:
+    rows = made_up()
+    advice = advise(rows, "position_max", AXES[1])
+    assert [one.target for one in advice] == [0.1, 0.01, 0.001]
+    assert advice[0].words == (
+        "For 10 % choose beuler, Δt 40 ms: 250 ms (error 4 %, the coarsest that ran); "
+        "bdf2 needs 500 ms (Δt 40 ms)."
+    )
+    assert advice[1].row is not None
+    assert advice[1].row.run == pytest.approx(1.0)
+    assert advice[2].row is None
+    assert "nothing that ran is accurate enough" in advice[2].words
+    assert "bdf2, Δt 10 ms, error 0.25 %, in 2 s" in advice[2].words
+    star = choose_recommended(rows, advice, "position_max")
+    assert star is advice[1].row
+    assert star.recommended
+
+
+def test_advice_goes_as_far_as_the_errors_and_no_further() -> None:
+    rows = made_up()
+    for row in rows:
+        row.errors["position_max"] *= 1e-3
+    targets = [one.target for one in advise(rows, "position_max")]
+    assert targets == pytest.approx([1e-1, 1e-2, 1e-3, 1e-4, 1e-5])
+
+
+def test_what_others_could_not_reach_is_said() -> None:
+    rows = made_up()
+    words = advise(rows, "position_max")[1].words
+    assert "did not reach it" not in words
+    rows[2].errors["position_max"] = 0.012
+    words = advise(rows, "position_max")[1].words
+    assert "choose bdf2, Δt 20 ms" in words
+    assert "beuler did not reach it (Δt 10 ms: error 1.2 %, 1 s)" in words
+
+
+def test_an_error_below_the_references_own_is_no_number() -> None:
+    rows = made_up(own=1.5e-3)
+    assert rows[5].unresolved == {"position_max"}  # 0.0025 < 2 · 0.0015
+    assert math.isnan(rows[5].shown("position_max"))
+    assert rows[4].unresolved == set()
+    assert rows[4].at_most("position_max") == pytest.approx(0.0115)
+    assert rows[5].at_most("position_max") == pytest.approx(0.0045)
+    orders = observed_orders(rows, AXES, ["position_max"])
+    assert len(orders[1].neighbours) == 1
+    mark_front(rows, "position_max")
+    assert rows[5].on_front  # it is more accurate than all others, however much
+    words = advise(rows, "position_max")[1].words
+    assert "choose bdf2, Δt 10 ms: 2 s (error below 0.45 %)" in words
+
+
+def test_the_references_own_error_counts_against_a_target() -> None:
+    rows = made_up(own=2e-4)
+    assert rows[4].errors["position_max"] == pytest.approx(0.01)
+    winner = advise(rows, "position_max")[1].row
+    assert winner is rows[5]  # 0.01 ± 0.0002 is not surely within 1 %
+
+
+def test_the_largest_error_is_told_beside_the_mean() -> None:
+    rows = made_up()
+    for row in rows:
+        row.errors["position_l2"] = row.errors["position_max"] / 4.0
+    words = advise(rows, "position_l2")[1].words
+    assert "For 1 % choose beuler, Δt 40 ms: 250 ms (error 1 %, at most 4 % anywhere)" in words
+
+
+def test_failed_rows_are_left_out() -> None:
+    rows = made_up()
+    for row in rows[:3]:
+        row.result.problem, row.result.timings, row.errors = "no", [], {}
+    mark_front(rows, "position_max")
+    assert not any(row.on_front for row in rows[:3])
+    assert "beuler" not in advise(rows, "position_max")[0].words
+    assert advise(rows[:3], "position_max") == []
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None:
+    value = [1.0 + 0.3 * h**order for h in (0.1, 0.2, 0.4)]
+    found = richardson(abs(value[0] - value[1]), abs(value[1] - value[2]), 2.0, order)
+    assert found.error == pytest.approx(value[0] - 1.0)
+    assert found.order == pytest.approx(order)
+    assert found.trusted
+
+
+def test_richardson_trusts_no_higher_order_than_expected_and_no_divergence() -> None:
+    fast = richardson(1.0, 16.0, 2.0, 2)
+    assert fast.error == pytest.approx(1.0 / 3.0)
+    slow = richardson(1.0, 2.0, 2.0, 2)
+    assert slow.error == pytest.approx(1.0)
+    away = richardson(2.0, 1.0, 2.0, 2)
+    assert not away.trusted
+    assert away.error > 2.0
+    assert richardson(0.0, 0.0, 2.0, 2).error == 0.0
+
+
+def test_errors_in_time_and_space_add_up() -> None:
+    both = joined([{"a": Estimate(1.0, 2.0, True)}, {"a": Estimate(0.5, 2.0, False)}])
+    assert both["a"].error == 1.5
+    assert not both["a"].trusted
+    two = of_chain([{"a": 0.2}], Chain((), 0))
+    assert two["a"].error == 0.2

@@ -1,0 +1,203 @@
+"""Runs compared slab by slab, on one mesh and across meshes, on any number of ranks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import grid, scene_of
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.exact.motion import Energies, Motion
+from lyra_petsc.experiments.study import samples as samples_module
+from lyra_petsc.experiments.study.measure import Party, against_motion, against_run
+from lyra_petsc.experiments.study.quantities import ENERGY, POSITION, probe_quantity
+from lyra_petsc.experiments.study.samples import Surface, read_here, read_samples, read_surface
+from lyra_petsc.experiments.study.transfer import barycentric, make_transfer
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.mesh import Mesh
+
+pytest.importorskip("scipy")
+
+Array = NDArray[np.float64]
+TIMES = (0.0, 0.1, 0.2)
+QUANTITIES = [*POSITION, ENERGY, probe_quantity("tip")]
+SHEET = grid(0.3, 0.4, 3, 4)  # diagonal 0.5 m
+
+
+def mesh_of(*sources: object) -> Mesh:
+    return build_mesh(scene_of({"mesh": list(sources)}).mesh)
+
+
+def write_run(
+    folder: Path, mesh: Mesh, states: list[Array], energies: list[list[float]], tip: list[Array]
+) -> None:
+    """The files of a run as far as a comparison reads them."""
+    folder.mkdir()
+    with h5py.File(folder / "mesh.h5", "w") as file:
+        file["mesh/rest"], file["mesh/triangles"] = mesh.rest, mesh.triangles
+        file["mesh/corner_uv"] = mesh.triangle_uv
+    for number, (time, x) in enumerate(zip(TIMES, states, strict=True)):
+        with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
+            file[f"states/{number:06d}/position"] = x
+            file[f"states/{number:06d}"].attrs["time"] = time
+            file[f"states/{number:06d}"].attrs["step"] = number
+    names = "kinetic_energy,membrane_energy,bending_energy,potential_energy"
+    rows = [f"{n},{TIMES[n]!r},{','.join(map(repr, row))}" for n, row in enumerate(energies)]
+    (folder / "history.csv").write_text("\n".join([f"step,time,{names}", *rows]) + "\n")
+    rows = [f"{n},{TIMES[n]!r},{','.join(map(repr, row.tolist()))}" for n, row in enumerate(tip)]
+    (folder / "probes.csv").write_text("\n".join(["step,time,tip_x,tip_y,tip_z", *rows]) + "\n")
+
+
+ENERGIES = [[0.0, 0.0, 0.0, 5.0], [1.0, 0.5, 0.0, 3.5], [2.0, 0.0, 0.0, 3.0]]
+TIP = [np.zeros(3), np.array([0.0, 0.0, -0.1]), np.array([0.0, 0.0, -0.2])]
+
+
+@pytest.fixture
+def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
+    """Two runs on one mesh: the second is off by 0.05 m in one corner at 0.1 s, and in energy and probe."""
+    one, two = shared_tmp / "one", shared_tmp / "two"
+    if comm.rank == 0:
+        mesh = mesh_of(SHEET)
+        states = [mesh.rest + [0, 0, -t] for t in TIMES]
+        off = [x.copy() for x in states]
+        off[1][0] += [0.03, 0.0, 0.04]
+        energies = [[0.0, 0.0, 0.0, 5.0], [1.2, 0.5, 0.0, 3.5], [2.0, 0.0, 0.0, 3.0]]
+        tip = [TIP[0], TIP[1], TIP[2] + [0.0, 0.005, 0.0]]
+        write_run(one, mesh, states, ENERGIES, TIP)
+        write_run(two, mesh, off, energies, tip)
+    comm.Barrier()
+    return one, two
+
+
+@pytest.mark.parallel
+def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
+    one, two = (Party(read_samples(comm, folder, TIMES, 0.1), [20]) for folder in pair)
+    errors = against_run(comm, two, one, QUANTITIES)
+    assert errors["position_max"] == pytest.approx(0.05 / 0.5)
+    # the corner of a diagonal grid that both triangles of its cell meet in: two thirds of 0.005 m²
+    share = (2.0 * 0.005 / 3.0) / 0.12
+    assert errors["position_l2"] == pytest.approx(math.sqrt(share * 0.05**2 / 2.0) / 0.5)
+    assert errors["energy"] == pytest.approx(0.2 / 2.0)
+    assert errors["probe_tip"] == pytest.approx(0.005 / 0.5)
+    assert against_run(comm, one, one, QUANTITIES) == dict.fromkeys(errors, 0.0)
+
+
+class Falling(Motion):
+    """The motion of the first run."""
+
+    def positions(self, start: Array, t: float) -> Array:
+        return np.asarray(start - [0.0, 0.0, t])
+
+    def energies(self, t: float) -> Energies:
+        kinetic, membrane, _, potential = ENERGIES[round(10 * t)]
+        return Energies(kinetic, membrane, potential)
+
+
+@pytest.mark.parallel
+def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
+    one, two = (Party(read_samples(comm, folder, TIMES, 0.1), [20]) for folder in pair)
+    exact = against_motion(comm, one, Falling(), QUANTITIES)
+    assert max(exact.values()) < 1e-15
+    errors = against_motion(comm, two, Falling(), QUANTITIES)
+    assert errors == pytest.approx(against_run(comm, two, one, QUANTITIES))
+
+
+def linear(rest: Array, t: float) -> Array:
+    """A field that linear interpolation gives exactly."""
+    return np.asarray(rest @ np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, 0.5], [0.0, 0.0, 1.0]]) + [t, 0.0, -t])
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("rows_at_once", [7, 1 << 16])
+def test_errors_across_meshes(
+    shared_tmp: Path, comm: MPI.Comm, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples_module, "ROWS_AT_ONCE", rows_at_once)
+    folders = {"coarse": grid(0.3, 0.4, 3, 2), "fine": grid(0.3, 0.4, 7, 9, "criss-cross")}
+    if comm.rank == 0:
+        for name, source in folders.items():
+            mesh = mesh_of(source)
+            write_run(shared_tmp / name, mesh, [linear(mesh.rest, t) for t in TIMES], ENERGIES, TIP)
+    comm.Barrier()
+    coarse, fine = (
+        Party(read_samples(comm, shared_tmp / name, TIMES, 0.1), [count])
+        for name, count in (("coarse", 12), ("fine", 143))
+    )
+    for errors in (
+        against_run(comm, coarse, fine, QUANTITIES),
+        against_run(comm, fine, coarse, QUANTITIES),
+    ):
+        assert errors["position_max"] < 1e-14
+        assert errors["energy"] == 0.0
+
+
+def surface(mesh: Mesh) -> Surface:
+    return Surface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+
+
+@pytest.mark.parallel
+def test_sheets_that_lie_on_each_other_are_kept_apart(comm: MPI.Comm, shared_tmp: Path) -> None:
+    two = [grid(1.0, 1.0, 2, 2), grid(1.0, 1.0, 2, 2)]
+    finer = [grid(1.0, 1.0, 4, 4), grid(1.0, 1.0, 4, 4)]
+    coarse, fine = mesh_of(*two), mesh_of(*finer)
+    transfer = make_transfer(comm, surface(coarse), [9, 9], surface(fine), [25, 25])
+    first, last = comm.rank * 18 // comm.size, (comm.rank + 1) * 18 // comm.size
+    numbers = transfer.wanted[transfer.corner]
+    for row, point in enumerate(range(first, last)):
+        used = numbers[row][transfer.weight[row] > 1e-12]
+        assert (used < 25).all() == (point < 9)
+
+
+def test_curved_surfaces_are_projected() -> None:
+    def cylinder(n: int) -> Mesh:
+        mesh = mesh_of(grid(1.0, 1.0, n, n))
+        angle = mesh.rest[:, 0].copy()
+        mesh.rest = np.column_stack([np.sin(angle), mesh.rest[:, 1], np.cos(angle)])
+        return mesh
+
+    coarse, fine = cylinder(5), cylinder(23)
+    transfer = make_transfer(MPI.COMM_SELF, surface(coarse), [36], surface(fine), [576])
+    found = np.einsum("nc,nci->ni", transfer.weight, fine.rest[transfer.wanted[transfer.corner]])
+    assert np.linalg.norm(found - coarse.rest, axis=1).max() < (1.0 / 23.0) ** 2 / 8.0
+    assert transfer.weight.min() >= 0.0
+    assert np.allclose(transfer.weight.sum(axis=1), 1.0)
+
+
+def test_weights_of_the_nearest_place() -> None:
+    corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]] * 4)
+    places = np.array([[0.25, 0.25, 0.3], [0.5, -1.0, 0.0], [2.0, 2.0, 0.0], [-1.0, -1.0, 0.5]])
+    expected = [[0.5, 0.25, 0.25], [0.5, 0.5, 0], [0, 0.5, 0.5], [1, 0, 0]]
+    assert np.allclose(barycentric(places, corners), expected)
+
+
+def test_other_meshes_are_told_apart(tmp_path: Path) -> None:
+    one, two = surface(mesh_of(SHEET)), surface(mesh_of(grid(0.3, 0.4, 3, 4, "alternating")))
+    assert one.same_as(one)
+    assert not one.same_as(two)
+    moved = Surface(one.rest + [0, 0, 1e-12], one.triangles, one.areas)
+    assert one.same_as(moved)
+    assert not one.same_as(Surface(one.rest * 1.001, one.triangles, one.areas))
+
+
+def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:
+    with pytest.raises(InputError, match=r"no state at t = 0.05 s, .* output.every = 0.05"):
+        read_here(pair[0], [0.0, 0.05, 0.1], 0.05)
+    with pytest.raises(InputError, match="holds no states"):
+        read_here(pair[0] / "nowhere", TIMES, 0.1)
+    (pair[0] / "mesh.h5").write_bytes(b"no HDF5")
+    with pytest.raises(InputError, match="the mesh cannot be read"):
+        read_surface(pair[0])
+    with pytest.raises(InputError, match="the mesh cannot be read"):
+        read_here(pair[0], TIMES, 0.1)
+
+
+def test_areas_are_thirds_of_rest_areas(pair: tuple[Path, Path]) -> None:
+    areas = read_surface(pair[0]).areas
+    assert areas.sum() == pytest.approx(0.12)
+    assert areas[0] == pytest.approx(2 * 0.005 / 3.0)

@@ -1,0 +1,100 @@
+"""The exact answers that cases work out by themselves, and the meshes they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
+from lyra_petsc.experiments.verification.bar_strip import arc
+from lyra_petsc.experiments.verification.case import data
+from lyra_petsc.experiments.verification.cases.hanging import middle
+from lyra_petsc.experiments.verification.cases.motions import level_fall
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def test_the_level_fall_is_the_tabulated_one() -> None:
+    for t, speed, z in data("wind_drag")["backward_euler_dt_0.01"]:
+        assert level_fall(100.0, t) == pytest.approx((speed, -z), rel=1e-12)
+
+
+def test_the_level_fall_tends_to_the_continuous_one() -> None:
+    for t, speed, z in data("wind_drag")["continuous"]:
+        assert level_fall(1e5, t) == pytest.approx((speed, -z), rel=1e-3)
+
+
+@pytest.mark.parametrize("row", data("catenary")["unequal_heights"]["rows"])
+def test_the_middle_of_a_catenary_halves_its_length(row: list[float]) -> None:
+    dx, dz, a, lowest = row[:4]
+    x, z = middle(a, lowest)
+
+    def curve(at: Array) -> Array:
+        return np.asarray(a * (np.cosh((at - lowest) / a) - math.cosh(lowest / a)))
+
+    def length(low: float, high: float) -> float:
+        at = np.linspace(low, high, 20001)
+        return float(np.hypot(np.diff(at), np.diff(curve(at))).sum())
+
+    assert curve(np.array([dx]))[0] == pytest.approx(dz, abs=1e-9)
+    assert length(0.0, x) == pytest.approx(0.5, abs=1e-7)
+    assert length(x, dx) == pytest.approx(0.5, abs=1e-7)
+    assert z == pytest.approx(float(curve(np.array([x]))[0]), abs=1e-12)
+
+
+@pytest.mark.parametrize("span", [0.3, 0.8, 1.0])
+def test_an_arc_has_its_length_and_its_span(span: float) -> None:
+    points = arc(np.linspace(0.0, 1.0, 20001), span)
+    assert np.hypot(*np.diff(points, axis=0).T).sum() == pytest.approx(1.0, abs=1e-8)
+    np.testing.assert_allclose(points[[0, -1]], [[0.0, 0.0], [span, 0.0]], rtol=0.0, atol=1e-9)
+    assert points[:, 1].max() <= 1e-12  # it sags
+
+
+def areas(vertices: Array, triangles: Ints) -> Array:
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    return np.asarray(0.5 * np.cross(b - a, c - a)[:, 2])
+
+
+MESHES: list[tuple[Callable[..., tuple[Array, Ints]], tuple[Any, ...]]] = [
+    (rectangle, (4, 3, 1.0, 0.7)),
+    (irregular_rectangle, (6, 1.0, 0.7)),
+]
+
+
+@pytest.mark.parametrize(("make", "arguments"), MESHES)
+def test_rectangles_are_covered_once(
+    make: Callable[..., tuple[Array, Ints]], arguments: tuple[Any, ...]
+) -> None:
+    parts = areas(*make(*arguments))
+    assert parts.min() > 0.0
+    assert parts.sum() == pytest.approx(0.7, rel=1e-14)
+
+
+def test_an_irregular_rectangle_is_irregular_and_always_the_same() -> None:
+    vertices, triangles = irregular_rectangle(6, 1.0, 0.7)
+    assert areas(vertices, triangles).std() > 0.1 * areas(vertices, triangles).mean()
+    again = irregular_rectangle(6, 1.0, 0.7)
+    assert np.array_equal(vertices, again[0])
+    assert np.array_equal(triangles, again[1])
+
+
+def test_a_quarter_disc_fills_the_disc_with_order_two() -> None:
+    missing = []
+    for n in (8, 16, 32):
+        vertices, triangles = quarter_disc(n, 2.0)
+        parts = areas(vertices, triangles)
+        assert parts.min() > 0.0
+        missing.append(math.pi - parts.sum())
+        number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+        rim = vertices[np.concatenate([number[-1], number[:, -1]])]
+        np.testing.assert_allclose(np.linalg.norm(rim, axis=1), 2.0, rtol=1e-14)
+        assert np.abs(vertices[number[:, 0], 0]).max() == 0.0
+        assert np.abs(vertices[number[0], 1]).max() == 0.0
+    assert np.log2(missing[0] / missing[1]) == pytest.approx(2.0, abs=0.1)
+    assert np.log2(missing[1] / missing[2]) == pytest.approx(2.0, abs=0.1)

@@ -1,0 +1,106 @@
+"""What the bending cases compare with, and the tools by which they look at a flat sheet's stiffness."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from physics import reference
+
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.verification.cases import hinges
+from lyra_petsc.experiments.verification.cases.hinges import expected
+from lyra_petsc.experiments.verification.coupled_strip import heavy_coupled_strip
+from lyra_petsc.experiments.verification.elastica import cantilever, overhang_weight
+from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness
+from lyra_petsc.experiments.verification.periodic_cell import strip_stiffness
+from lyra_petsc.experiments.verification.runner import run_case
+from lyra_petsc.experiments.verification.strips import strip
+
+PUBLISHED = reference("cantilevers")
+
+
+@pytest.mark.parametrize("row", PUBLISHED["tip_load"]["rows"], ids=lambda row: f"{row[0]:g}")
+def test_the_loaded_elastica_is_the_published_one(row: list[float]) -> None:
+    load, angle, shortening, drop = row
+    tip = cantilever(0.0, tip_load=load)
+    found = (tip.angle, 1.0 - tip.reach, tip.drop)
+    assert found == pytest.approx((angle, shortening, drop), abs=PUBLISHED["tip_load"]["tolerance"])
+
+
+@pytest.mark.parametrize("row", PUBLISHED["own_weight"]["rows"], ids=lambda row: f"{row[0]:g}")
+def test_the_heavy_elastica_is_the_published_one(row: list[float]) -> None:
+    weight, drop, reach, angle, curvature = row
+    tip = cantilever(weight)
+    tolerance = PUBLISHED["own_weight"]["tolerance"]
+    assert (tip.drop, tip.reach, tip.angle) == pytest.approx((drop, reach, angle), abs=tolerance)
+    assert tip.clamp_curvature == pytest.approx(curvature, rel=tolerance)
+
+
+@pytest.mark.parametrize("row", PUBLISHED["stretching"]["rows"], ids=lambda row: f"{row[0]:g} {row[1]:g}")
+def test_the_stretching_elastica_is_the_published_one(row: list[float]) -> None:
+    weight, thickness, drop, reach, angle = row
+    tip = cantilever(weight, stretch=thickness**2 / 12.0)
+    tolerance = PUBLISHED["stretching"]["tolerance"]
+    assert (tip.drop, tip.reach, tip.angle) == pytest.approx((drop, reach, angle), abs=tolerance)
+
+
+def test_overhangs_are_the_published_ones() -> None:
+    for degrees, weight in PUBLISHED["overhang"]["rows"]:
+        assert overhang_weight(degrees) == pytest.approx(weight, rel=PUBLISHED["overhang"]["tolerance"])
+
+
+def test_a_light_coupled_strip_bends_with_four_fifths_and_goes_sideways_by_the_square() -> None:
+    weight = 1e-3
+    _, sideways, drop = heavy_coupled_strip(0.8 * weight)
+    assert drop == pytest.approx(weight / 8.0, rel=1e-5)
+    # κ = −Γ (1 − s)²/2 twists by τ = −κ/5; y'' = −κ ∫τ
+    assert sideways == pytest.approx(weight**2 / 60.0 * (1.0 / 4.0 - 1.0 / 7.0), rel=1e-4)
+
+
+def test_far_bent_the_coupled_strip_is_stiffer_than_four_fifths() -> None:
+    _, sideways, drop = heavy_coupled_strip(8.0)
+    assert sideways > 0.05
+    assert drop < cantilever(10.0).drop - 0.005
+
+
+@pytest.mark.parallel
+def test_the_assembled_stiffness_solves_as_it_multiplies(comm: MPI.Comm) -> None:
+    with Bench(comm).simulation(hinges.square_plate("CFFF", "criss-cross", 6)) as trial:
+        operator, mass = stiffness(trial), trial.mass
+    height = operator.solve(mass)
+    assert height[operator.held] == pytest.approx(0.0, abs=0.0)
+    assert operator.dense() @ height[~operator.held] == pytest.approx(mass[~operator.held], rel=1e-9)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("pattern", hinges.PATTERNS)
+def test_bending_divided_by_what_the_mesh_makes_of_it_gives_b(comm: MPI.Comm, pattern: str) -> None:
+    scene: dict[str, Any] = strip(
+        pattern, 8, material={"bending": 1.0, "bending_scale": 1.0 / expected(pattern)}
+    )
+    with Bench(comm).simulation(scene) as trial:
+        hinges, points = hinge_blocks(trial), trial.x[:, :2]
+    found = strip_stiffness(hinges, points, start=0.25, period=0.25, width=0.125)
+    assert found == pytest.approx(1.0, rel=1e-10)
+
+
+@pytest.mark.parallel
+def test_another_stiffness_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hinges, "expected", lambda pattern, ratio=1.0: 1.0)
+    outcome = run_case(comm, hinges.hinge_strip, quick=True, warm=False)
+    verdicts = {quantity: verdict.passed for quantity, verdict in outcome.verdicts.items()}
+    assert not verdicts["B_effective / B, diagonal, square cells"]
+    assert verdicts["B_effective / B, criss-cross, square cells"]
+    assert not outcome.passed
+
+
+def test_cells_of_other_shapes() -> None:
+    assert expected("diagonal") == pytest.approx(0.8)
+    assert expected("alternating") == pytest.approx(0.8)
+    assert expected("criss-cross") == pytest.approx(1.0)
+    assert expected("diagonal", 1e-3) == pytest.approx(1.0)
+    assert expected("criss-cross", 1e-3) == pytest.approx(2.0)
+    assert math.isclose(expected("criss-cross", 1e3), 0.4, rel_tol=1e-5)

@@ -1,0 +1,45 @@
+"""Every case of ``verify`` holds, on one rank and on several."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.experiments.verification.registry import CASES
+from lyra_petsc.experiments.verification.runner import run_case
+
+SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
+"""Cases that are run whatever is selected: each takes no more than a second or two."""
+
+
+@pytest.mark.parametrize("name", CASES.modules)
+def test_describes_itself(name: str) -> None:
+    case = CASES.load(name)
+    assert case.name == name
+    assert case.title
+    assert case.source
+    assert list(case.resolutions) == sorted(set(case.resolutions))
+    assert 1 <= case.quick <= len(case.resolutions)
+    sizes = [case.size(n) for n in case.resolutions]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+@pytest.mark.parametrize("name", CASES.modules)
+def test_is_in_the_docs(name: str) -> None:
+    assert any(f"`{name}`" in page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize(
+    "name", [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in CASES.modules]
+)
+def test_passes(comm: MPI.Comm, name: str) -> None:
+    # every resolution on one rank; on several those that show that they give the same
+    outcome = run_case(comm, CASES.load(name), quick=comm.size > 1, warm=False)
+    words = "; ".join(f"{quantity}: {verdict.words}" for quantity, verdict in outcome.verdicts.items())
+    assert outcome.passed, words

@@ -1,0 +1,60 @@
+"""Frequencies by subspace iteration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from oracle import blocks_of, summed
+
+from lyra_petsc.errors import SolverError
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.verification.spectrum import lowest_modes
+from lyra_petsc.terms.term import Elastic
+
+pytestmark = pytest.mark.parallel
+
+SHEET: dict[str, Any] = {
+    "mesh": {"grid": {"width": 1.0, "height": 0.6, "nx": 4, "ny": 3}},
+    "material": {"density": 0.2, "membrane": {"c11": 120, "c22": 80, "c12": 30, "c33": 25}, "bending": 0.1},
+    "handles": [{"group": "left", "clamp": True}, {"nodes": [19], "axes": ["z"]}],
+    "time": {"end": 1.0, "step": 1.0},
+}
+
+
+def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Every ω² of a simulation on one rank, from element Hessians summed here."""
+    model = trial.simulation.model
+    n = model.points.n_owned
+    stiffness = np.zeros((n, 3, n, 3))
+    for term in model.terms.values():
+        if isinstance(term, Elastic):
+            blocks = blocks_of(term, model.system.x, model.system.frozen[term])
+            stiffness += summed(term.stencil, blocks, n)
+    free = ~model.system.held.mask(0.0, 0.0, n).ravel()
+    root = np.sqrt(np.repeat(model.system.mass, 3))[free]
+    matrix = stiffness.reshape(3 * n, 3 * n)[np.ix_(free, free)] / np.outer(root, root)
+    return np.linalg.eigvalsh(matrix)
+
+
+@pytest.mark.parametrize("count", [1, 5, 30])
+def test_as_from_a_dense_solver(comm: MPI.Comm, count: int) -> None:
+    with Bench(MPI.COMM_SELF) as bench, bench.simulation(SHEET) as trial:
+        exact = np.sqrt(dense(trial)[:count])
+    with Bench(comm) as bench, bench.simulation(SHEET) as trial:
+        found, shapes = lowest_modes(trial, count)
+        mass = trial.mass
+    np.testing.assert_allclose(found, exact, rtol=1e-9)
+    inertia = np.einsum("avi,v,bvi->ab", shapes, mass, shapes)
+    np.testing.assert_allclose(inertia, np.eye(count), rtol=0.0, atol=1e-9)
+    assert np.abs(shapes[:, [0, 5, 10, 15]]).max() == 0.0  # the held edge
+
+
+def test_an_unstable_state_is_refused(comm: MPI.Comm) -> None:
+    content = SHEET | {"material": {k: v for k, v in SHEET["material"].items() if k != "bending"}}
+    with Bench(comm) as bench, bench.simulation(content) as trial:
+        trial.set_state(x=trial.start * [0.95, 1.0, 1.0])
+        with pytest.raises(SolverError):
+            lowest_modes(trial, 3)

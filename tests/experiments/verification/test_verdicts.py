@@ -1,0 +1,172 @@
+"""Verdicts: what is right passes, what is wrong fails, what cannot run says so."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.errors import InputError, Interrupted, SolverError
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.verification.case import Case, Measured
+from lyra_petsc.experiments.verification.claims import (
+    Claim,
+    Converges,
+    Exact,
+    Row,
+    at_finest,
+    observed_order,
+)
+from lyra_petsc.experiments.verification.registry import CASES
+from lyra_petsc.experiments.verification.runner import run_case
+
+
+def row(n: float, error: float) -> Row:
+    return Row("q", "m", n, 1.0 / n, value=1.0 + error, exact=1.0, error=error)
+
+
+def table(*errors: float, first: float = 4.0) -> list[Row]:
+    rows: list[Row] = []
+    for k, error in enumerate(errors):
+        new = row(first * 2.0**k, error)
+        rows.append(dataclasses.replace(new, order=observed_order(rows[-1], new)) if rows else new)
+    return rows
+
+
+def finest(rows: list[Row]) -> float:
+    return rows[-1].h
+
+
+def test_orders_are_those_of_the_errors() -> None:
+    rows = table(1e-2, 2.5e-3, 1.25e-3)
+    assert math.isnan(rows[0].order)
+    assert [r.order for r in rows[1:]] == pytest.approx([2.0, 1.0])
+    assert math.isnan(observed_order(rows[0], row(8, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("claim", "errors", "good"),
+    [
+        (Exact(1e-10), (1e-11, 1e-12), True),
+        (Exact(1e-10), (2e-10, 1e-12), False),
+        (Exact(1e-10), (1e-12, math.nan), False),
+        (at_finest(1e-3), (1.0, 9e-4), True),
+        (at_finest(1e-3), (1e-4, 2e-3), False),
+        (at_finest(1e-3), (1e-4, math.nan), False),
+        (Converges(2.0, 1e-3), (3.6e-3, 9e-4), True),
+        (Converges(2.0, 1e-3), (4.8e-3, 1.2e-3), False),  # right order, too large
+        (Converges(2.0, 1e-3), (1.8e-3, 9e-4), False),  # small, but first order
+        (Converges(2.0, 1e-3), (9e-4, 9e-4), False),
+        (Converges(2.0, 1e-3), (3.6e-3, 3e-5), False),  # an order too good to be true
+        (Converges(2.0, 1e-3), (3.6e-3, math.nan), False),
+        (Converges(2.0, 1e-3), (3.6e-3, 0.0), False),
+        (Converges(1.0, 1e-3, slack=0.1), (1.6e-3, 8.1e-4), True),
+    ],
+)
+def test_claims(claim: Claim, errors: tuple[float, ...], good: bool) -> None:
+    rows = table(*errors)
+    verdict = claim.judge(rows, finest(rows))
+    assert verdict.passed is good, verdict.words
+    assert verdict.words
+
+
+def test_the_bound_of_a_quick_run_grows_with_its_h() -> None:
+    rows = table(6e-2, 1.5e-2)
+    assert Converges(2.0, 1e-3).judge(rows, finest(rows) / 4.0).passed  # 16e-3
+    assert not Converges(2.0, 1e-3).judge(rows, finest(rows) / 2.0).passed  # 4e-3
+
+
+def test_errors_are_relative_to_their_scale() -> None:
+    assert Measured("q", 1.1, 1.0).error == pytest.approx(0.1)
+    assert Measured("q", 1e-6, 0.0, "N", 10.0).error == pytest.approx(1e-7)
+
+
+def made(**changes: object) -> Case:
+    def measure(bench: Bench, n: float) -> Iterable[Measured]:
+        return [Measured("a", 1.0 + n**-2, 1.0, "m"), Measured("b", 2.0, 2.0)]
+
+    case = Case(
+        "made-up", "title", measure, "source", (4, 8, 16), Converges(2.0, 1e-2), claims={"b": Exact(1e-12)}
+    )
+    return dataclasses.replace(case, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parallel
+def test_rows_and_verdicts_of_a_case(comm: MPI.Comm) -> None:
+    outcome = run_case(comm, made())
+    assert outcome.passed
+    assert list(outcome.tables()) == ["a", "b"]
+    assert [r.n for r in outcome.tables()["a"]] == [4, 8, 16]
+    assert [r.order for r in outcome.tables()["a"]][1:] == pytest.approx([2.0, 2.0])
+    assert all(math.isnan(r.order) for r in outcome.tables()["b"])
+    assert [r.n for r in run_case(comm, made(), quick=True).tables()["a"]] == [4, 8]
+
+
+@pytest.mark.parallel
+def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
+    def measure(bench: Bench, n: float) -> Iterable[Measured]:
+        if n == 8:
+            raise SolverError("the step\ndid not converge", collective=True)
+        yield Measured("a", 1.0 + n**-2, 1.0)
+        if n == 16:
+            raise InputError("is not there", key="some.key")
+
+    outcome = run_case(comm, made(measure=measure))
+    assert not outcome.passed
+    assert outcome.verdicts["a"].passed  # order 2 between 4 and 16
+    assert [r.n for r in outcome.tables()["a"]] == [4, 16]
+    problems = [r for r in outcome.rows if r.problem]
+    assert [(r.n, r.problem) for r in problems] == [
+        (8, "the step did not converge"),
+        (16, "some.key: is not there"),
+    ]
+    assert "n = 8" in outcome.verdicts["could not run"].words
+
+
+@pytest.mark.parallel
+def test_nothing_measured_is_no_success(comm: MPI.Comm) -> None:
+    assert not run_case(comm, made(measure=lambda bench, n: [])).passed
+
+
+@pytest.mark.parallel
+def test_a_request_to_stop_ends_the_case(comm: MPI.Comm) -> None:
+    def stop() -> None:
+        raise Interrupted("stopped by SIGINT", 2)
+
+    with pytest.raises(Interrupted):
+        run_case(comm, CASES.load("free-fall"), watch=stop)
+
+
+def wrong_by(case: Case, fraction: float) -> Case:
+    """The case with every exact answer off by a fraction of its scale."""
+
+    def measure(bench: Bench, n: float) -> Iterable[Measured]:
+        for one in case.measure(bench, n):
+            scale = abs(one.exact) if one.scale is None else one.scale
+            yield dataclasses.replace(one, exact=one.exact + fraction * scale, scale=scale)
+
+    return dataclasses.replace(case, measure=measure)
+
+
+QUICK_AND_EXACT = ("patch-states", "free-fall", "oscillator", "rigid-rotation", "hanging-strip-chain")
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", QUICK_AND_EXACT)
+def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -> None:
+    case = CASES.load(name)
+    outcome = run_case(comm, wrong_by(case, 1e-9), quick=True, warm=False)
+    exact = [q for q in outcome.tables() if case.claim_of(q) == Exact(1e-10)]
+    assert exact
+    for quantity in exact:
+        assert not outcome.verdicts[quantity].passed, quantity
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["stretched-membrane", "hanging-chain", "hanging-strip"])
+def test_a_limit_wrong_by_a_few_percent_fails(comm: MPI.Comm, name: str) -> None:
+    outcome = run_case(comm, wrong_by(CASES.load(name), 0.05), quick=True, warm=False)
+    assert not any(verdict.passed for verdict in outcome.verdicts.values())

@@ -1,0 +1,153 @@
+"""What was compiled is found again, and nothing that is stale, half written or of another type is taken."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba import config
+from numba.core.caching import CacheImpl
+
+from lyra_petsc.kernels import cache as kernel_cache
+from lyra_petsc.kernels.cache import KernelCache, cached, digest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def twice(x):  # type: ignore[no-untyped-def]
+    return 2 * x
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def compiled(x: Any) -> tuple[Any, int]:
+    """Result of a new dispatcher, as of a new process, and how many types it found in the cache."""
+    dispatcher = cached()(twice)
+    result = dispatcher(x)
+    return result, sum(dispatcher.stats.cache_hits.values())
+
+
+def files(place: Path, ending: str) -> list[Path]:
+    return sorted(place.rglob(f"*.{ending}"))
+
+
+def test_what_was_compiled_is_found_again(place: Path) -> None:
+    assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 1)
+    assert len(files(place, "nbi")) == len(files(place, "nbc")) == 1
+
+
+def test_a_change_of_any_module_of_the_package_counts(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled(2.5)
+    monkeypatch.setattr(kernel_cache, "digest", lambda room: "changed")
+    assert compiled(2.5) == (5.0, 0)
+    assert len(files(place, "nbc")) == 2
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0, 5, 40])
+def test_half_a_file_is_compiled_again_and_mended(place: Path, ending: str, left: int) -> None:
+    compiled(2.5)
+    (file,) = files(place, ending)
+    file.write_bytes(file.read_bytes()[:left])
+    assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 1)
+
+
+def test_an_entry_that_was_announced_but_not_written_is_compiled(place: Path) -> None:
+    compiled(2.5)
+    files(place, "nbc")[0].unlink()
+    assert compiled(2.5) == (5.0, 0)
+
+
+def test_two_ranks_that_chose_one_name_for_two_types(place: Path) -> None:
+    """Both saw an empty index: the file holds what the one compiled, the index what the other announced."""
+    compiled(2)
+    (integer,) = files(place, "nbc")
+    of_integers = integer.read_bytes()
+    for file in files(place, "nb?"):
+        file.unlink()
+    compiled(2.5)
+    assert files(place, "nbc") == [integer]
+    integer.write_bytes(of_integers)
+    assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 1)
+
+
+def test_a_disk_that_takes_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 0)
+    assert compiled(2.5) == (5.0, 1)
+
+
+def test_no_place_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
+    with pytest.raises(RuntimeError):
+        KernelCache(twice)
+    assert compiled(2.5) == (5.0, 0)
+
+
+@pytest.mark.slow
+def test_processes_that_begin_at_once_with_an_empty_cache(place: Path) -> None:
+    code = (
+        "import numpy as np; from lyra_petsc.terms import wind; out = np.ones((1, 3)); x = np.eye(3)\n"
+        "wind.normals(x, np.array([[0, 1, 2]], dtype=np.int{}), out); assert np.allclose(out, 3 ** -0.5), out"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(place), "PYTHONPATH": str(REPOSITORY)}
+    for _ in range(2):
+        begun = [
+            subprocess.Popen([sys.executable, "-c", code.format(bits)], env=environment)
+            for bits in (32, 64, 32, 64)
+        ]
+        assert [process.wait(timeout=120) for process in begun] == [0, 0, 0, 0]
+    assert not files(place, "tmp.*")
+
+
+def test_terms_that_the_scene_does_not_name_are_not_loaded() -> None:
+    code = """
+import sys
+from mpi4py import MPI
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.simulation import Simulation
+grid = {"width": 1.0, "height": 1.0, "nx": 2, "ny": 2}
+stuff = {"density": 0.1, "membrane": {"c11": 10, "c22": 10, "c12": 0, "c33": 5}, "bending": 0}
+scene = {"mesh": {"grid": grid}, "material": stuff, "time": {"end": 0.01, "step": 0.01}}
+Simulation(MPI.COMM_SELF, Scene.model_validate(scene)).step()
+print(sorted(name.split(".")[-1] for name in sys.modules if name.startswith("lyra_petsc.terms.")))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    loaded = set(done.stdout.split("[")[1].replace("'", "").strip("]\n").split(", "))
+    assert "membrane" in loaded
+    assert not loaded & {"bending", "hinge", "clamp", "spring", "gravity", "wind", "pressure", "force"}
+
+
+def test_the_digest_is_that_of_all_modules(tmp_path: Path) -> None:
+    from lyra_petsc.terms import hinge_forces
+
+    assert digest(REPOSITORY / "lyra_petsc" / "terms") in hinge_forces.energies._cache._cache_file._index_name
+    (tmp_path / "one.py").write_text("1")
+    (tmp_path / "two.py").write_text("2")
+    before = digest(tmp_path)
+    digest.cache_clear()
+    (tmp_path / "two.py").write_text("3")
+    assert digest(tmp_path) != before

@@ -1,0 +1,103 @@
+"""A factorisation that failed once does not fail for ever."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from physics import gathered, grid, scene_of
+
+from lyra_petsc.linear.failed_factors import MARGIN, forget
+from lyra_petsc.stepping.simulation import Simulation
+
+FAILED = PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
+WORKSPACE = "mat_mumps_icntl_14"
+
+
+@pytest.mark.parametrize("kind", ["ilu", "bjacobi", "cholesky"])
+def test_a_better_matrix_has_factors_again(kind: str) -> None:
+    mat = PETSc.Mat().createBAIJ(((12, 12), (12, 12)), 3, nnz=4, comm=PETSc.COMM_SELF)
+
+    def fill(diagonal: float) -> None:
+        values = np.ones((12, 12))
+        np.fill_diagonal(values, diagonal)
+        for i, row in enumerate(values):
+            mat.setValues(i, np.arange(12, dtype=PETSc.IntType), row)
+        mat.assemble()
+
+    fill(1.0)
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setType("cg")
+    ksp.getPC().setType(kind)
+    b, x = mat.createVecs()
+    b.set(1.0)
+    ksp.setOperators(mat)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() == FAILED
+    assert not forget(ksp)
+    assert ksp.getConvergedReason() == FAILED
+    fill(3.0)
+    ksp.setOperators(mat)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() > 0
+    np.testing.assert_allclose(x.getArray(), 1.0 / 14.0, rtol=1e-4)
+    # nothing failed
+    pc = ksp.getPC()
+    assert not forget(ksp)
+    assert ksp.getPC() == pc
+
+
+def test_petscs_multigrid_keeps_its_levels() -> None:
+    mat = PETSc.Mat().createAIJ((4, 4), nnz=1, comm=PETSc.COMM_SELF)
+    for i in range(4):
+        mat.setValue(i, i, 1.0 if i else 0.0)
+    mat.assemble()
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setType("cg")
+    pc = ksp.getPC()
+    pc.setType("mg")
+    pc.setMGLevels(1)
+    pc.getMGCoarseSolve().setType("preonly")
+    pc.getMGCoarseSolve().getPC().setType("cholesky")
+    ksp.setOperators(mat)
+    b, x = mat.createVecs()
+    b.set(1.0)
+    ksp.solve(b, x)
+    assert ksp.getConvergedReason() == FAILED
+    assert not forget(ksp)
+    assert ksp.getPC() == pc
+    assert pc.getMGLevels() == 1
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
+def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
+    if not PETSc.Sys.hasExternalPackage("mumps"):
+        pytest.skip("this PETSc has no MUMPS")
+    scene = {
+        "mesh": grid(1.0, 1.0, 20, 20),
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"nodes": [0, 20]}],
+        "time": {"end": 0.02, "step": 0.01, "integrator": integrator},
+    }
+    asked = {"mat_type": "aij", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
+    database = PETSc.Options()
+    ends = []
+    for margin in (200, -50):
+        for name, value in {**asked, WORKSPACE: margin}.items():
+            database.setValue(name, value)
+        try:
+            simulation = Simulation(comm, scene_of(scene))
+            simulation.step()
+            simulation.step()
+            assert simulation.notes == []
+            used = database.getInt(WORKSPACE)
+            assert used == margin if margin > 0 else used >= MARGIN
+            ends.append(gathered(simulation.model.points, simulation.model.system.x))
+            simulation.destroy()
+        finally:
+            for name in [*asked, WORKSPACE, *simulation.stepper.our_options]:
+                database.delValue(name)
+    np.testing.assert_allclose(*ends, atol=1e-9)

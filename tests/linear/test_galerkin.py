@@ -1,0 +1,108 @@
+"""Coarse block rows are interpolationᵀ · matrix · interpolation, as PETSc works it out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from physics import CLOTH, Simulation, grid
+
+from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Level, interpolations
+from lyra_petsc.linear.matrix import AssembledMatrix
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.mesh.points import Points
+
+
+def symmetric(points: Points, pattern: BlockPattern) -> np.ndarray:
+    """Block rows (n_blocks, 3, 3) of a matrix whose entries are a symmetric function of row and column."""
+    row = np.repeat(points.global_number[: points.n_owned], np.diff(pattern.indptr))
+    i = 3 * row[:, None, None] + np.arange(3)[:, None]
+    j = 3 * points.global_number[pattern.columns][:, None, None] + np.arange(3)
+    return ((7 * i * j + 3 * (i + j)) % 101) / 50.0 - 1.0
+
+
+class Interpolation:
+    """The PETSc matrix (3 n fine, 3 n coarse) that interpolates to a level from the next coarser one."""
+
+    def __init__(self, rows: InterpolationRows, level: Level, coarser: Level) -> None:
+        fine, points = level.points, coarser.points
+        row = np.repeat(fine.start + np.arange(fine.n_owned), np.diff(rows.start))
+        self._entries, self._first = (row, rows.parents, rows.weights), fine.start
+        sizes = (3 * fine.n_owned, 3 * fine.n_global), (3 * points.n_owned, 3 * points.n_global)
+        most = int(np.diff(rows.start).max(initial=0))
+        self.mat = PETSc.Mat().createAIJ(sizes, nnz=(most, most), comm=fine.comm)
+
+    def set(self, free: np.ndarray) -> None:
+        """Interpolate to coordinates only that are free (n_owned, 3); collective."""
+        for row, parent, weight in zip(*self._entries, strict=True):
+            for axis in range(3):
+                value = weight * free[row - self._first, axis]
+                self.mat.setValue(3 * row + axis, 3 * parent + axis, value)
+        self.mat.assemble()
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("held", [False, True], ids=["free", "some held"])
+def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 60, 48), "material": CLOTH}, comm) as simulation:
+        model = simulation.model
+        points, pattern = model.points, model.pattern
+        mask = np.zeros((points.n_local, 3), dtype=bool)
+        if held:
+            mask[:, 0] = points.global_number % 7 == 0
+            mask[points.global_number % 11 == 0] = True
+        rng = np.random.default_rng(comm.rank)
+        values = symmetric(points, pattern)
+        model.discretisation.rows.constrain(values, mask, np.arange(points.n_owned))
+        between = interpolations(points, model.surface, 3)
+        hierarchy = Hierarchy(points, pattern, between)
+        assert len(hierarchy.levels) == 3
+        list(hierarchy.block_rows(np.ones_like(values), ~mask))  # what is left from before must not show
+        rows = list(zip(hierarchy.levels, hierarchy.block_rows(values, mask), strict=True))
+        for one, another, share in zip(rows, rows[1:], between, strict=False):
+            (level, (of_fine, free)), (coarser, (of_coarse, coarse_free)) = one, another
+            fine, coarse = (
+                AssembledMatrix(at.points, at.pattern, "aij") for at in (level, coarser)
+            )
+            fine.set(of_fine)
+            coarse.set(of_coarse)
+            interpolation = Interpolation(share, level, coarser)
+            interpolation.set(free)
+            product = fine.mat.ptap(interpolation.mat)
+            x, _ = product.createVecs()
+            x.setArray(rng.standard_normal(x.getLocalSize()))
+            expected, found, diagonal_part = x.duplicate(), x.duplicate(), x.duplicate()
+            product.mult(x, expected)
+            # coordinates that nothing is interpolated from have a one on the diagonal
+            product.getDiagonal(diagonal_part)
+            dead = diagonal_part.getArray() == 0.0
+            assert np.array_equal(dead.reshape(-1, 3), coarse_free == 0.0)
+            expected.getArray()[dead] = x.getArray()[dead]
+            coarse.mat.mult(x, found)
+            np.testing.assert_allclose(found.getArray(), expected.getArray(), rtol=0.0, atol=1e-11)
+            for item in (fine, coarse, interpolation.mat, product):
+                item.destroy()
+        hierarchy.destroy()
+
+
+@pytest.mark.parallel
+def test_nothing_is_interpolated_to_held_coordinates(comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
+        points = simulation.model.points
+        between = interpolations(points, simulation.model.surface, 2)
+        hierarchy = Hierarchy(points, simulation.model.pattern, between)
+        mask = np.zeros((points.n_local, 3), dtype=bool)
+        mask[points.global_number % 3 == 0, 1] = True
+        interpolation = Interpolation(between[0], *hierarchy.levels)
+        for held in (~mask, mask):
+            rows = np.zeros((simulation.model.pattern.n_blocks, 3, 3))
+            _, free = next(hierarchy.block_rows(rows, held))
+            interpolation.set(free)
+            ones, out = interpolation.mat.createVecs()
+            ones.set(1.0)
+            interpolation.mat.mult(ones, out)
+            expected = np.where(held[: points.n_owned], 0.0, 1.0)
+            np.testing.assert_allclose(out.getArray().reshape(-1, 3), expected, atol=1e-12)
+        interpolation.mat.destroy()
+        hierarchy.destroy()

@@ -1,0 +1,205 @@
+"""Multigrid on our coarse meshes: iterations against mesh, ranks, stiffness."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from physics import gathered
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
+from lyra_petsc.linear.presets import PYTHON_TYPE
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.simulation import Simulation
+
+ROOT = Path(__file__).resolve().parents[2]
+
+pytestmark = pytest.mark.parallel
+
+
+@pytest.fixture(params=["python", "mg"])
+def kind(request: pytest.FixtureRequest) -> str:
+    """Value of ``-pc_type``: our cycle goes by both."""
+    return str(request.param)
+
+
+def hanging(cells: int, **time: Any) -> dict[str, Any]:
+    """A square of gray interlock, held at two corners and falling."""
+    corners = [cells * (cells + 1), (cells + 1) ** 2 - 1]
+    return {
+        "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": cells, "ny": cells}},
+        "material": {"cloth": "gray-interlock", "damping": 0.03},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"nodes": corners}],
+        "time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"} | time,
+    }
+
+
+def stepped(
+    comm: MPI.Comm, content: dict[str, Any], steps: int, pc_type: str, **petsc: Any
+) -> tuple[np.ndarray, list[int]]:
+    """Positions in mesh order and linear iterations of each step."""
+    options = PETSc.Options()
+    given, filled = {"pc_type": pc_type, **petsc}, []
+    for name, value in given.items():
+        options[name] = value
+    try:
+        simulation = Simulation(comm, Scene.model_validate(content))
+        filled = simulation.stepper.our_options
+        counts = [simulation.step().linear_iterations for _ in range(steps)]
+        x = gathered(simulation.model.points, simulation.model.system.x)
+        simulation.destroy()
+    finally:
+        for name in [*given, *filled]:
+            options.delValue(name)
+    return x, counts
+
+
+def test_iterations_hardly_grow_with_the_mesh(kind: str, comm: MPI.Comm) -> None:
+    coarse, fine = (max(stepped(comm, hanging(cells), 3, kind)[1]) for cells in (25, 75))
+    assert 3 <= coarse <= 9
+    assert fine <= 1.5 * coarse + 1
+
+
+def test_stiff_cloth_and_long_steps(kind: str, comm: MPI.Comm) -> None:
+    content = hanging(50, step=0.04)
+    content["material"]["stretching_scale"] = 1000.0
+    assert max(stepped(comm, content, 3, kind)[1]) <= 30
+
+
+def test_the_answer_is_that_of_a_factorisation(kind: str, comm: MPI.Comm) -> None:
+    tight = {"ksp_rtol": 1e-11}
+    x, _ = stepped(comm, hanging(25), 5, kind, **tight)
+    direct, _ = stepped(comm, hanging(25), 5, "cholesky", **tight)
+    assert np.abs(x - direct).max() < 1e-10
+
+
+def test_newton_with_an_exact_hessian(kind: str, comm: MPI.Comm) -> None:
+    x, counts = stepped(comm, hanging(25, integrator="beuler"), 4, kind)
+    other, _ = stepped(comm, hanging(25, integrator="beuler"), 4, "pbjacobi")
+    assert max(counts) < 40
+    assert np.abs(x - other).max() < 1e-6
+
+
+def test_handles_that_let_go(kind: str, comm: MPI.Comm) -> None:
+    content = hanging(25)
+    content["handles"][0]["until"] = 0.015
+    x, counts = stepped(comm, content, 8, kind)
+    direct, _ = stepped(comm, content, 8, "cholesky")
+    assert max(counts) <= 10
+    assert np.abs(x - direct).max() < 1e-6
+
+
+def test_a_mesh_of_a_few_triangles(kind: str, comm: MPI.Comm) -> None:
+    x, counts = stepped(comm, hanging(2), 4, kind)
+    direct, _ = stepped(comm, hanging(2), 4, "cholesky")
+    assert max(counts) <= 10
+    assert np.abs(x - direct).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"pc_mg_levels": 1},
+        {"pc_mg_levels": 2},
+        {"pc_mg_levels": 50},
+        {"pc_mg_w_from": 1},
+        {"pc_mg_w_from": 9},
+        {"mat_type": "aij"},
+        {"mg_coarse_pc_type": "svd"},
+    ],
+    ids=lambda options: " ".join(options),
+)
+def test_options_reach_it(options: dict[str, Any], kind: str, comm: MPI.Comm) -> None:
+    if comm.size > 1 and "mg_coarse_pc_type" in options:
+        options = {"mg_coarse_redundant_pc_type": "svd"}
+    _, counts = stepped(comm, hanging(25), 2, kind, **options)
+    assert 0 < max(counts) < 20
+
+
+def test_levels_visited_twice(comm: MPI.Comm) -> None:
+    content = hanging(75)
+    content["material"] |= {"stretching_scale": 1000.0, "bending_scale": 1000.0}
+    once, counts = stepped(comm, content, 3, "python")
+    twice, fewer = stepped(comm, content, 3, "python", pc_mg_w_from=1)
+    assert max(fewer) < max(counts)
+    assert np.abs(once - twice).max() < 1e-6
+
+
+def test_our_cycle_stands_in_the_solvers_view(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
+    stepped(comm, hanging(25), 1, "python", ksp_view="")
+    if comm.rank == 0:
+        assert "V cycle on" in capfd.readouterr().out
+
+
+def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
+    own = {"pc_python_type": f"{__name__}.Scaling"}
+    x, counts = stepped(comm, hanging(8), 2, "python", **own)
+    direct, _ = stepped(comm, hanging(8), 2, "cholesky")
+    assert max(counts) > 20
+    assert np.abs(x - direct).max() < 1e-6
+
+
+def test_as_a_part_of_another_preconditioner_it_is_refused(comm: MPI.Comm) -> None:
+    with pytest.raises(InputError, match="main preconditioner only") as caught:
+        stepped(comm, hanging(8), 1, "bjacobi", sub_pc_type="python", sub_pc_python_type=PYTHON_TYPE)
+    assert caught.value.key == "-sub_pc_python_type"
+
+
+def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
+    _, counts = stepped(comm, hanging(50), 3, "python")
+    alone = comm.Split(comm.rank, 0)
+    _, serial = stepped(alone, hanging(50), 3, "python")
+    alone.Free()
+    # but for sweeps, which see the values of other ranks later
+    assert max(counts) <= max(serial) + 2
+
+
+class Scaling:
+    """A preconditioner of somebody's: the identity."""
+
+    def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
+        """x = b."""
+        b.copy(x)
+
+
+def test_sweeps_that_grow_without_bound_are_negative_curvature(comm: MPI.Comm) -> None:
+    """In the sixth step the exact Hessian, tried as its own preconditioner, is indefinite."""
+    settings = ("time.integrator=alpha2", "time.step=0.01")
+    simulation = Simulation(comm, load_scene(ROOT / "configs" / "swing.yaml", settings))
+    for _ in range(7):
+        simulation.step()
+    assert simulation.stepper.preset == "multigrid-w"
+    assert not simulation.notes
+    simulation.destroy()
+
+
+def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm) -> None:
+    """PETSc only multiplies by our rows; ``-mat_type`` makes a matrix with entries."""
+    for asked, with_entries in (({}, False), ({"mat_type": "aij"}, True)):
+        database = PETSc.Options()
+        given = asked | {"pc_type": "python", "pc_python_type": PYTHON_TYPE}
+        for name, value in given.items():
+            database[name] = value
+        try:
+            simulation = Simulation(comm, Scene.model_validate(hanging(25)))
+            simulation.step()
+            linear = simulation.stepper.linear
+            assert isinstance(linear.operator, AssembledMatrix if with_entries else BlockMatrix)
+            assert isinstance(linear.preconditioner, BlockMatrix)
+            largest = comm.allreduce(float(np.abs(linear.operator.rows).max()), MPI.MAX)
+            if with_entries:
+                assert linear.operator.mat.norm(PETSc.NormType.INFINITY) > largest
+            else:
+                assert linear.operator.mat.getType() == PETSc.Mat.Type.PYTHON
+                assert linear.preconditioner is linear.operator
+            simulation.destroy()
+        finally:
+            for name in [*given, *simulation.stepper.our_options]:
+                database.delValue(name)

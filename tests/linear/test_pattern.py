@@ -1,0 +1,202 @@
+"""Half storage of block rows against dense sums; indices that pass 32 bits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from oracle import expanded
+from petsc4py import PETSc
+from physics import Simulation, grid
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
+from lyra_petsc.linear import pattern as room
+from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.terms.term import Across
+
+N_OWNED, N_LOCAL = 9, 14
+
+
+def random_stencil(rng: np.random.Generator, count: int, width: int) -> np.ndarray:
+    return np.array([rng.permutation(N_LOCAL)[:width] for _ in range(count)], dtype=np.int32)
+
+
+def dense(stencil: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+    """Sum (n_local, n_local, 3, 3) of element blocks."""
+    total = np.zeros((N_LOCAL, N_LOCAL, 3, 3))
+    for vertices, block in zip(stencil, blocks, strict=True):
+        for a, row in enumerate(vertices):
+            for b, column in enumerate(vertices):
+                total[row, column] += block[a, b]
+    return total
+
+
+def symmetric(blocks: np.ndarray) -> np.ndarray:
+    """Element blocks (E, n, n, 3, 3) whose transposes are those of the exchanged vertices."""
+    return blocks + blocks.transpose(0, 2, 1, 4, 3)
+
+
+@pytest.mark.parametrize("largest", [room.LARGEST_INT32, 20])
+def test_sums_of_element_blocks(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
+    monkeypatch.setattr(room, "LARGEST_INT32", largest)
+    rng = np.random.default_rng(1)
+    stencils = {"three": random_stencil(rng, 8, 3), "four": random_stencil(rng, 5, 4)}
+    pattern = BlockPattern(stencils, N_OWNED, N_LOCAL)
+    assert pattern.offsets["four"].dtype == (np.int32 if largest > 20 else np.int64)
+    rows = BlockRows(pattern)
+    values = rows.zeros()
+    expected = np.zeros((N_LOCAL, N_LOCAL, 3, 3))
+    for name, stencil in stencils.items():
+        blocks = symmetric(rng.random((*stencil.shape, stencil.shape[1], 3, 3)))
+        weight = rng.random(len(stencil))
+        expected += dense(stencil, weight[:, None, None, None, None] * blocks)
+        add_elements(weight, blocks, pattern.offsets[name], values)
+    found, n_couplings = np.zeros_like(expected), 0
+    for row in range(N_OWNED):
+        here = slice(pattern.indptr[row], pattern.indptr[row + 1])
+        columns = pattern.columns[here]
+        assert (np.diff(columns) > 0).all()
+        coupled = set(np.flatnonzero(expected[row].any(axis=(1, 2)))) | {row}
+        assert set(columns) == {column for column in coupled if column >= row}
+        n_couplings += len(coupled)
+        found[row, columns] = values[here].transpose(0, 2, 1)  # column by column
+        found[columns, row] = values[here]
+    np.testing.assert_allclose(found[:N_OWNED], expected[:N_OWNED])
+    assert pattern.n_couplings == n_couplings
+
+    x = rng.standard_normal((N_LOCAL, 3))
+    product = np.einsum("rcij,cj->ri", expected[:N_OWNED], x)
+    np.testing.assert_allclose(rows.product(values, x), product)
+
+    rows.scale(values, 2.0, diagonal := rng.random(N_OWNED), sums := np.ones_like(values))
+    of_diagonal = diagonal[:, None] * x[:N_OWNED]
+    np.testing.assert_allclose(rows.product(sums, x), 2.0 * product + of_diagonal)
+    rows.set_diagonal(diagonal, sums)
+    np.testing.assert_array_equal(rows.product(sums, x), of_diagonal)
+
+
+def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
+    rng = np.random.default_rng(2)
+    rows = BlockRows(BlockPattern({"three": random_stencil(rng, 12, 3)}, N_OWNED, N_LOCAL))
+    values, mask = rng.standard_normal((rows.pattern.n_blocks, 3, 3)), np.zeros((N_LOCAL, 3), dtype=bool)
+    mask[[2, 5, N_OWNED + 1], [0, 1, 2]] = mask[7] = True
+    before, free = values.copy(), ~mask
+    rows.constrain(values, mask, rows.beside(mask)[0])
+    x = rng.standard_normal((N_LOCAL, 3))
+    found = rows.product(values, x)
+    # the free part as it was without the others, each of which is its own
+    alone = rows.product(before, np.where(free, x, 0.0))
+    np.testing.assert_allclose(np.where(free[:N_OWNED], found - alone, 0.0), 0.0, atol=1e-14)
+    assert (found * x[:N_OWNED])[mask[:N_OWNED]].min() > 0.0
+    rows.constrain(everywhere := before, mask, np.arange(N_OWNED))
+    np.testing.assert_array_equal(values, everywhere)
+
+
+def test_rows_times_columns_pass_32_bits() -> None:
+    n = 70_000  # n² > 2³²
+    stencil = np.array([[n - 1, n - 2], [0, n - 1]], dtype=np.int32)
+    pattern = BlockPattern({"pair": Across(stencil)}, n, n)
+    assert pattern.n_blocks == n + 2
+    assert pattern.n_couplings == n + 4
+    assert pattern.columns[: pattern.indptr[1]].tolist() == [0, n - 1]
+    assert pattern.columns[pattern.indptr[n - 2] :].tolist() == [n - 2, n - 1, n - 1]
+    assert (pattern.offsets["pair"] % 2).tolist() == [0, 1]
+    assert pattern.columns[pattern.offsets["pair"] // 2].tolist() == [n - 1, n - 1]
+
+
+def test_the_same_elements_have_one_table_of_offsets() -> None:
+    stencil = random_stencil(np.random.default_rng(4), 6, 3)
+    stencils = {"one": stencil, "alike": stencil.copy(), "other": stencil[::-1]}
+    offsets = BlockPattern(stencils, N_OWNED, N_LOCAL).offsets
+    assert offsets["alike"] is offsets["one"]
+    np.testing.assert_array_equal(offsets["other"], offsets["one"][::-1])
+
+
+def test_pairs_are_coupled_whole_or_across_only() -> None:
+    stencil = np.array([[1, 2], [3, 0]], dtype=np.int32)
+    pattern = BlockPattern({"pair": stencil, "across": Across(stencil)}, 4, 4)
+    assert pattern.offsets["pair"].shape == (2, 3)
+    assert pattern.offsets["across"].shape == (2,)
+    np.testing.assert_array_equal(pattern.offsets["pair"][:, 1], pattern.offsets["across"])
+    # (0, 0), (0, 1), (1, 1) of each
+    values, rng = np.zeros((pattern.n_blocks, 3, 3)), np.random.default_rng(6)
+    blocks = symmetric(rng.random((2, 2, 2, 3, 3)))
+    add_elements(np.ones(2), blocks, pattern.offsets["pair"], values)
+    expected = np.zeros((4, 4, 3, 3))
+    for (a, b), block in zip(stencil, blocks, strict=True):
+        expected[np.ix_([a, b], [a, b])] += block
+    np.testing.assert_allclose(expanded(pattern, values, 4), expected.transpose(0, 2, 1, 3))
+    assert BlockPattern({"across": Across(stencil)}, 4, 4).columns.tolist() == pattern.columns.tolist()
+
+
+@pytest.mark.parametrize("largest", [room.LARGEST_INT32, 80])
+def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, largest: int) -> None:
+    monkeypatch.setattr(room, "LARGEST_INT32", largest)
+    rng = np.random.default_rng(5)
+    fixed, more = random_stencil(rng, 8, 3), random_stencil(rng, 5, 2)
+    more[0] = N_LOCAL + 1, 2  # with a ghost that is new
+    small = BlockPattern({"fixed": fixed}, N_OWNED, N_LOCAL)
+    made, place = small.extended({"more": more}, N_LOCAL + 2)
+    once = BlockPattern({"fixed": fixed, "more": more}, N_OWNED, N_LOCAL + 2)
+    np.testing.assert_array_equal(made.columns, once.columns)
+    np.testing.assert_array_equal(made.indptr, once.indptr)
+    for name in ("fixed", "more"):
+        np.testing.assert_array_equal(made.offsets[name], once.offsets[name])
+        assert made.offsets[name].dtype == once.offsets[name].dtype
+    # and blocks of the small one are found again
+    values = np.zeros((made.n_blocks, 3, 3))
+    values[place] = before = rng.random((small.n_blocks, 3, 3))
+    wide = expanded(made, values, N_LOCAL + 2)
+    np.testing.assert_array_equal(wide[:, :, :N_LOCAL], expanded(small, before, N_LOCAL))
+    assert not wide[:, :, N_LOCAL:].any()
+
+
+@pytest.mark.parametrize("n_owned", [8, 6, 3])
+def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
+    """Vertices are rows 0 to 5, unknowns of edges three each in rows 6 and 7."""
+    rng = np.random.default_rng(8)
+    vertices = np.array([[0, 1, 2], [5, 3, 1], [4, 2, 0]], dtype=np.int32)
+    edges = np.array([[18, 19], [23, 20], [21, 19]], dtype=np.int64)  # two of one row, and of different ones
+    stencil = np.concatenate([vertices, edges // 3], axis=1).astype(np.int32)
+    pattern = BlockPattern({"mixed": stencil}, n_owned, 8)
+    blocks = rng.random((3, 11, 11))
+    blocks += blocks.transpose(0, 2, 1)
+    weight, values = rng.random(3), np.zeros((pattern.n_blocks, 3, 3))
+    add_mixed_elements(weight, blocks, vertices, edges, pattern.offsets["mixed"], values)
+    expected = np.zeros((24, 24))
+    for e in range(3):
+        places = np.concatenate([(3 * vertices[e][:, None] + np.arange(3)).ravel(), edges[e]])
+        expected[np.ix_(places, places)] += weight[e] * blocks[e]
+    found = expanded(pattern, values, 8).reshape(3 * n_owned, 24)
+    np.testing.assert_allclose(found, expected[: 3 * n_owned])
+
+
+def test_no_elements_leave_the_diagonal() -> None:
+    pattern = BlockPattern({"none": np.empty((0, 3), np.int32)}, 2, 3)
+    assert pattern.columns.tolist() == [0, 1]
+    assert BlockPattern({}, 0, 0).n_blocks == 0
+
+
+def test_patterns_of_keys() -> None:
+    keys = room.union(room.diagonal_keys(2, 4), np.array([3, 1, 7]))
+    pattern = BlockPattern.of_keys(keys, 2, 4)
+    assert pattern.indptr.tolist() == [0, 3, 5]
+    assert pattern.columns.tolist() == [0, 1, 3, 1, 3]
+    assert pattern.offsets == {}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(("largest", "remedy"), [(100, "64-bit indices"), (400, "more ranks")])
+def test_more_than_petsc_can_count(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, largest: int, remedy: str
+) -> None:
+    class Small:
+        max = largest
+
+    monkeypatch.setattr(
+        np, "iinfo", lambda kind, real=np.iinfo: Small if kind is PETSc.IntType else real(kind)
+    )
+    with pytest.raises(InputError, match=remedy), Simulation({"mesh": grid(1, 1, 7, 7)}, comm):
+        pass

@@ -1,0 +1,79 @@
+"""Which linear solver a problem starts with, and which follow it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+
+from lyra_petsc.linear.pivots import negative_pivots, shows_negative_curvature
+from lyra_petsc.linear.presets import PRESETS, candidates, linear_limit
+
+
+@pytest.mark.parametrize(
+    ("vertices", "ranks", "more", "first"),
+    [
+        (500, 1, {}, "block-jacobi"),
+        (500, 3, {}, "block-jacobi"),
+        (500, 1, {"iterations": 50.0}, "ilu"),
+        (500, 3, {"iterations": 50.0}, "block-ilu"),
+        (500, 1, {"newton": False}, "ilu"),
+        (500, 2, {"newton": False}, "block-ilu"),
+        (500, 1, {"iterations": 1e4}, "direct"),
+        (5000, 1, {}, "multigrid"),
+        (5000, 2, {}, "multigrid"),
+        (5000, 1, {"iterations": 20.0}, "multigrid"),
+        (5000, 1, {"iterations": 1000.0}, "multigrid-w"),
+        (2500, 1, {"newton": False}, "ilu"),
+        (5000, 1, {"iterations": 1e4}, "direct"),
+        (10_000, 2, {}, "multigrid"),
+        (5000, 1, {"newton": False}, "multigrid"),
+        (5000, 2, {"newton": False}, "multigrid"),
+        (200_000, 1, {}, "multigrid"),
+        (200_000, 4, {"iterations": 1e5}, "multigrid-w"),
+        (5000, 2, {"static": True}, "direct"),
+        (200_000, 2, {"static": True}, "multigrid-w"),
+    ],
+)
+def test_the_first_fits_the_problem(vertices: int, ranks: int, more: dict[str, float], first: str) -> None:
+    chosen = candidates(vertices, ranks, **more)  # type: ignore[arg-type]
+    assert chosen[0] == first
+    assert len(set(chosen)) == len(chosen) > 1
+    assert set(chosen) <= set(PRESETS)
+    # what holds a matrix of any size
+    assert {"multigrid", "multigrid-w", "gamg", "block-jacobi"} & set(chosen)
+
+
+def test_iterations_are_limited_only_before_a_factorisation() -> None:
+    assert linear_limit(1000, ["block-jacobi", "direct"]) == 4.0 * linear_limit(1000, ["gamg", "direct"])
+    assert linear_limit(1000, ["ilu", "direct"]) == 2.0 * linear_limit(1000, ["gamg", "direct"])
+    assert linear_limit(9000, ["gamg", "direct"]) > linear_limit(1000, ["gamg", "direct"])
+    assert linear_limit(10**6, ["gamg", "block-jacobi"]) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("values", "negative"), [([2.0, 1.0, 3.0], 0), ([2.0, -1.0, 3.0], 1), ([-2.0, -1.0, 3.0], 2)]
+)
+def test_pivots_tell_negative_curvature(values: list[float], negative: int) -> None:
+    mat = PETSc.Mat().createAIJ((3, 3), nnz=3, comm=PETSc.COMM_SELF)
+    rotation = np.linalg.qr(np.arange(9.0).reshape(3, 3) ** 2 + np.eye(3))[0]
+    mat.setValues(range(3), range(3), rotation @ np.diag(values) @ rotation.T)
+    mat.assemble()
+    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    pc = PETSc.PC().create(PETSc.COMM_SELF)
+    pc.setType("cholesky")
+    pc.setFactorSolverType("mumps")
+    pc.setOperators(mat)
+    pc.setUp()
+    assert shows_negative_curvature(pc)
+    assert negative_pivots(pc) == negative
+
+
+@pytest.mark.parametrize(
+    ("kind", "shows"), [("pbjacobi", True), ("ilu", True), ("lu", False), ("none", True)]
+)
+def test_exact_factors_without_pivots_hide_it(kind: str, shows: bool) -> None:
+    pc = PETSc.PC().create(PETSc.COMM_SELF)
+    pc.setType(kind)
+    assert shows_negative_curvature(pc) is shows
+    assert negative_pivots(pc) == 0

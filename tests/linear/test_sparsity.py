@@ -1,0 +1,163 @@
+"""The matrix has an entry for what the active terms couple, and for nothing else."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import CLOTH, Simulation, grid
+
+from lyra_petsc.linear.matrix import AssembledMatrix
+
+NX, NY = 6, 5
+
+
+def couplings(mesh: dict[str, Any], comm: MPI.Comm, **more: Any) -> set[tuple[int, int]]:
+    """Coupled vertex pairs (mesh numbers) of a scene's matrix, its own with itself too, on every rank."""
+    with Simulation({"mesh": mesh} | more, comm) as simulation:
+        points, pattern = simulation.model.points, simulation.model.pattern
+        mesh_number = np.empty(points.n_global, dtype=np.int64)
+        for start, original in comm.allgather((points.start, points.original)):
+            mesh_number[start : start + len(original)] = original
+        local = mesh_number[points.global_number]
+        rows, columns = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
+        pairs = list(zip(local[rows].tolist(), local[columns].tolist(), strict=True))
+        upper = (rows < columns) & (columns < points.n_owned)
+        pairs += zip(local[columns[upper]].tolist(), local[rows[upper]].tolist(), strict=True)
+        assert len(pairs) == pattern.n_couplings
+        every = [pair for part in comm.allgather(pairs) for pair in part]
+        assert len(every) == len(set(every))
+        matrix = AssembledMatrix(points, pattern, "baij")
+        stored = matrix.mat.getInfo()["nz_allocated"]  # over all ranks
+        matrix.destroy()
+        assert stored / 9 == len(every)
+        return set(every)
+
+
+def stencil_pairs(stencils: list[tuple[int, ...]]) -> set[tuple[int, int]]:
+    return {(a, b) for stencil in stencils for a in stencil for b in stencil}
+
+
+def grid_stencils() -> tuple[list[tuple[int, ...]], list[tuple[int, ...]]]:
+    """Triangles and hinges of the diagonal grid, found by brute force."""
+    triangles = []
+    for j in range(NY):
+        for i in range(NX):
+            a, b = j * (NX + 1) + i, (j + 1) * (NX + 1) + i
+            triangles += [(a, a + 1, b + 1), (a, b + 1, b)]
+    hinges = []
+    for k, one in enumerate(triangles):
+        hinges += [tuple({*one, *two}) for two in triangles[:k] if len({*one} & {*two}) == 2]
+    return triangles, hinges
+
+
+@pytest.mark.parallel
+def test_membrane_scene_has_membrane_couplings_only(comm: MPI.Comm) -> None:
+    triangles, _ = grid_stencils()
+    more = {"gravity": [0, 0, -9.81], "handles": [{"nodes": [0]}], "loads": [{"pressure": 1.0}]}
+    wind = {"wind": {"velocity": [0, 0, 1], "density": 1.0}}
+    expected = stencil_pairs(triangles)
+    assert couplings(grid(1, 1, NX, NY), comm) == expected
+    assert couplings(grid(1, 1, NX, NY), comm, **more, **wind) == expected
+
+
+@pytest.mark.parallel
+def test_hinges_couple_opposite_vertices_too(comm: MPI.Comm) -> None:
+    triangles, hinges = grid_stencils()
+    bent = couplings(grid(1, 1, NX, NY), comm, material=CLOTH | {"bending": 1e-4})
+    assert bent == stencil_pairs(triangles) | stencil_pairs(hinges)
+    assert len(bent) > 1.5 * len(stencil_pairs(triangles))
+
+
+@pytest.mark.parallel
+def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(comm: MPI.Comm) -> None:
+    with Simulation({"mesh": grid(1, 1, NX, NY)}, comm) as simulation:
+        assert list(simulation.model.terms) == ["membrane"]
+        system = simulation.system
+        assert not system.held
+        assert not system.viscous
+        assert not system.loads
+        assert not system._damping.acts
+        assert system._damping._values is None
+        assert len(system.prescribed.goal) == len(system.prescribed.rows) == 0
+        assert simulation.model.probes == {}
+
+
+SCRIPT = """
+import json, sys
+import petsc4py
+petsc4py.init(["test", "-pc_type", "lu"])
+from mpi4py import MPI
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.phases import Phases
+from lyra_petsc.stepping.problem import build_model
+from lyra_petsc.stepping.stepper import Stepper
+
+scene = Scene.model_validate(json.loads(sys.argv[1]))
+model = build_model(MPI.COMM_SELF, scene, Phases())
+stepper = Stepper(scene, model.system, model.surface, model.outline.spacing, 1e-12)
+stepper.start(0.0, 0)
+assert stepper.attempt(0.0, 0.01).converged
+print(json.dumps(sorted(m for m in sys.modules if m.startswith("lyra_petsc.") or m in HEAVY)))
+"""
+HEAVY = ("gmsh", "h5py", "ruamel.yaml", "rich")
+
+
+def imported(**more: Any) -> set[str]:
+    """Modules that are loaded after a step of a scene, in a fresh interpreter."""
+    scene = {
+        "mesh": grid(1, 1, 2, 2),
+        "material": CLOTH,
+        "time": {"end": 1, "step": 0.01},
+        "initial": {"velocity": [0, 0, 1]},
+    } | more
+    script = SCRIPT.replace("HEAVY", repr(HEAVY))
+    done = subprocess.run(
+        [sys.executable, "-c", script, json.dumps(scene)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+MEMBRANE_SCENE = {
+    "membrane",
+    "membrane_laws",
+    "membrane_laws.registry",
+    "membrane_laws.stvk",
+    "motion",
+    "prescribed_handles",
+    "registry",
+    "remembered",
+    "rest",
+    "term",
+}
+"""Modules of ``terms`` that every scene needs."""
+
+
+@pytest.mark.slow
+def test_a_membrane_scene_imports_and_compiles_no_other_term() -> None:
+    loaded = imported()
+    terms = {m.removeprefix("lyra_petsc.terms.") for m in loaded if m.startswith("lyra_petsc.terms.")}
+    assert terms == MEMBRANE_SCENE
+    assert not loaded & set(HEAVY)
+
+
+@pytest.mark.slow
+def test_each_key_of_a_scene_brings_its_own_term_and_no_more() -> None:
+    without = {m for m in imported() if ".terms." in m}
+    added = {
+        "wind": {"wind": {"velocity": [0, 0, 1], "density": 1.0}},
+        "gravity": {"gravity": [0, 0, -9.81]},
+        "pressure": {"loads": [{"pressure": 1.0}]},
+    }
+    for term, keys in added.items():
+        assert {m for m in imported(**keys) if ".terms." in m} - without == {f"lyra_petsc.terms.{term}"}

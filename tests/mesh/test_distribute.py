@@ -1,0 +1,301 @@
+"""Distribution: every vertex owned once, every element where it is needed and counted once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.distribute import Part, Whole, distribute, split_elements
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.grids import grid_sheet
+from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
+from lyra_petsc.mesh.points import Numbering, Points
+from lyra_petsc.mesh.topology import hinges
+from lyra_petsc.scene.schema import Grid
+
+Ints = NDArray[np.int64]
+
+pytestmark = [pytest.mark.parallel, pytest.mark.quick]
+
+SIZES = [(1, 1), (2, 1), (7, 5), (20, 20)]
+
+
+def whole_of(triangles: Ints, n_vertices: int) -> Whole:
+    elements = {"triangles": Elements(triangles, {"number": np.arange(len(triangles), dtype=float)})}
+    quads = hinges(triangles).vertices
+    elements["hinges"] = Elements(quads, {"number": np.arange(len(quads), dtype=float)})
+    elements["some"] = Elements(np.array([[0], [n_vertices - 1]]))
+    elements["none"] = Elements(np.empty((0, 2), dtype=np.int64))
+    return Whole(n_vertices, triangles, elements, {"number": np.arange(n_vertices, dtype=float)})
+
+
+def meshes() -> list[tuple[Ints, int]]:
+    one = (np.array([[0, 1, 2]]), 3)
+    apart = (np.array([[0, 1, 2], [3, 4, 5]]), 6)  # two sheets that share nothing
+    return [one, apart, *(square(nx, ny) for nx, ny in SIZES)]
+
+
+def square(nx: int, ny: int) -> tuple[Ints, int]:
+    """Triangles of a unit square's grid, and its number of vertices."""
+    sheet = grid_sheet(Grid(width=1, height=1, nx=nx, ny=ny, pattern="alternating"))
+    return sheet.triangles, len(sheet.points)
+
+
+@pytest.fixture(params=range(6), ids=["triangle", "apart", *(f"{nx}x{ny}" for nx, ny in SIZES)])
+def mesh(request: pytest.FixtureRequest) -> tuple[Ints, int]:
+    return meshes()[request.param]
+
+
+@pytest.fixture
+def part(comm: MPI.Comm, mesh: tuple[Ints, int]) -> Part:
+    return distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)
+
+
+def test_every_vertex_has_one_owner_and_contiguous_numbers(
+    comm: MPI.Comm, mesh: tuple[Ints, int], part: Part
+) -> None:
+    points = part.layout
+    originals = np.concatenate(comm.allgather(points.original))
+    np.testing.assert_array_equal(np.sort(originals), np.arange(mesh[1]))
+    assert points.n_owned == len(points.original) == points.bounds[comm.rank + 1] - points.start
+    assert points.bounds[0] == 0
+    assert points.bounds[-1] == points.n_global == mesh[1]
+    # where no elements couple edges all rows are vertices
+    assert (points.n_vertices, points.n_vertices_global) == (points.n_owned, points.n_global)
+    assert points.n_edges == points.n_edges_global == len(points.edges) == len(points.padding) == 0
+    np.testing.assert_array_equal(part.vertex_data["number"], points.original)
+
+
+def test_a_rank_has_every_element_that_touches_what_it_owns(
+    comm: MPI.Comm, mesh: tuple[Ints, int], part: Part
+) -> None:
+    triangles, n_vertices = mesh
+    whole = whole_of(triangles, n_vertices)
+    mine = np.zeros(n_vertices, dtype=bool)
+    mine[part.layout.original] = True
+    numbers = np.empty(part.layout.n_global, dtype=np.int64)  # mesh index of each global number
+    for start, original in comm.allgather((part.layout.start, part.layout.original)):
+        numbers[start : start + len(original)] = original
+    for name, elements in part.elements.items():
+        expected = np.flatnonzero(mine[whole.elements[name].stencil].any(axis=1))
+        np.testing.assert_array_equal(np.sort(elements.index), expected)
+        # local numbers lead back to the vertices of the mesh, in the same order within the element
+        back = numbers[part.layout.global_number[elements.stencil]]
+        np.testing.assert_array_equal(back, whole.elements[name].stencil[elements.index])
+        if "number" in elements.data:
+            np.testing.assert_array_equal(elements.data["number"], elements.index)
+
+
+def test_every_element_is_counted_on_one_rank(comm: MPI.Comm, mesh: tuple[Ints, int], part: Part) -> None:
+    whole = whole_of(*mesh)
+    for name, elements in part.elements.items():
+        counted = np.concatenate(comm.allgather(elements.index[: elements.n_owned]))
+        np.testing.assert_array_equal(np.sort(counted), np.arange(len(whole.elements[name].stencil)))
+
+
+def test_ghosts_are_what_elements_touch_and_get_their_owners_values(comm: MPI.Comm, part: Part) -> None:
+    points = part.layout
+    touched = np.unique(np.concatenate([e.stencil.ravel() for e in part.elements.values()]))
+    ghosts = touched[touched >= points.n_owned]
+    np.testing.assert_array_equal(ghosts, np.arange(points.n_owned, points.n_local))
+    assert not np.any((points.ghosts >= points.start) & (points.ghosts < points.start + points.n_owned))
+    values = np.full((points.n_local, 3), np.nan)
+    values[: points.n_owned] = points.global_number[: points.n_owned, None] + [0.0, 0.25, 0.5]
+    points.update_ghosts(values)
+    np.testing.assert_array_equal(values, points.global_number[:, None] + [0.0, 0.25, 0.5])
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_owners_get_the_sum_of_what_ranks_have(comm: MPI.Comm, part: Part, kind: type) -> None:
+    points = part.layout
+    values = np.ones((points.n_local, 3), dtype=kind)
+    values[:, 1] = comm.rank
+    points.add_to_owners(values)
+    everywhere = comm.allgather((points.global_number, comm.rank))
+    seen, ranks = np.zeros(points.n_global), np.zeros(points.n_global)
+    for numbers, rank in everywhere:
+        seen[numbers] += 1
+        ranks[numbers] += rank
+    own = points.global_number[: points.n_owned]
+    np.testing.assert_array_equal(values[: points.n_owned, 0], seen[own])
+    np.testing.assert_array_equal(values[: points.n_owned, 1], ranks[own])
+
+
+def test_a_large_mesh_is_cut_evenly_with_few_ghosts(comm: MPI.Comm) -> None:
+    mesh = square(40, 40)
+    part = distribute(comm, whole_of(*mesh) if comm.rank == 0 else None)
+    sizes = comm.allgather(part.layout.n_owned)
+    assert max(sizes) <= 1.15 * mesh[1] / comm.size
+    # a straight cut has 41 vertices a side, hinges reach one row further
+    assert len(part.layout.ghosts) <= (0 if comm.size == 1 else 4 * 41)
+
+
+def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:
+    graph = vertex_graph([np.array([[i, i + 1] for i in range(11)])], 12) if comm.rank == 0 else None
+    database = PETSc.Options()
+    database.setValue("mat_partitioning_type", "average")
+    try:
+        owner, name = partition(comm, graph, 12)
+    finally:
+        database.delValue("mat_partitioning_type")
+    if comm.size > 1:
+        assert name == "average"
+    if comm.rank == 0:
+        np.testing.assert_array_equal(np.sort(np.unique(owner)), np.arange(comm.size))
+
+
+def test_a_partitioner_that_petsc_has_not_is_refused(comm: MPI.Comm) -> None:
+    if comm.size == 1:  # nothing is cut, hence nothing asked for
+        return
+    database = PETSc.Options()
+    database.setValue("mat_partitioning_type", "scissors")
+    try:
+        with pytest.raises(InputError, match="scissors"):
+            partition(comm, vertex_graph([np.array([[0, 1]])], 2) if comm.rank == 0 else None, 2)
+    finally:
+        database.delValue("mat_partitioning_type")
+
+
+def test_locality_order_is_a_permutation_that_keeps_neighbours_near() -> None:
+    rng = np.random.default_rng(1)
+    names = rng.permutation(200)  # a path whose vertices are numbered at random
+    graph = vertex_graph([np.column_stack([names[:-1], names[1:]])], 200)
+    position = locality_order(graph)
+    np.testing.assert_array_equal(np.sort(position), np.arange(200))
+    assert np.abs(np.diff(position[names])).max() == 1
+
+
+def test_numbering_is_by_owner_then_by_position() -> None:
+    numbering = Numbering.build(np.array([1, 0, 1, 0, 3]), np.array([4, 3, 2, 1, 0]), 4)
+    np.testing.assert_array_equal(numbering.bounds, [0, 2, 4, 4, 5])
+    np.testing.assert_array_equal(numbering.number, [3, 1, 2, 0, 4])
+
+
+def test_split_counts_an_element_where_its_first_point_is_owned() -> None:
+    split = split_elements(np.array([[0, 1], [1, 0], [2, 2]]), 4)
+    assert [(sorted(index), n) for index, n in split] == [([0, 1], 1), ([0, 1], 1), ([2], 1), ([], 0)]
+    assert split[1][0][0] == 1  # what a rank counts comes first
+
+
+def with_edges(triangles: Ints, n_vertices: int) -> Whole:
+    """The mesh with an unknown on every other interior edge, coupled to the four vertices of its hinge."""
+    quads = hinges(triangles).vertices[::2]
+    edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    chosen = np.flatnonzero((np.sort(quads[:, :2], axis=1)[:, None] == edges).all(axis=2))
+    index = (chosen % len(edges))[:, None]
+    whole = whole_of(triangles, n_vertices)
+    whole.elements["angles"] = Elements(quads, {"number": np.arange(len(quads), dtype=float)}, edges=index)
+    whole.edges = edges
+    return whole
+
+
+@pytest.fixture
+def mixed(comm: MPI.Comm, mesh: tuple[Ints, int]) -> Part:
+    return distribute(comm, with_edges(*mesh) if comm.rank == 0 else None)
+
+
+def test_rows_of_vertices_and_of_edges(comm: MPI.Comm, mesh: tuple[Ints, int], mixed: Part) -> None:
+    layout, whole = mixed.layout, with_edges(*mesh)
+    indices = whole.elements["angles"].edges
+    assert indices is not None
+    n_edges = len(np.unique(indices))
+    assert (layout.n_vertices_global, layout.n_edges_global) == (mesh[1], n_edges)
+    # every vertex, and every edge that carries an unknown, once
+    for own, count in ((layout.original, mesh[1]), (layout.edges, n_edges)):
+        np.testing.assert_array_equal(np.sort(np.concatenate(comm.allgather(own))), np.arange(count))
+    assert layout.n_owned == layout.n_vertices + -(-layout.n_edges // 3)
+    # a rank's rows are contiguous: its vertices, its edges, and what is left of the last row
+    vertices = np.arange(3 * layout.n_vertices)
+    places = np.concatenate([vertices, layout.edge_places, layout.padding])
+    np.testing.assert_array_equal(places, np.arange(3 * layout.n_owned))
+    assert len(layout.padding) < 3
+    np.testing.assert_array_equal(mixed.vertex_data["number"], layout.original)
+    numbers = np.arange(layout.n_global)
+    assert np.count_nonzero(layout.are_vertices(numbers)) == mesh[1]
+    own = layout.start + np.arange(layout.n_owned)
+    np.testing.assert_array_equal(layout.are_vertices(own), np.arange(layout.n_owned) < layout.n_vertices)
+    # numbered alone, vertices are contiguous on each rank too
+    alone = layout.vertex_numbers(own[: layout.n_vertices])
+    bounds = layout.vertex_bounds
+    np.testing.assert_array_equal(alone, np.arange(bounds[comm.rank], bounds[comm.rank + 1]))
+    np.testing.assert_array_equal(layout.local(layout.global_number), np.arange(layout.n_local))
+
+
+def test_elements_find_the_unknowns_of_their_edges(
+    comm: MPI.Comm, mesh: tuple[Ints, int], mixed: Part
+) -> None:
+    layout, whole = mixed.layout, with_edges(*mesh)
+    indices = whole.elements["angles"].edges
+    assert indices is not None
+    assert whole.edges is not None
+    carrying = np.unique(indices)
+    # every row holds what it stands for: a vertex its number in the mesh, an edge its index
+    vertices = np.repeat(layout.original[:, None], 3, axis=1).astype(float)
+    owned = layout.joined(vertices, carrying[layout.edges].astype(float))
+    found = layout.split(owned)
+    np.testing.assert_array_equal(found[0], vertices)
+    np.testing.assert_array_equal(found[1], carrying[layout.edges])
+    values = np.full((layout.n_local, 3), np.nan)
+    values[: layout.n_owned] = owned
+    layout.update_ghosts(values)
+    mine = np.zeros(mesh[1], dtype=bool)
+    mine[layout.original] = True
+    my_edges = np.zeros(len(whole.edges), dtype=bool)
+    my_edges[carrying[layout.edges]] = True
+    for name, elements in mixed.elements.items():
+        of_mesh = whole.elements[name]
+        touches = mine[of_mesh.stencil].any(axis=1)
+        if of_mesh.edges is not None:
+            touches |= my_edges[of_mesh.edges].any(axis=1)
+        np.testing.assert_array_equal(np.sort(elements.index), np.flatnonzero(touches))
+        np.testing.assert_array_equal(values[elements.stencil, 0], of_mesh.stencil[elements.index])
+        if elements.edges is not None:
+            assert of_mesh.edges is not None
+            np.testing.assert_array_equal(values.ravel()[elements.edges], of_mesh.edges[elements.index])
+        counted = np.concatenate(comm.allgather(elements.index[: elements.n_owned]))
+        np.testing.assert_array_equal(np.sort(counted), np.arange(len(of_mesh.stencil)))
+
+
+def test_further_ghosts_come_after_the_present_ones(comm: MPI.Comm, part: Part) -> None:
+    layout = part.layout
+    others = np.setdiff1d(np.arange(layout.n_global), layout.global_number)[::2]
+    more = layout.with_ghosts(others)
+    np.testing.assert_array_equal(more.global_number, np.concatenate([layout.global_number, others]))
+    np.testing.assert_array_equal(more.local(more.global_number), np.arange(more.n_local))
+    values = np.full((more.n_local, 3), np.nan)
+    values[: more.n_owned] = more.global_number[: more.n_owned, None]
+    more.update_ghosts(values)
+    np.testing.assert_array_equal(values[:, 0], more.global_number)
+    assert (more.n_vertices, more.n_edges) == (layout.n_vertices, layout.n_edges)
+    more.destroy()
+
+
+def test_points_in_any_order_are_exchanged(comm: MPI.Comm) -> None:
+    # a ring of points dealt out to the ranks; each rank sees the next rank's last two, the last one first
+    n = 4 * comm.size
+    numbering = Numbering.build(np.arange(n) // 4, np.arange(n), comm.size)
+    after = 4 * ((comm.rank + 1) % comm.size)
+    ghosts = numbering.number[[after + 3, after + 2] if comm.size > 1 else []]
+    points = Points(comm, numbering.bounds, ghosts)
+    values = np.zeros((points.n_local, 3))
+    values[:4] = points.global_number[:4, None]
+    points.update_ghosts(values)
+    np.testing.assert_array_equal(values[:, 0], points.global_number)
+    np.testing.assert_array_equal(points.local(points.global_number), np.arange(points.n_local))
+    points.destroy()
+
+
+def test_a_constant_that_is_one_number_takes_no_memory() -> None:
+    stencil = np.arange(12).reshape(4, 3)
+    data = {"same": np.full(4, 0.3), "other": np.arange(4.0), "wide": np.ones((4, 2))}
+    elements = Elements(stencil, data)
+    for name in (*data, "missing"):
+        assert elements.once(name).data.keys() == data.keys()
+    assert elements.once("other") is elements.once("wide") is elements.once("missing") is elements
+    once = elements.once("same").data["same"]
+    assert once.strides == (0,)
+    np.testing.assert_array_equal(once, data["same"])

@@ -1,0 +1,182 @@
+"""gmsh scripts: meshing, sizes, errors, and what gmsh must not leave behind."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mesh_sources import mesh_of, rest_areas
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.measures import mean_edge_length, triangle_sides
+from lyra_petsc.mesh.topology import boundary_edges
+
+gmsh = pytest.importorskip("gmsh")
+
+MESHES = Path(__file__).parents[2] / "meshes"
+
+SQUARE = """
+Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
+Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+"""
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Path:
+    return tmp_path / "script.geo"
+
+
+@pytest.mark.parametrize(
+    ("name", "spans", "groups"),
+    [
+        ("flag", (1.5, 0, 1), {"flag": 2, "pole": 1, "fly": 1, "tip": 0}),
+        (
+            "square",
+            (1, 1, 0),
+            {"sheet": 2, "left": 1, "right": 1, "bottom": 1, "top": 1, "corners": 0}
+            | {f"corner{i}": 0 for i in (1, 2, 3, 4)},
+        ),
+        ("sail", None, {"sail": 2, "luff": 1, "leech": 1, "foot": 1, "head": 0, "tack": 0, "clew": 0}),
+        ("plate", (1, 0.1, 0), {"plate": 2, "clamped": 1, "tip": 1}),
+    ],
+)
+def test_shipped_meshes(name: str, spans: tuple[float, ...] | None, groups: dict[str, int]) -> None:
+    mesh = mesh_of(MESHES / f"{name}.geo")
+    assert mesh.notes == []
+    assert {group: found.dimension for group, found in mesh.groups.items()} == groups
+    if spans is not None:
+        assert np.allclose(np.ptp(mesh.rest, axis=0), spans, atol=1e-12)
+    a, b = triangle_sides(mesh.rest[mesh.triangles])
+    assert np.allclose(np.linalg.norm(np.cross(a, b), axis=1), 2 * rest_areas(mesh))
+    # well shaped: no side longer than four times what an equilateral triangle of its area has
+    longest = np.linalg.norm(np.stack([a, b, b - a]), axis=2).max(axis=0)
+    assert (longest**2 < 16 * 4 / np.sqrt(3) * rest_areas(mesh)).all()
+
+
+def test_flag_lies_where_the_scene_expects_it() -> None:
+    mesh = mesh_of(MESHES / "flag.geo")
+    assert 2000 < mesh.n_triangles < 2500
+    assert mesh.positions[mesh.groups["tip"].vertices].tolist() == [[1.5, 0, 1]]
+    assert (mesh.positions[mesh.groups["pole"].vertices, 0] == 0).all()
+    assert (mesh.positions[mesh.groups["fly"].vertices, 0] == 1.5).all()
+
+
+def test_sail_is_curved_and_its_edges_are_its_boundary() -> None:
+    mesh = mesh_of(MESHES / "sail.geo")
+    x = mesh.rest[mesh.triangles]
+    normal = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    assert (normal @ normal.mean(axis=0)).min() < 0.97
+    edges = sum(len(mesh.groups[name].edges) for name in ("luff", "leech", "foot"))
+    assert edges == len(boundary_edges(mesh.triangles).edges)
+    assert mesh.positions[mesh.groups["head"].vertices].tolist() == [[0, 0, 3]]
+
+
+@pytest.mark.parametrize("size", [0.3, 0.05])
+@pytest.mark.parametrize("options", ["", "Mesh.MeshSizeMax = 0.2; Mesh.MeshSizeFactor = 3;\n", "Mesh 2;\n"])
+def test_size_overrides_the_script(script: Path, size: float, options: str) -> None:
+    script.write_text(SQUARE + options)
+    mesh = mesh_of(script, size=size)
+    assert mean_edge_length(mesh) == pytest.approx(size, rel=0.25)
+    assert mesh.notes == []
+
+
+def test_fixed_divisions_win_and_are_told(script: Path) -> None:
+    script.write_text(SQUARE + "Transfinite Curve {1, 2, 3, 4} = 3; Transfinite Surface {1};\n")
+    (note,) = mesh_of(script, size=0.05).notes
+    assert "fixes its divisions" in note
+
+
+def test_a_script_may_mesh_by_itself_and_have_groups_on_parts_only(script: Path) -> None:
+    script.write_text(SQUARE + 'Physical Curve("west") = {4};\nMesh.ElementOrder = 2;\nMesh 2;\n')
+    mesh = mesh_of(script)
+    assert rest_areas(mesh).sum() == pytest.approx(1.0)
+    assert list(mesh.groups) == ["west"]
+    assert any("higher order" in note for note in mesh.notes)
+
+
+def test_surfaces_that_face_each_other_are_oriented_alike(script: Path) -> None:
+    script.write_text(
+        SQUARE
+        + "Point(5) = {2, 0, 0, 0.5}; Point(6) = {2, 1, 0, 0.5};\n"
+        + "Line(5) = {2, 5}; Line(6) = {5, 6}; Line(7) = {6, 3};\n"
+        + "Curve Loop(2) = {-7, -6, -5, 2}; Plane Surface(2) = {2};\n"
+    )
+    mesh = mesh_of(script)
+    x = mesh.positions[mesh.triangles]
+    assert len(np.unique(np.sign(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])[:, 2]))) == 1
+    assert any("turned over" in note for note in mesh.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("// broken\nPoint(1) = {0, 0};\n", "geo: gmsh: line 2: syntax error"),
+        (SQUARE + "Line(9) = {1, 77};\n", "gmsh: "),
+        (SQUARE + 'Merge "nowhere.step";\n', "line 5: includes 'nowhere.step', which does not exist"),
+        ("Point(1) = {0, 0, 0};\n", "no triangles"),
+        ("// nothing\n", "no triangles"),
+        ("   \n", "empty"),
+        ("caf\xe9 = {;\n", "gmsh: "),
+    ],
+)
+def test_refused(script: Path, text: str, message: str) -> None:
+    script.write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match=message) as caught:
+        mesh_of(script)
+    assert caught.value.file == str(script)
+    assert "\n" not in str(caught.value)
+
+
+def test_quiet_and_without_traces(script: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)]
+    script.write_text(SQUARE)
+    mesh_of(script)
+    script.write_text("wrong")
+    with pytest.raises(InputError):
+        mesh_of(script)
+    captured = capfd.readouterr()
+    assert (captured.out, captured.err) == ("", "")
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)] == before
+    if hasattr(gmsh, "isInitialized"):
+        assert not gmsh.isInitialized()
+
+
+def test_same_mesh_every_time(script: Path) -> None:
+    script.write_text(SQUARE)
+    first, second = mesh_of(script, size=0.1), mesh_of(script, size=0.1)
+    assert (first.triangles == second.triangles).all()
+    assert (first.positions == second.positions).all()
+
+
+@pytest.mark.skipif(not hasattr(gmsh, "isInitialized"), reason="gmsh cannot tell before 4.9")
+def test_a_session_of_the_caller_goes_on(script: Path) -> None:
+    script.write_text(SQUARE)
+    gmsh.initialize(readConfigFiles=False)
+    try:
+        gmsh.model.add("theirs")
+        assert mesh_of(script, size=0.3).n_triangles > 10
+        assert gmsh.model.getCurrent() == "theirs"
+    finally:
+        gmsh.finalize()
+
+
+@pytest.mark.parametrize(
+    ("fake", "words"),
+    [
+        ("raise ImportError('no library')", r"need gmsh \(no library\)"),
+        ("def initialize(**_): raise AttributeError('undefined symbol')", r"start \(undefined symbol\)"),
+    ],
+)
+def test_a_gmsh_that_does_not_start_is_told(
+    script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake: str, words: str
+) -> None:
+    (tmp_path / "fake").mkdir()
+    (tmp_path / "fake" / "gmsh.py").write_text(fake)
+    script.write_text(SQUARE)
+    monkeypatch.syspath_prepend(tmp_path / "fake")
+    with pytest.raises(InputError, match=words):
+        mesh_of(script)

@@ -1,0 +1,64 @@
+"""Hinges and boundary edges."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from mesh_sources import grid_mesh
+
+from lyra_petsc.mesh.topology import boundary_edges, hinges
+
+
+def test_hinge_of_two_triangles() -> None:
+    found = hinges(np.array([[0, 1, 2], [0, 2, 3]]))
+    assert found.vertices.tolist() == [[2, 0, 1, 3]]
+    assert found.triangles.tolist() == [[0, 1]]
+
+
+def test_hinges_agree_with_their_triangles() -> None:
+    triangles = grid_mesh(nx=7, ny=5, pattern="alternating").triangles
+    vertices, pairs = hinges(triangles)
+    turns = {(t, *np.roll(triangle, -k)) for t, triangle in enumerate(triangles) for k in range(3)}
+    for (a, b, c, d), (first, second) in zip(vertices, pairs, strict=True):
+        assert (first, a, b, c) in turns
+        assert (second, b, a, d) in turns
+        assert first < second
+
+
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
+def test_euler_formula(pattern: str) -> None:
+    mesh = grid_mesh(nx=6, ny=4, pattern=pattern)
+    interior, boundary = len(hinges(mesh.triangles).vertices), len(boundary_edges(mesh.triangles).edges)
+    assert boundary == 2 * (6 + 4)
+    assert mesh.n_vertices - (interior + boundary) + mesh.n_triangles == 1
+    assert 3 * mesh.n_triangles == 2 * interior + boundary
+
+
+def test_boundary_edges_run_with_their_triangle_and_close() -> None:
+    mesh = grid_mesh(nx=3, ny=2)
+    edges, triangle, opposite = boundary_edges(mesh.triangles)
+    assert sorted(edges[:, 0]) == sorted(edges[:, 1])
+    for (a, b), t, c in zip(edges, triangle, opposite, strict=True):
+        corners = mesh.triangles[t].tolist()
+        assert (corners.index(a) + 1) % 3 == corners.index(b)
+        assert {a, b, c} == set(corners)
+
+
+def test_three_triangles_on_an_edge_are_refused() -> None:
+    with pytest.raises(ValueError, match="more than two triangles"):
+        hinges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+
+
+def test_no_triangles_no_edges() -> None:
+    empty = np.empty((0, 3), dtype=np.int64)
+    assert hinges(empty).vertices.shape == (0, 4)
+    assert boundary_edges(empty).edges.shape == (0, 2)
+
+
+def test_fast_on_a_large_mesh() -> None:
+    triangles = grid_mesh(nx=300, ny=300).triangles
+    begin = time.perf_counter()
+    hinges(triangles)
+    assert time.perf_counter() - begin < 2.0

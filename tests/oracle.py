@@ -1,0 +1,168 @@
+"""Plain, slow versions of what terms compute: dense Hessians, and differences of what they derive from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms.bending import Bending, dihedral_angles
+from lyra_petsc.terms.hinge_energy import hinge_hessian
+from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.term import Elastic, Step, Viscous
+from lyra_petsc.terms.wind import Wind
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64] | NDArray[np.int32]
+
+
+def frozen_by(term: Elastic | Viscous, system: StageEquations, x: Array | None = None) -> Any:
+    """What a term freezes for a step from 0 s to 0.01 s, at positions x instead of the state's."""
+    return term.freeze(Step(0.0, 0.01, 0.01, system.x if x is None else x, system.reference.at))
+
+
+def gradient(term: Elastic | Viscous, at: Array, frozen: Any) -> Array:
+    """The term's gradient (n, 3) at positions or velocities (n, 3)."""
+    out = np.zeros_like(at)
+    term.add_gradient(at, frozen, out)
+    return out
+
+
+def differences(f: Callable[[Array], Array | float], y: Array, h: float) -> Array:
+    """Derivative of f (…) with respect to y (n, 3) by fourth-order central differences, (n, 3, …)."""
+    rows = []
+    for index in np.ndindex(y.shape):
+        e = np.zeros_like(y)
+        e[index] = h
+        rows.append((8.0 * (f(y + e) - f(y - e)) - (f(y + 2 * e) - f(y - 2 * e))) / (12.0 * h))
+    return np.array(rows).reshape(*y.shape, *np.shape(rows[0]))
+
+
+def expanded(pattern: BlockPattern, values: Array, n_local: int) -> Array:
+    """Block rows of which one half is stored as a dense matrix (n_owned, 3, n_local, 3)."""
+    out = np.zeros((pattern.n_owned, 3, n_local, 3))
+    rows = np.repeat(np.arange(pattern.n_owned), np.diff(pattern.indptr))
+    for row, column, block in zip(rows, pattern.columns, values, strict=True):
+        out[row, :, column, :] = block.T  # stored column by column
+        if column < pattern.n_owned:
+            out[column, :, row, :] = block
+    return out
+
+
+def hessian(
+    term: Elastic | Viscous,
+    at: Array,
+    frozen: Any,
+    blend: float = 0.0,
+    *,
+    weight: Array | None = None,
+    before: Array | None = None,
+    n_owned: int | None = None,
+) -> Array:
+    """What a term adds to block rows, as a dense matrix (n_owned, 3, n, 3), at positions or velocities."""
+    n = len(at)
+    pattern = BlockPattern(term.couplings, n if n_owned is None else n_owned, n)
+    values = np.zeros((pattern.n_blocks, 3, 3))
+    if isinstance(term, Viscous):
+        term.add_hessian(at, frozen, pattern.offsets, values)
+    else:
+        weight = np.ones(term.n_elements) if weight is None else weight
+        term.add_hessian(at, frozen, blend, weight, pattern.offsets, values, before)
+    return expanded(pattern, values, n)
+
+
+def element_hessians(term: Elastic, x: Array, frozen: Any, blend: float = 0.0) -> Array:
+    """The Hessian of each element alone, (E, 3 n, 3 n) over all n points."""
+    size = x.size
+    return np.array(
+        [hessian(term, x, frozen, blend, weight=w).reshape(size, size) for w in np.eye(term.n_elements)]
+    )
+
+
+def summed(stencil: Ints, blocks: Array, n: int) -> Array:
+    """Sum of element blocks (E, k, k, 3, 3) as a matrix (n, 3, n, 3)."""
+    out = np.zeros((n, 3, n, 3))
+    for points, block in zip(stencil, blocks, strict=True):
+        for a, i in enumerate(points):
+            for b, j in enumerate(points):
+                out[i, :, j, :] += block[a, b]
+    return out
+
+
+# -- formulas ------------------------------------------------------------------------------------------
+
+
+def membrane_blocks(term: Membrane, x: Array, blend: float, before: Array | None = None) -> Array:
+    """Element Hessians (E, 3, 3, 3, 3) of St. Venant-Kirchhoff membranes.
+
+    A (∂E/∂x : C : ∂E/∂x + S : ∂²E/∂x²), with S of the strain linearised at ``before``, and regularised of
+    what extension along the material axes alone makes, none of it compressive.
+    """
+    out = np.empty((term.n_elements, 3, 3, 3, 3))
+    area, inverse, (laws, law) = term.elements.data["area"], term.elements.data["inverse"], term.laws
+    for e, points in enumerate(term.stencil):
+        c11, c12, c22, c33 = laws[law[e]]
+        c = np.array([[c11, c12, 0.0], [c12, c22, 0.0], [0.0, 0.0, c33]])
+        shape = np.vstack([-inverse[e].sum(axis=0), inverse[e]])  # ∂F/∂x of each corner
+        f = x[points].T @ shape
+        way = f - (x if before is None else before)[points].T @ shape
+        green = 0.5 * (f.T @ f - np.eye(2) - way.T @ way)
+        strain = np.array([green[0, 0], green[1, 1], 2.0 * green[0, 1]])
+        extension = np.maximum(strain, 0.0) * [1.0, 1.0, 0.0]
+        s = (1.0 - blend) * (c @ strain) + blend * np.maximum(c @ extension, 0.0) * [1.0, 1.0, 0.0]
+        stress = np.array([[s[0], s[2]], [s[2], s[1]]])
+        slopes = np.array(
+            [
+                [f[:, 0] * g[0], f[:, 1] * g[1], f[:, 0] * g[1] + f[:, 1] * g[0]]  # ∂E/∂x of a corner
+                for g in shape
+            ]
+        )
+        out[e] = area[e] * np.einsum("aki,kl,blj->abij", slopes, c, slopes)
+        out[e] += area[e] * np.einsum("ab,ij->abij", shape @ stress @ shape.T, np.eye(3))
+    return out
+
+
+def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
+    """Element Hessians (E, 4, 4, 3, 3) of hinges, each from its four points."""
+    data, sides = term.elements.data, term._triangles.sides
+    out, g = np.empty((term.n_elements, 4, 4, 3, 3)), np.empty((4, 3))
+    angles, limits = dihedral_angles(x, term.stencil), term._limit[sides[:-1] >> 2]
+    for e, points in enumerate(term.stencil):
+        corners = [tuple(x[p].tolist()) for p in points]
+        law = data["k"][e], data["rest_angle"][e], (limits[e, 0], limits[e, 1])
+        hinge_hessian(*corners, angles[e], *law, blend, g, out[e])
+    return out
+
+
+def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
+    """Element Hessians (E, 3, 3, 3, 3): a ninth of ∂²P/∂v_rel² to each pair of corners."""
+    out = np.empty((term.n_elements, 3, 3, 3, 3))
+    wind, density, drag = term._law
+    for e, points in enumerate(term.stencil):
+        n = normals[e]
+        across = np.outer(n, n)
+        speed = abs((wind - v[points].mean(axis=0)) @ n)
+        whole = 2.0 * density * speed * across + drag * (np.eye(3) - across)
+        out[e] = term.elements.data["area"][e] / 9.0 * whole
+    return out
+
+
+def blocks_of(
+    term: Elastic | Viscous, at: Array, frozen: Any, blend: float = 0.0, before: Array | None = None
+) -> Array:
+    """Element Hessians (E, k, k, 3, 3) by the plain formulas, or what a term has for each element."""
+    if isinstance(term, Membrane):
+        return membrane_blocks(term, at, blend, before)
+    if isinstance(term, Bending):
+        return bending_blocks(term, at, blend)
+    if isinstance(term, Wind):
+        return wind_blocks(term, at, frozen)
+    assert isinstance(term, Elastic)
+    k = term.stencil.shape[1]
+    out = np.full((term.n_elements, k, k, 3, 3), np.nan)
+    term.hessians(at, frozen, 0, term.n_elements, blend, out)
+    return out

@@ -1,0 +1,77 @@
+"""Fields on request: their values on shapes where these are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import Simulation, grid
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.fields import FIELDS, chosen
+from lyra_petsc.scene import schema as control
+from lyra_petsc.terms.bending import Bending
+
+MATERIAL = {"density": 0.2, "membrane": {"c11": 100, "c22": 80, "c12": 20, "c33": 30}, "bending": 1e-3}
+ALL = {"mesh": grid(1.0, 1.0, 8, 8), "material": MATERIAL, "output": {"fields": list(control.FIELDS)}}
+
+
+def value(simulation: Simulation, name: str) -> np.ndarray:
+    return FIELDS[name].compute(simulation.model)
+
+
+def test_scene_and_program_know_the_same_fields() -> None:
+    assert set(FIELDS) == set(control.FIELDS)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_curvature_of_a_cylinder(sign: float) -> None:
+    radius = 2.0
+    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+        flat = simulation.x
+        angle = flat[:, 0] / radius
+        bent = np.column_stack([radius * np.sin(angle), flat[:, 1], sign * radius * (1.0 - np.cos(angle))])
+        simulation.set_state(x=bent)
+        original = simulation.model.points.original
+        inside = (np.abs(flat[original, :2] - 0.5) < 0.45).all(axis=1)
+        curvature = value(simulation, "curvature")[inside]
+    # curling towards the normal (+z) counts as positive
+    np.testing.assert_allclose(curvature, sign / radius, rtol=2e-3)
+
+
+def test_collapsed_triangles_have_no_curvature() -> None:
+    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+        flat, noise = simulation.x, np.random.default_rng(3).normal(0.0, 1e-9, simulation.x.shape)
+        simulation.set_state(x=flat * [0.0, 1.0, 1.0] + noise)
+        bending = simulation.model.terms["bending"]
+        assert isinstance(bending, Bending)
+        angles = bending.angles(simulation.system.x)
+        curvature, energy = value(simulation, "curvature"), value(simulation, "bending_energy")
+    assert np.abs(angles).max() > 1.0
+    assert not np.any(np.abs(curvature) > 1e-30)
+    assert not np.any(energy > 1e-30)
+
+
+def test_energy_densities_add_up() -> None:
+    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+        simulation.set_state(x=simulation.x + np.random.default_rng(3).normal(0.0, 0.01, simulation.x.shape))
+        area = simulation.model.membrane.elements.data["area"]
+        total = value(simulation, "membrane_energy") @ area
+        assert total == pytest.approx(simulation.energy("membrane"))
+        vertex_area = simulation.mass / 0.2
+        bending = value(simulation, "bending_energy") @ vertex_area[simulation.model.points.original]
+        assert bending == pytest.approx(simulation.energy("bending"))
+
+
+def test_strain_and_stress_of_a_stretch() -> None:
+    with Simulation(ALL, MPI.COMM_SELF) as simulation:
+        simulation.set_state(x=simulation.x * [1.1, 1.0, 1.0])
+        strain, stress = value(simulation, "green_strain"), value(simulation, "stress")
+    np.testing.assert_allclose(strain, np.tile([0.105, 0.0, 0.0], (len(strain), 1)), atol=1e-12)
+    np.testing.assert_allclose(stress, np.tile([10.5, 2.1, 0.0], (len(stress), 1)), atol=1e-10)
+
+
+def test_a_field_of_an_absent_term_is_refused() -> None:
+    content = ALL | {"material": MATERIAL | {"bending": 0}, "output": {"fields": ["curvature"]}}
+    with Simulation(content, MPI.COMM_SELF) as simulation, pytest.raises(InputError, match="bending"):
+        chosen(simulation.model)

@@ -1,0 +1,171 @@
+"""``scripts/test.sh``: which tests it runs in how many processes, its exit code, its last line."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from environments import NEEDED, ROOT, activated, call, make, put, site_packages, surroundings
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="shell scripts")
+
+PYTEST = """\
+import os, signal, sys, time
+from pathlib import Path
+workers = os.environ["PYTEST_XDIST_AUTO_NUM_WORKERS"]
+heeded = signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+print(f"{workers} workers, interrupts heeded: {heeded}, words:", sys.argv[1:])
+line, code = os.environ.get("SAID", "=== 7 passed in 3.75s ===;0").split(";")
+print(line)
+sys.stdout.flush()
+if line == "works":
+    Path(os.environ["LYRA_VENV"]).with_name("pid").write_text(str(os.getpid()))
+    time.sleep(60)
+if int(code) < 0:
+    os.kill(os.getpid(), -int(code))
+sys.exit(int(code))
+"""
+
+CORES = '#!/bin/sh\necho "${CORES:-2}"\n'
+
+Tests = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment in which pytest only says how it was called, and ends as it is told."""
+    folder = tmp_path_factory.mktemp("tests") / "environment"
+    make(folder)
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    for extra in ("view", "export", "test"):
+        names = re.search(rf"^{extra} = \[(.*?)\]", text, re.MULTILINE | re.DOTALL)
+        assert names is not None
+        for name, version in re.findall(r'"([a-z-]+)>=([0-9.]+)"', names[1]):
+            if name not in NEEDED and not (site_packages(folder) / name).exists():
+                put(folder, name, version)
+    (site_packages(folder) / "pytest" / "__main__.py").write_text(PYTEST)
+    (folder / "bin" / "nproc").write_text(CORES)
+    (folder / "bin" / "nproc").chmod(0o755)
+    return folder
+
+
+@pytest.fixture
+def tests(made: Path, tmp_path: Path) -> Tests:
+    return lambda *words, **variables: call(
+        "test.sh", *words, cwd=tmp_path, **{**activated(made), **variables}
+    )
+
+
+def first_part(done: subprocess.CompletedProcess[str]) -> str:
+    """How pytest was called on one rank."""
+    found = re.search(r"^\d+ workers, .*", done.stdout, re.MULTILINE)
+    assert found is not None, done.stderr
+    return found[0]
+
+
+def parallel_part(done: subprocess.CompletedProcess[str], ranks: int) -> str:
+    """How pytest was called under mpirun; empty if it was not."""
+    found = re.search(rf"^launched in .* -n {ranks} (.*\n)*?exit \$code sh (.*)", done.stdout, re.MULTILINE)
+    return found[2] if found else ""
+
+
+def test_all_tests_on_one_rank_and_the_parallel_ones_on_two_and_three(tests: Tests) -> None:
+    done = tests("-x", "-k", "some or other")
+    assert done.returncode == 0, done.stderr
+    assert first_part(done).startswith("2 workers, interrupts heeded: True")
+    assert "'-n', 'auto'" in first_part(done)
+    assert "'tests', '-x', '-k', 'some or other', '-m', ''" in first_part(done)
+    for ranks in (2, 3):
+        words = parallel_part(done, ranks)
+        assert "-x -k some or other -m parallel" in words
+        assert "tests/stepping/test_ranks.py" in words
+        assert "tests/docs/" not in words
+    assert done.stdout.splitlines()[-1] == "=== 7 passed in 3.75s ==="
+
+
+def test_quick_reads_only_the_files_that_have_quick_tests(tests: Tests) -> None:
+    done = tests("--quick", "-m", "not slow")
+    assert "'-m', 'quick and (not slow)'" in first_part(done)
+    assert "quick and parallel and (not slow)" in parallel_part(done, 2)
+    mark = "pytest.mark." + "quick"  # not in one word, or this file would have it
+    for words in (first_part(done), parallel_part(done, 2)):
+        files = re.findall(r"tests/[\w/]+\.py", words)
+        assert files
+        assert all(mark in (ROOT / file).read_text(encoding="utf-8") for file in files)
+
+
+@pytest.mark.parametrize(
+    ("said", "code", "line"),
+    [
+        ("=== 1 failed, 2 passed in 61.00s (0:01:01) ===;1", 1, None),
+        ("=== 9 deselected in 0.50s ===;5", 5, None),
+        ("tests/cli ...;-11", 139, "tests/cli ..."),
+    ],
+)
+def test_a_failure_is_the_last_line_and_the_exit_code(
+    tests: Tests, said: str, code: int, line: str | None
+) -> None:
+    done = tests(SAID=said)
+    assert done.returncode == code, done.stderr
+    assert done.stdout.splitlines()[-1] == line or said.split(";")[0]
+
+
+def test_a_failure_on_some_ranks_is_a_failure(tests: Tests) -> None:
+    assert tests(LAUNCHER_EXIT="3").returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "variables", "workers"),
+    [
+        ((), {"CORES": "1"}, 1),
+        ((), {"CORES": "64"}, 4),
+        (("-s",), {}, 0),
+        (("tests/docs",), {}, 2),
+        (("tests/test_house.py::test_imports_point_one_way",), {}, 0),
+    ],
+)
+def test_number_of_processes(
+    tests: Tests, words: tuple[str, ...], variables: dict[str, str], workers: int
+) -> None:
+    done = tests(*words, **variables)
+    assert done.returncode == 0, done.stderr
+    assert first_part(done).startswith(f"{workers} workers")
+    assert all(f"'{word}'" in first_part(done) for word in words)
+    assert bool(parallel_part(done, 2)) == (not words or words == ("-s",))
+
+
+def at_work(pid: int) -> bool:
+    """Whether a process has not ended."""
+    words = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True).stdout
+    return words.strip()[:1] not in ("", "Z")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_pytest(made: Path, tmp_path: Path, number: int) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    process = subprocess.Popen(
+        ["bash", str(ROOT / "scripts/test.sh")],
+        env=surroundings(tmp_path) | activated(made) | {"SAID": "works;0", "TMPDIR": str(logs)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    pid = tmp_path / "pid"
+    deadline = time.monotonic() + 30.0
+    while not (pid.exists() and pid.read_text()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.killpg(process.pid, number)  # as a terminal does
+    assert process.wait(timeout=20.0) != 0
+    while at_work(int(pid.read_text())):
+        assert time.monotonic() < deadline + 20.0
+        time.sleep(0.02)
+    assert list(logs.iterdir()) == []

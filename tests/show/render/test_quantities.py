@@ -1,0 +1,98 @@
+"""What a sheet is coloured by, against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from written_run import REST, TRIANGLES, position, scene, stress, velocity, written
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.show.render.colour_quantities import quantity
+from lyra_petsc.show.render.draw import colour_limits, extent
+from lyra_petsc.show.render.sheet_geometry import HeldVertices
+
+
+@pytest.fixture
+def run(tmp_path) -> Run:
+    return Run(written(tmp_path / "run", vt="none"))
+
+
+def test_speed_and_displacement(run):
+    speed = quantity(run, "speed")
+    assert speed.label == "speed [m/s]"
+    np.testing.assert_allclose(speed.values(2), np.linalg.norm(velocity(2), axis=1))
+    moved = quantity(run, "displacement")
+    assert moved.label == "displacement [m]"
+    np.testing.assert_allclose(moved.values(2), np.linalg.norm(position(2) - position(0), axis=1))
+
+
+@pytest.mark.parametrize("vt", ["none", "seam"])
+def test_strain_is_the_largest_principal_green_strain(tmp_path, vt):
+    run = Run(written(tmp_path, vt=vt))
+    strain = quantity(run, "strain")
+    assert strain.label == "largest principal strain [%]"
+    assert strain.on_triangles
+    # positions are rest + (a x, 0, b x) with x in metres; material coordinates are a third of those
+    a, b = 0.1 * np.sin(2.0) / 3.0, np.sin(2.0) / 3.0
+    along_x, along_y = 9.0 * ((1.0 + a) ** 2 + b**2), 9.0
+    expected = 100.0 * (max(along_x, along_y) - 1.0) / 2.0
+    np.testing.assert_allclose(strain.values(2), expected)
+
+
+def test_written_fields(run):
+    shown = quantity(run, "stress")
+    assert shown.label == "largest principal stress [N/m]"
+    assert shown.on_triangles
+    tensors = [np.array([[uu, uv], [uv, vv]]) for uu, vv, uv in stress(1)]
+    np.testing.assert_allclose(shown.values(1), [np.linalg.eigvalsh(t).max() for t in tensors], atol=1e-12)
+    assert quantity(run, "velocity").label == "velocity [m/s]"
+
+
+def test_what_is_not_there_is_said(run, tmp_path):
+    with pytest.raises(InputError, match="no field 'spede', did you mean 'speed'"):
+        quantity(run, "spede")
+    bare = Run(written(tmp_path / "bare", fields=False))
+    with pytest.raises(
+        InputError, match=r"speed needs the velocities, .* add velocity to the scene's output.fields"
+    ):
+        quantity(bare, "speed")
+
+
+def test_the_extent_is_the_same_in_parts(run):
+    normals = np.random.default_rng(0).normal(size=(5, 3))
+    shown = quantity(run, "speed")
+    whole = extent(run, [0, 1, 2], normals, shown)
+    parts = [extent(run, states, normals, shown) for states in ([1], [], [0, 2])]
+    np.testing.assert_array_equal(whole, np.max(parts, axis=0))
+    reach = np.max([position(i) @ normals.T for i in range(3)], axis=(0, 1))
+    np.testing.assert_array_equal(whole[:5], reach)
+    spans = [shown.span(i) for i in range(3)]
+    assert (-whole[5], whole[6]) == (min(low for low, _ in spans), max(high for _, high in spans))
+
+
+def test_the_range_of_the_colours_is_not_empty():
+    assert colour_limits(1.0, 3.0) == (1.0, 3.0)
+    assert colour_limits(0.0, 0.0) == (0.0, 1e-12)
+    assert colour_limits(np.inf, -np.inf) == (0.0, 1e-12)
+
+
+def test_held_vertices_follow_the_windows_of_handles(tmp_path):
+    folder = written(tmp_path)
+    data = scene().model_dump(exclude_none=True, by_alias=True)
+    data["handles"] = [{"nodes": [0, 2, 6], "until": 0.1}, {"box": [[0, 3, 0], [3, 3, 0]]}]
+    (folder / "scene.yaml").write_text(dump_scene(Scene.model_validate(data)), encoding="utf-8")
+    held = HeldVertices(Run(folder))
+
+    vertices, edges = held.at(0.05)
+    assert vertices.tolist() == [0, 1, 2, 3, 6]
+    assert sorted(map(tuple, edges)) == [(0, 2), (0, 3), (0, 6), (1, 2), (1, 3), (2, 6)]
+    vertices, edges = held.at(0.2)
+    assert vertices.tolist() == [1, 3]
+    assert edges.tolist() == [[1, 3]]
+    assert {tuple(edge) for edge in edges} <= {
+        tuple(sorted(t[[i, i - 1]])) for t in TRIANGLES for i in range(3)
+    }
+    assert len(REST) == 8

@@ -1,0 +1,214 @@
+"""The page about a run: finished, failed, stopped, killed, or going on."""
+
+from __future__ import annotations
+
+import fcntl
+import html
+import json
+import re
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
+
+from launch import SCENE, done, finish, lyra, start, without_pictures, write_scene
+
+from lyra_petsc.cli.report import write_page
+from lyra_petsc.linear.presets import PRESETS
+from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.show.report.run_advice import OPTIONS, advice
+from lyra_petsc.show.report.run_facts import Facts
+
+FAILING = SCENE.replace("c11: 800, c22: 800", "c11: 8.0e+9, c22: 8.0e+9") + "solver: {max_iterations: 2}\n"
+
+
+def page_of(folder: Path) -> str:
+    """The text of the page, tags and pictures taken out."""
+    write_page(folder, None)
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|<script|<link|url\(", page)
+    text = re.sub(r'src="data:[^"]*"', 'src=""', page)
+    return html.unescape(re.sub(r"<[^>]*>", " ", text.split("</style>")[1]))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("finished")
+    write_scene(folder, "title: A <b>small</b> sheet\n" + SCENE)
+    done(["run", "scene.yaml", "--out", "sheet", "-ksp_rtol", "1e-5", "-ksp_rtoll", "1"], folder, ranks=2)
+    return folder / "sheet"
+
+
+def copied(run: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(run, folder / "sheet"))
+
+
+def test_a_finished_run_has_all_sections(finished: Path) -> None:
+    text = page_of(finished)
+    assert "The run came to its end, t = 0.05 of 0.05 s." in text
+    assert "A <b>small</b> sheet" in text
+    for heading in (
+        "What to change", "Pictures", "Energy", "Steps and iterations", "Wall time", "Warnings and notes",
+        "Settings", "Versions",
+    ):  # fmt: skip
+        assert heading in text
+    assert "5 accepted, 0 attempts rejected; 4 states written" in text
+    for caption in ("t = 0 s", "t = 0.02 s", "t = 0.05 s", "Energies over time", "The slowest steps"):
+        assert caption in text
+    page = (finished / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/") == 3 + 2 + 1 + 1
+    assert "A &lt;b&gt;small" in page
+    assert "bending_scale: 1.0" in text  # the resolved scene
+    assert "-ksp_rtol 1e-5" in text
+    assert "PETSc options that nothing used: -ksp_rtoll" in text
+
+
+def test_the_page_does_without_what_draws_films(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = copied(finished, tmp_path)
+    monkeypatch.setattr("lyra_petsc.cli.render.PACKAGES", ("no_such_package",))
+    write_page(run, None)
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/svg+xml") == 3 + 2 + 1 + 1
+
+
+def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> None:
+    from lyra_petsc.output.read_run import Run
+
+    facts = Facts.of(Run(finished))
+    table = np.loadtxt(finished / "history.csv", delimiter=",", skiprows=1)
+    column = {name: table[:, i] for i, name in enumerate(HISTORY_COLUMNS)}
+    energy = sum(column[f"{kind}_energy"] for kind in ("kinetic", "membrane", "bending", "potential"))
+    loss = energy[0] - energy + column["external_work"] - column["dissipation"]
+    np.testing.assert_allclose(facts.scheme_loss, loss, atol=1e-14)
+    assert facts.scheme_loss[-1] > 0  # backward Euler takes energy
+    assert f"taken away by the time scheme {facts.scheme_loss[-1]:.3g}"[:38] in page_of(finished)
+
+
+def test_a_run_that_failed_says_why_and_what_to_try(tmp_path: Path) -> None:
+    write_scene(tmp_path, FAILING)
+    left = lyra(["run", "scene.yaml", "--out", "bad", "-ts_adapt_dt_min", "0.005"], tmp_path)
+    assert left.code == 3, left.err
+    text = page_of(tmp_path / "bad")
+    assert "did not converge even with" in text
+    assert "The solver stopped. Try " in text
+    assert "The last attempt, Newton iteration by iteration" in text  # failure.txt
+
+
+def test_a_killed_run_is_told_from_one_that_goes_on(finished: Path, tmp_path: Path) -> None:
+    run = copied(finished, tmp_path)
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    (run / "summary.json").write_text(json.dumps({**summary, "outcome": "running"}), encoding="utf-8")
+    with open(run / "history.csv", "a", encoding="utf-8") as table:
+        table.write("6,0.06,0.0")  # a kill in the middle of a row
+    text = page_of(run)
+    assert "The run was killed" in text
+    assert f"lyra-petsc run --resume --out {run}" in text
+    with open(run / "run.lock", "w", encoding="utf-8") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert "The run goes on: t = 0.05 of 0.05 s" in page_of(run)
+    (run / "summary.json").unlink()
+    assert "How the run ended is not known" in page_of(run)
+
+
+def test_a_stopped_run_says_how_to_go_on(tmp_path: Path) -> None:
+    write_scene(tmp_path, SCENE.replace("end: 0.05, step: 0.01", "end: 1000, step: 0.01"))
+    process = start(["run", "scene.yaml", "--out", "long"], tmp_path)
+    states, deadline = tmp_path / "long" / "states.xdmf", time.monotonic() + 60
+    while not states.exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    running = page_of(tmp_path / "long")  # also while it goes on
+    process.send_signal(signal.SIGTERM)
+    assert finish(process).code == 143
+    assert "The run goes on" in running
+    text = page_of(tmp_path / "long")
+    assert "stopped by SIGTERM after step" in text
+    assert "It goes on with: mpirun -n 1 lyra-petsc run --resume --out " in text
+
+
+def test_a_static_run_has_load_factors(tmp_path: Path) -> None:
+    write_scene(tmp_path, SCENE.replace("time: {end: 0.05, step: 0.01}", "time: {analysis: static}"))
+    done(["run", "scene.yaml", "--out", "still"], tmp_path)
+    text = page_of(tmp_path / "still")
+    assert "load factor 1" in text
+    assert "increment of the load factor" in text
+
+
+def test_the_page_can_go_elsewhere_and_mistakes_are_one_line(finished: Path, tmp_path: Path) -> None:
+    done(["report", finished, "--out", "page.html"], tmp_path, ranks=2)
+    assert (tmp_path / "page.html").is_file()
+    for arguments, words in (
+        (["report"], "Missing argument"),
+        (["report", "nothing"], "no such folder"),
+        (["report", tmp_path], "is not the folder of a run"),
+        (["report", finished, "--out", tmp_path], "is a folder; name a file"),
+        (["report", finished, "--out", "no/where.html"], "there is no such folder"),
+    ):
+        left = lyra(arguments, tmp_path)
+        assert left.code == 2, left.err
+        assert len(left.ours) == 1
+        assert words in left.ours[0]
+
+
+def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
+    left = without_pictures(["report", str(finished)], finished)
+    assert left.returncode == 2
+    assert "pip install 'lyra-petsc[study]'" in left.stderr
+
+
+# -- advice ------------------------------------------------------------------------------------------
+
+
+def told(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
+    """The advice for the finished run with another summary or other columns of its history."""
+    from lyra_petsc.output.read_run import Run
+
+    run = Run(finished)
+    facts = Facts.of(run)
+    for name, value in columns.items():
+        facts.columns[name][1:] = value
+    return "\n".join(advice(Facts(run, facts.columns, {**facts.summary, **(summary or {})})))
+
+
+WALL = {"mesh": 0.1, "solve": 8.0, "output": 0.5, "other": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rejected": 1.0}, "5 attempts at a step were rejected over 5 accepted steps"),
+        ({"rejected": 1.0, "dt": 0.004}, "Set time.step to 0.004 s"),
+        ({"newton_iterations": 12.0}, "takes 12 Newton iterations on average"),
+        ({"linear_iterations": 5000.0, "newton_iterations": 2.0}, "takes 2500 linear iterations"),
+        ({"dissipation": -1.0}, "The time scheme (beuler) took away"),
+        ({"summary": {"wall_seconds": {**WALL, "output": 8.0}}}, "Writing took 49 % of the wall time"),
+        ({"summary": {"wall_seconds": {**WALL, "mesh": 8.0}}}, "Reading the mesh took 48 %"),
+        (
+            {"summary": {"notes": ["step 3: linear solver 'ilu' broke down, going on with 'gamg'"],
+                         "linear_solver": "gamg"}},
+            "To start with it: -pc_type gamg",
+        ),
+        ({"summary": {"ranks": 4}}, "4 ranks share 25 vertices"),
+    ],
+)  # fmt: skip
+def test_advice(finished: Path, changes: dict[str, Any], words: str) -> None:
+    usual = {"ranks": 1, "wall_seconds": WALL}
+    quiet = {"newton_iterations": 3.0, "linear_iterations": 30.0, "dissipation": 0.01}
+    assert words not in told(finished, usual, **quiet)
+    summary = {**usual, **changes.pop("summary", {})} if "summary" in changes else usual
+    assert words in told(finished, summary, **{**quiet, **changes})
+
+
+def test_the_advice_knows_every_linear_solver() -> None:
+    assert set(OPTIONS) == set(PRESETS)

@@ -1,0 +1,99 @@
+"""A run's page, served by a process of its own, and a browser without a screen."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
+
+
+@dataclass
+class Served:
+    """A page that can be opened."""
+
+    process: subprocess.Popen[str]
+    url: str
+
+    @property
+    def port(self) -> int:
+        return urlsplit(self.url).port
+
+    @property
+    def token(self) -> str:
+        return self.url.partition("token=")[2]
+
+    def get(self, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+        """Ask without a browser; ``_`` in the names of headers stands for ``-``."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
+
+    def cookie(self) -> str:
+        """What a browser sends after it has opened the address."""
+        return self.get(f"/?token={self.token}")[1]["Set-Cookie"].split(";")[0]
+
+
+Serve = Callable[..., Served]
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Serve]:
+    """Starts ``view`` on a folder; ended with the test."""
+    from launch import start
+
+    pytest.importorskip("trame")
+    started = []
+
+    def work(folder: Path, *options: str, ranks: int = 1) -> Served:
+        process = start(["view", folder, "--no-browser", *options], tmp_path, ranks)
+        started.append(process)
+        line = process.stdout.readline()
+        found = re.fullmatch(r"view: (http://\S+)\n", line)
+        assert found, line + process.communicate(timeout=30)[1]
+        return Served(process, found[1])
+
+    yield work
+    for process in started:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a screen, drawing by software."""
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    try:
+        from selenium import webdriver
+        from selenium.webdriver.chrome.service import Service
+    except ImportError:
+        driver = None
+    if not (chromium and driver):
+        pytest.skip("needs Debian's packages chromium and chromium-driver, and selenium from PyPI")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for word in ("headless=new", "disable-dev-shm-usage", "window-size=1280,800", "no-proxy-server"):
+        options.add_argument(f"--{word}")
+    options.add_argument("--enable-unsafe-swiftshader")
+    options.add_argument("--use-angle=swiftshader")
+    if os.geteuid() == 0:
+        options.add_argument("--no-sandbox")  # it does not start as root otherwise
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    opened = webdriver.Chrome(service=Service(driver), options=options)
+    yield opened
+    opened.quit()

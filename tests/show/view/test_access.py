@@ -1,0 +1,106 @@
+"""Who may see the page."""
+
+import pytest
+from launch import PATIENCE
+from written_run import written
+
+from lyra_petsc.show.view.access import Access, is_loopback
+
+SOCKET = {
+    "Upgrade": "websocket",
+    "Connection": "Upgrade",
+    "Sec_WebSocket_Version": "13",
+    "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
+
+
+def test_nothing_without_the_token(serve, tmp_path):
+    page = serve(written(tmp_path / "run"))
+    wrong = page.token[:-1] + ("A" if page.token[-1] != "A" else "B")
+
+    for path in ("/", "/index.html", "/vue.global.js", "/ws", "/paraview/", "/nothing"):
+        assert page.get(path)[0] == 403, path
+        assert page.get(f"{path}?token={wrong}")[0] == 403, path
+        assert page.get(path, Cookie=f"lyra-view={page.token}")[0] == 403, path
+    assert page.get("/ws", **SOCKET)[0] == 403
+    assert page.get(f"/ws?token={wrong}", **SOCKET)[0] == 403
+    assert page.get("/?token=%C3%A9%FF%00")[0] == 403
+    assert page.get("/paraview/", "POST")[0] == 403
+    assert page.token.encode() not in page.get("/")[2]
+
+
+def test_the_token_opens_the_page_and_its_cookie_the_rest(serve, tmp_path):
+    page = serve(written(tmp_path / "run"))
+
+    code, headers, _ = page.get(f"/?token={page.token}")
+    assert code == 302
+    assert "HttpOnly" in headers["Set-Cookie"]
+    assert "SameSite=Strict" in headers["Set-Cookie"]
+    assert page.get(f"/index.html?token={page.token}")[0] == 200
+    code, headers, body = page.get("/vue.global.js", Cookie=page.cookie())
+    assert code == 200
+    assert len(body) > 10000
+    assert headers["Content-Security-Policy"].startswith("default-src 'self'; ")
+    assert headers["Referrer-Policy"] == "no-referrer"
+    assert page.get("/ws", Cookie=page.cookie(), **SOCKET)[0] == 101
+    assert page.get("/../../../../../../etc/passwd", Cookie=page.cookie())[0] == 404
+    assert page.get("/nothing", Cookie=page.cookie())[0] == 404
+
+
+def test_other_names_and_other_sites_are_refused_with_the_token_too(serve, tmp_path):
+    page = serve(written(tmp_path / "run"))
+    cookie, path = page.cookie(), "/vue.global.js"
+
+    for host in (
+        "evil.example",
+        f"evil.example:{page.port}",
+        "127.0.0.1.evil.example",
+        "10.1.2.3",
+        "",
+        "a@b:c",
+    ):
+        assert page.get(path, Cookie=cookie, Host=host)[0] in (400, 403), host
+        assert page.get(f"{path}?token={page.token}", Host=host)[0] in (400, 403), host
+    for host in (f"localhost:{page.port}", "127.0.0.1:1", "[::1]:9", "LOCALHOST"):  # behind ssh -L
+        assert page.get(path, Cookie=cookie, Host=host)[0] == 200, host
+    ours = f"127.0.0.1:{page.port}"
+    assert page.get("/ws", Cookie=cookie, Origin="http://evil.example", **SOCKET)[0] == 403
+    assert page.get("/ws", Cookie=cookie, Origin="null", **SOCKET)[0] == 403
+    assert page.get("/ws", Cookie=cookie, Origin="http://127.0.0.1:1", **SOCKET)[0] == 403
+    assert page.get("/ws", Cookie=cookie, Origin=f"http://{ours}", **SOCKET)[0] == 101
+
+
+def test_another_address_only_when_asked_for(serve, tmp_path):
+    folder = written(tmp_path / "run")
+    own, all_ = serve(folder), serve(folder, "--host", "0.0.0.0")
+
+    assert own.url.startswith(f"http://127.0.0.1:{own.port}/?token=")
+    assert len(own.token) >= 30
+    assert own.token != all_.token
+    assert own.process.stdout.readline() == "Ctrl-C ends\n"
+    assert "other machines" in all_.process.stdout.readline()
+    assert all_.get("/index.html?token=" + all_.token, Host="192.168.7.8")[0] == 200
+    assert all_.get("/index.html?token=" + all_.token, Host="evil.example")[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("host", "local"),
+    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("127.9.9.9", True), ("0.0.0.0", False)],
+)
+def test_what_is_local(host, local):
+    assert is_loopback(host) is local
+    assert Access("token", host).watching == 0
+
+
+def test_the_port_is_that_asked_for_and_only_once(serve, tmp_path):
+    from launch import lyra
+
+    page = serve(written(tmp_path / "run"))
+    left = lyra(["view", tmp_path / "run", "--port", page.port], tmp_path)
+
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert f"--port: 127.0.0.1:{page.port} cannot be used: Address already in use" in left.ours[0]
+    page.process.terminate()
+    page.process.wait(PATIENCE)
+    assert serve(tmp_path / "run", "--port", str(page.port)).port == page.port

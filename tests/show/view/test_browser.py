@@ -1,0 +1,248 @@
+"""The page in a real browser: it loads, plays, and does what is clicked."""
+
+import io
+import json
+import time
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from written_run import Writer, written
+
+pytestmark = pytest.mark.slow
+
+PATIENCE = 60.0
+"""Seconds; the browser draws by software, on a machine that may have other work."""
+
+
+class Seen:
+    """What is on the page."""
+
+    def __init__(self, browser, url):
+        from selenium.webdriver.common.by import By
+
+        self.browser, self._by = browser, By
+        browser.get("about:blank")
+        for log in ("browser", "performance"):
+            browser.get_log(log)
+        browser.get(url)
+        self.until(lambda: self.text("clock"))
+        self.until(lambda: self.has_cloth(self.picture()))
+
+    def element(self, name):
+        return self.browser.find_element(self._by.ID, name)
+
+    def elements(self, selector):
+        return self.browser.find_elements(self._by.CSS_SELECTOR, selector)
+
+    def text(self, name):
+        from selenium.common.exceptions import WebDriverException
+
+        try:
+            return self.element(name).text
+        except WebDriverException:  # not there yet
+            return ""
+
+    def time(self):
+        """The time shown [s]."""
+        return float(self.text("clock").split()[2])
+
+    def picture(self):
+        """(height, width, 3) what is drawn of the cloth."""
+        from PIL import Image
+
+        (view,) = self.elements(".picture")
+        return np.asarray(Image.open(io.BytesIO(view.screenshot_as_png)).convert("RGB")).astype(int)
+
+    @staticmethod
+    def has_cloth(picture):
+        """Whether a good part of the picture is not the background."""
+        background = picture[2, 2]
+        return bool((np.abs(picture - background).max(axis=2) > 20).mean() > 0.02)
+
+    def until(self, condition):
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            if condition():
+                return
+            assert time.monotonic() < deadline, "the page does not get there"
+            time.sleep(0.05)
+
+    def until_drawn(self, before, differs=True):
+        """Wait for another picture than ``before``."""
+
+        def is_other():
+            now = self.picture()
+            return now.shape != before.shape or np.abs(now - before).mean() > 0.05
+
+        self.until(lambda: is_other() == differs)
+
+    def choose(self, list_name, words):
+        self.elements(f".v-select:has(#{list_name})")[0].click()
+        items = ".v-overlay--active .v-list-item"
+        self.until(lambda: any(item.text == words for item in self.elements(items)))
+        next(item for item in self.elements(items) if item.text == words).click()
+        self.until(lambda: not self.elements(items))
+
+    def complaints(self):
+        """What the browser's console says above a mere note."""
+        return [line for line in self.browser.get_log("browser") if line["level"] not in ("INFO", "DEBUG")]
+
+    def asked_elsewhere(self, url):
+        """Addresses asked for that are not those of our server."""
+        events = [json.loads(line["message"])["message"] for line in self.browser.get_log("performance")]
+        asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
+        asked += [e["params"]["url"] for e in events if e["method"] == "Network.webSocketCreated"]
+        assert len(asked) > 5
+        ours = urlsplit(url).netloc
+        return [
+            a for a in asked if urlsplit(a).netloc != ours and not a.startswith(("data:", "blob:", "about:"))
+        ]
+
+
+def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    page = serve(written(tmp_path / "run", states=9))  # 0.1 s apart; unfinished: begins at the newest
+    seen = Seen(browser, page.url)
+    assert seen.text("title") == "run"
+    assert "8 vertices · 9 states" in seen.text("status")
+    assert browser.title == "run – lyra_petsc"
+    for plot in ("energies", "iterations"):
+        seen.until(lambda plot=plot: len(seen.elements(f"#{plot} .scatterlayer path.js-line")) >= 2)
+    last = seen.picture()
+    assert seen.time() == pytest.approx(0.8)
+
+    # plays: the picture and the time change, and it stops at the end
+    seen.choose("speed", "0.1 ×")
+    seen.element("play").click()
+    seen.until(lambda: seen.time() < 0.7)
+    seen.until_drawn(last)
+    seen.choose("speed", "4 ×")
+    seen.until(lambda: seen.time() == pytest.approx(0.8))
+    seen.until_drawn(last, differs=False)
+
+    # to the first state and back by the slider
+    seen.element("first").click()
+    seen.until(lambda: seen.time() == 0.0)
+    seen.until_drawn(last)
+    first = seen.picture()
+    (thumb,) = seen.elements(".v-slider-thumb")
+    thumb.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    seen.until(lambda: seen.time() == pytest.approx(0.3))
+    seen.until_drawn(first)
+    thumb.send_keys(Keys.END)
+    seen.until(lambda: seen.time() == pytest.approx(0.8))
+
+    # orbit, and back
+    before = seen.picture()
+    (view,) = seen.elements(".picture canvas")
+    drag = ActionChains(browser, duration=10).move_to_element(view).click_and_hold()  # [ms] as a hand moves
+    for _ in range(10):
+        drag.move_by_offset(12, 5)
+    drag.release().perform()
+    seen.until_drawn(before)
+    seen.element("fit").click()
+    seen.until_drawn(before, differs=False)
+
+    # another quantity, another unit; and none
+    assert "speed [m/s]" in seen.text("colours")
+    before = seen.picture()
+    seen.choose("quantity", "stress")
+    seen.until(lambda: "[N/m]" in seen.text("colours"))
+    seen.until_drawn(before)
+    seen.choose("quantity", "none")
+    seen.until(lambda: not seen.elements("#colours"))
+    seen.until(lambda: seen.has_cloth(seen.picture()))
+    before = seen.picture()
+    seen.element("edges").click()
+    seen.until_drawn(before)
+
+    assert seen.complaints() == []
+    assert seen.asked_elsewhere(page.url) == []
+
+
+def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
+    writer = Writer(tmp_path / "run")
+    writer.write()
+    page = serve(tmp_path / "run")
+    seen = Seen(browser, page.url)
+    assert "1 states" in seen.text("status")
+    before = seen.picture()
+    for _ in range(3):
+        writer.write()
+    seen.until(lambda: "4 states" in seen.text("status"))
+    seen.until(lambda: seen.time() == pytest.approx(0.3))
+    seen.until_drawn(before)
+
+    for file in (tmp_path / "run").iterdir():
+        file.unlink()
+    seen.until(lambda: "is not the folder of a run" in seen.text("notice"))
+
+    # another run takes its place, with fewer states and without velocities
+    writer = Writer(tmp_path / "run", fields=False)
+    writer.write()
+    writer.write()
+    seen.until(lambda: "2 states" in seen.text("status"))
+    seen.until(lambda: not seen.elements("#notice"))
+    seen.until(lambda: not seen.elements("#colours"))
+    seen.element("first").click()
+    seen.until(lambda: seen.time() == 0.0)
+    seen.until(lambda: seen.has_cloth(seen.picture()))
+    assert seen.complaints() == []
+
+
+def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(browser, tmp_path):
+    from lyra_petsc.show.view.live import LivePage
+
+    writer = Writer(tmp_path / "run")
+    writer.write()
+    told = []
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "run")
+    try:
+        while not told:
+            time.sleep(0.1)
+        seen = Seen(browser, told[0])
+        writer.write()
+    finally:
+        page.end()
+    seen.until(lambda: f"later: lyra-petsc view {tmp_path / 'run'}" in seen.text("notice"))
+    assert seen.time() == pytest.approx(0.1)
+    seen.element("first").click()
+    seen.until(lambda: seen.time() == 0.0)
+    assert "The run has ended" in seen.text("notice")
+    assert seen.complaints() == []
+
+
+@pytest.mark.parametrize("width", [1280, 820, 420])
+def test_nothing_lies_over_another_at_any_width(serve, browser, tmp_path, width):
+    page = serve(written(tmp_path / "run"))
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        seen = Seen(browser, page.url)
+        boxes = {}
+        for selector in (".bar", ".picture", "#colours", "#energies", "#iterations", ".time"):
+            for box in (element.rect for element in seen.elements(selector) if element.is_displayed()):
+                boxes[selector] = (box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"])
+        assert len(boxes) >= 5
+        for name, (left, top, right, bottom) in boxes.items():
+            assert -0.5 <= left < right <= width + 0.5, name
+            assert -0.5 <= top < bottom <= 800.5, name
+            for other, (l2, t2, r2, b2) in boxes.items():
+                apart = right <= l2 + 0.5 or r2 <= left + 0.5 or bottom <= t2 + 0.5 or b2 <= top + 0.5
+                assert name == other or apart, f"{name} and {other}"
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        clock = seen.element("clock")
+        assert browser.execute_script("return arguments[0].scrollWidth <= arguments[0].clientWidth", clock)
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_a_browser_without_the_token_sees_nothing(serve, browser, tmp_path):
+    page = serve(written(tmp_path / "run"))
+    browser.get(page.url.partition("?")[0] + "?token=guess")
+    assert "403" in browser.page_source
+    assert "canvas" not in browser.page_source

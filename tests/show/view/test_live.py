@@ -1,0 +1,164 @@
+"""``run --live``: the page comes, follows, and goes with the run however that ends."""
+
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from launch import SCENE, done, finish, lyra, start, write_scene
+from written_run import Writer
+
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.show.view.live import NICENESS, LivePage
+
+SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
+"""The same without an end in sight."""
+
+PATIENCE = 60.0
+
+
+def pages(folder):
+    """Processes that serve the page of a run started in ``folder``."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            words = entry.joinpath("cmdline").read_bytes().split(b"\0")
+            if b"lyra_petsc.show.view.live" in words and entry.joinpath("cwd").readlink() == folder.resolve():
+                found.append(int(entry.name))
+        except (OSError, ValueError):  # no process, or gone meanwhile
+            continue
+    return found
+
+
+def until(condition, what):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def address(process):
+    """Where the page is, as soon as the run says so."""
+    told = []
+    for line in process.stderr:
+        told.append(line)
+        found = re.match(r"view: (http://127\.0\.0\.1:\d+/\?token=\S+)$", line)
+        if found:
+            return found[1]
+    pytest.fail("no page:\n" + "".join(told))
+
+
+@pytest.fixture(autouse=True)
+def in_its_folder(tmp_path, monkeypatch):
+    pytest.importorskip("trame")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL), (3, signal.SIGTERM)])
+def test_the_page_goes_with_the_run(tmp_path, ranks, number):
+    write_scene(tmp_path, SLOW)
+    process = start(
+        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path, ranks
+    )
+    try:
+        address(process)
+        assert len(pages(tmp_path)) == 1
+        os.killpg(process.pid, number)
+        until(lambda: not pages(tmp_path), "the page outlives its run")
+    finally:
+        finish(process)
+    assert len(Run(tmp_path / "out")) > 1
+
+
+@pytest.mark.slow
+def test_resume_has_a_page_too(tmp_path):
+    write_scene(tmp_path)
+    done(["run", "scene.yaml", "--out", tmp_path / "out"], tmp_path)
+    settings = ["--set", "time.end=500", "--resume", "--live", "--no-browser"]
+    process = start(["run", "scene.yaml", "--out", tmp_path / "out", *settings], tmp_path)
+    try:
+        assert "token=" in address(process)
+    finally:
+        os.killpg(process.pid, signal.SIGINT)
+        assert finish(process).code == 130
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+@pytest.mark.slow
+def test_a_run_that_fails_leaves_no_page(tmp_path):
+    # the launcher must not wait for the page, nor the page for ever
+    write_scene(tmp_path, SCENE)
+    options = ["-snes_max_it", "1", "-snes_rtol", "1e-15", "-snes_stol", "0", "-ts_adapt_dt_min", "0.01"]
+    left = lyra(
+        ["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser", *options], tmp_path
+    )
+    assert left.code == 3
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+def test_a_run_ends_as_without_a_page(tmp_path):
+    write_scene(tmp_path)
+    left = done(["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path)
+
+    assert len(Run(tmp_path / "out")) == 4
+    assert Run(tmp_path / "out").finished
+    assert "note: no page" not in left.err
+    assert f"lyra-petsc view {tmp_path / 'out'}" in left.out
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+
+
+def test_a_port_in_use_is_told_before_anything_is_written(tmp_path):
+    import socket
+
+    write_scene(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        left = lyra(["run", "scene.yaml", "--out", "out", "--live", "--port", port], tmp_path)
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert "Address already in use" in left.ours[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_page_that_cannot_be_served_is_told(tmp_path):
+    told = []
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "nowhere")
+    until(lambda: told, "nothing is said")
+    page.end()
+    assert "nowhere: no such folder" in told[0]
+
+
+def test_the_page_stays_while_it_is_open_and_goes_with_the_last_who_looks(tmp_path):
+    import http.client
+    from urllib.parse import urlsplit
+
+    writer = Writer(tmp_path / "run")
+    writer.write()
+    told = []
+    page = LivePage("127.0.0.1", 0, told.append, told.append)
+    page.show(tmp_path / "run")
+    until(lambda: told, "nothing is said")
+    (process,) = pages(tmp_path)
+    assert os.getpriority(os.PRIO_PROCESS, process) >= NICENESS
+    group = Path(f"/proc/{process}/autogroup")  # where Linux shares the time out among sessions
+    if group.exists() and group.read_text().strip():
+        assert group.read_text().endswith(f"nice {NICENESS}\n")
+    url = urlsplit(told[0])
+    connection = http.client.HTTPConnection("127.0.0.1", url.port, timeout=20)
+    headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    connection.request(
+        "GET", "/ws?" + url.query, headers=headers | {"Sec-WebSocket-Key": "c29tZSBub25zZW5zZSAgIA=="}
+    )
+    assert connection.getresponse().status == 101
+
+    page.end()
+    time.sleep(6.0)
+    assert pages(tmp_path), "the page left those who look"
+    connection.close()
+    connection.sock = None
+    until(lambda: not pages(tmp_path), "the page outlives its run")
+    assert len(told) == 1

@@ -1,0 +1,117 @@
+"""``view`` as a program: how it begins and ends."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from launch import PATIENCE, environment, finish, lyra
+from written_run import Writer, written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere"], "nowhere: no such folder"),
+        (["."], ".: is not the folder of a run"),
+        (["file"], "file: is a file"),
+        (["run", "--host", "192.0.2.1"], "--host: 192.0.2.1 is no address of this machine"),
+        (["run", "--host", ""], "--host: '' is no address of this machine"),
+        (["run", "--port", "70000"], "--port"),
+        (["run", "--port", "x"], "--port"),
+        (["run", "--prot", "1"], "--prot: no such option"),
+        (["empty"], "empty: no state is written yet"),
+        (["cut"], "cannot be read"),
+        ([], "Missing argument 'RUN'"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, arguments, says):
+    pytest.importorskip("trame")
+    written(tmp_path / "run")
+    (tmp_path / "file").touch()
+    Writer(tmp_path / "empty")
+    (tmp_path / "empty" / "run.lock").touch()
+    (written(tmp_path / "cut") / "states-0000.h5").write_bytes(b"HDF")
+
+    left = lyra(["view", *arguments], tmp_path)
+
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert says in left.ours[0]
+    assert left.out == ""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_a_signal_ends_it_without_a_traceback(serve, tmp_path, number, code):
+    page = serve(written(tmp_path / "run"))
+    page.process.send_signal(number)
+    left = finish(page.process)
+
+    assert left.code == code
+    assert "Traceback" not in left.err
+    assert left.ours == ([] if code == 0 else ["lyra-petsc: ended by SIGTERM"])
+
+
+def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
+    folder = written(tmp_path / "run")
+    page = serve(folder, ranks=2)
+    assert page.get("/?token=" + page.token)[0] == 302
+    assert page.get("/")[0] == 403
+    page.process.send_signal(signal.SIGINT)
+    finish(page.process)
+
+    left = lyra(["view", "nowhere"], tmp_path, ranks=2)
+    assert left.code == 2
+    assert len(left.ours) == 1
+
+
+def test_a_missing_package_is_one_line(tmp_path):
+    program = (
+        "import sys, importlib.util as u; real = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name == 'trame_vtk' else real(name, *rest);"
+        "from lyra_petsc.cli.app import run_command_line;"
+        f"sys.exit(run_command_line(['lyra-petsc', 'view', {str(written(tmp_path / 'run'))!r}]))"
+    )
+    left = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+
+    assert left.returncode == 2
+    assert left.stderr == (
+        "lyra-petsc: view: trame_vtk is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
+    )
+
+
+@pytest.mark.parametrize("option", [["--host", "127.0.0.1"], ["--port", "0"], ["--no-browser"]])
+def test_options_of_the_page_without_a_page(tmp_path, option):
+    left = lyra(["run", *option], tmp_path)
+
+    assert left.code == 2
+    assert len(left.ours) == 1
+    assert f"{option[0]}: says where the page of --live is" in left.ours[0]
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("variables", "opened"),
+    [({}, False), ({"DISPLAY": ":0"}, True), ({"WAYLAND_DISPLAY": "w"}, True), ({"BROWSER": "b"}, True)],
+)
+def test_a_browser_is_opened_where_there_is_a_desktop(monkeypatch, variables, opened):
+    import webbrowser
+
+    from lyra_petsc.show.view import server
+
+    asked = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
+    monkeypatch.setattr(server.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert server.open_browser("http://127.0.0.1:1/") is opened
+    assert asked == ["http://127.0.0.1:1/"] * opened

@@ -1,0 +1,286 @@
+"""Stencils that change as the sheet moves, by a term that lives in the tests: vertices repel each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import CLOTH, gathered, grid, scene_of
+from repulsion_term import DISTANCE, REPULSION, Repulsion
+
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.terms import registry
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+GAP = 0.11
+"""Between the sheets at first [m]: more than the distance at which they feel each other."""
+
+LOWER = grid(0.6, 0.4, 5, 4, "alternating")
+UPPER = grid(0.55, 0.4, 4, 4) | {"transform": {"translate": [0.03, 0.01, GAP]}}
+
+SCENE: dict[str, Any] = {
+    "mesh": [LOWER, UPPER],
+    "material": CLOTH | {"bending": 1e-4},
+    "time": {"end": 0.06, "step": 0.002},
+}
+TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+SPEED = 2.0
+"""Of either sheet towards the other [m/s]."""
+
+
+@pytest.fixture(autouse=True)
+def repulsion(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Every scene has the term."""
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "REGISTRY", [*registry.REGISTRY, REPULSION])
+        yield
+
+
+def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> Simulation:
+    """Two sheets that fly at each other."""
+    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
+    system = simulation.model.system
+    n = system.points.n_owned
+    v = np.zeros((n, 3))
+    v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, -SPEED, SPEED)
+    system.state.set(system.x[:n].copy(), v)
+    simulation.ledger.measure()
+    simulation.stepper.start(0.0, 0)
+    return simulation
+
+
+def term_of(simulation: Simulation) -> Repulsion:
+    term = simulation.model.terms["repulsion"]
+    assert isinstance(term, Repulsion)
+    return term
+
+
+def momentum(simulation: Simulation) -> Array:
+    """(3,) [kg m/s]."""
+    system = simulation.model.system
+    n = system.points.n_owned
+    return np.asarray(system.points.summed(*(system.mass @ system.v[:n])))
+
+
+def flown(
+    comm: MPI.Comm,
+    scene: dict[str, Any],
+    watch: Callable[[Simulation], None] = lambda simulation: None,
+    **petsc: Any,
+) -> tuple[Array, float, float]:
+    """Positions in mesh order, mean upward speed of the upper sheet, and most pairs, of a whole run."""
+    database = PETSc.Options()
+    for name, value in petsc.items():
+        database[name] = value
+    simulation = thrown(comm, scene)
+    pairs = 0.0
+    while not simulation.finished:
+        simulation.step()
+        watch(simulation)
+        pairs = max(pairs, simulation.ledger.columns()["pairs"])
+    layout = simulation.model.points
+    x, v = (gathered(layout, rows) for rows in (simulation.model.system.x, simulation.model.system.v))
+    for name in [*petsc, *simulation.stepper.our_options]:
+        database.delValue(name)
+    simulation.destroy()
+    return x, float(v[30:, 2].mean()), pairs
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
+def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
+    def watch(simulation: Simulation) -> None:
+        system, term = simulation.model.system, term_of(simulation)
+        force = np.zeros((system.points.n_local, 3))
+        term.add_gradient(system.x, None, force)
+        own = force[: system.points.n_owned]
+        largest = comm.allreduce(float(np.abs(own).max(initial=0.0)), MPI.MAX)
+        total = np.asarray(system.points.summed(*own.sum(axis=0)))
+        assert np.abs(total).max() <= 1e-13 * max(largest, 1e-3)
+        assert np.abs(momentum(simulation) - before).max() < 1e-9
+
+    scene = {"time": SCENE["time"] | {"integrator": integrator}}
+    start = thrown(comm, scene)
+    before = momentum(start)
+    start.destroy()
+    tight = {"ksp_rtol": 1e-12} if integrator == "semi-implicit" else {}
+    _, speed, pairs = flown(comm, scene, watch, **tight)
+    assert pairs > 20
+    assert speed > (0.3 if integrator in ("beuler", "semi-implicit") else 0.6) * SPEED
+
+
+def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None:
+    nearest: list[float] = []
+
+    def watch(simulation: Simulation) -> None:
+        nearest.append(simulation.ledger.columns()["nearest"])
+        assert simulation.model.system.limits_step
+
+    flown(comm, {"time": {"end": 0.06, "step": 0.02}}, watch)
+    assert 0.0 < min(nearest) < DISTANCE
+
+
+def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
+    x, _, pairs = flown(comm, {})
+    alone = comm.Split(comm.rank)
+    single, _, serial_pairs = flown(alone, {})
+    alone.Free()
+    assert pairs == serial_pairs
+    np.testing.assert_allclose(x, single, rtol=0.0, atol=1e-8)
+
+
+SOLVERS: dict[str, dict[str, Any]] = {
+    "block Jacobi": {"pc_type": "pbjacobi"},
+    "incomplete factors": {"pc_type": "bjacobi", "sub_pc_type": "ilu", "mat_type": "baij"},
+    "our multigrid": {"pc_type": "mg", "pc_mg_levels": 2},
+    "algebraic multigrid": {"pc_type": "gamg"},
+    "direct": {"pc_type": "cholesky"},
+    "assembled operator": {"pc_type": "pbjacobi", "mat_type": "aij"},
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
+    time = {"time": SCENE["time"] | {"end": 0.03}}
+    x = flown(comm, time)[0]
+    np.testing.assert_allclose(flown(comm, time, ksp_rtol=1e-8, **SOLVERS[name])[0], x, rtol=0.0, atol=2e-8)
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "alpha2"])
+def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str) -> None:
+    time = {"end": 0.05, "step": "auto", "tolerance": 2e-3, "integrator": integrator}
+    _, speed, pairs = flown(comm, {"time": time})
+    assert pairs > 20
+    assert speed > 0.3 * SPEED
+
+
+def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
+    """Statics: the forces between the sheets carry the load on the upper one."""
+    pressed = {
+        "mesh": [LOWER | {"name": "lower"}, UPPER | {"transform": {"translate": [0.03, 0.01, 0.07]}}],
+        "handles": [
+            {"box": [[-1, -1, -1], [2, 2, 0.01]]},
+            {"box": [[-1, -1, 0.01], [2, 2, 1]], "axes": ["x", "y"]},
+        ],
+        "loads": [{"box": [[-1, -1, 0.01], [2, 2, 1]], "force": [0, 0, -3.0]}],
+        "time": {"analysis": "static", "end": 1.0, "step": 0.5},
+    }
+    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | pressed))
+    while not simulation.finished:
+        simulation.step()
+    system = simulation.model.system
+    force = np.zeros((system.points.n_local, 3))
+    term_of(simulation).add_gradient(system.x, None, force)
+    upper = system.x[: system.points.n_owned, 2] > 0.01
+    (carried,) = system.points.summed(float(-force[: system.points.n_owned][upper, 2].sum()))
+    assert carried == pytest.approx(3.0, rel=1e-6)
+    simulation.destroy()
+
+
+def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulation = thrown(comm, {"time": {"end": 1.0, "step": 1e-4}})
+    searches = []
+    term, search = term_of(simulation), Repulsion.neighbours
+    monkeypatch.setattr(
+        term, "neighbours", lambda x, numbers: (searches.append(1), search(term, x, numbers))[1]
+    )
+    simulation.step()
+    searches.clear()
+    matrices = simulation.stepper.linear.operator
+    for _ in range(10):  # 2 mm, while half the skin is 10
+        simulation.step()
+    assert searches == []
+    assert simulation.stepper.linear.operator is matrices
+    simulation.destroy()
+
+
+def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    folder = shared_tmp / "run"
+    simulation = thrown(comm, {})
+    recorder = Recorder(simulation)
+    if comm.rank == 0:
+        folder.mkdir()
+    comm.Barrier()
+    recorder.begin(folder)
+    for _ in range(18):  # the sheets touch
+        recorder.record(simulation.step())
+    recorder.write_checkpoint()
+    recorder.settle()
+    recorder.close()
+    touched = gathered(simulation.model.points, term_of(simulation).state()["touched"])
+    assert touched.max() > 1.0
+    while not simulation.finished:
+        simulation.step()
+    x = gathered(simulation.model.points, simulation.model.system.x)
+    at_end = gathered(simulation.model.points, term_of(simulation).state()["touched"])
+    simulation.destroy()
+    if comm.rank == 0:
+        header, *rows = (folder / "history.csv").read_text().splitlines()
+        assert header.endswith("wall_seconds,repulsion_energy,pairs,nearest")
+        assert float(rows[-1].split(",")[-3]) > 0.0
+    few = comm.Split(0 if comm.rank == 0 else 1)
+    if comm.rank == 0:
+        resumed = Simulation(few, scene_of(SCENE | {"solver": TIGHT}))
+        again = Recorder(resumed)
+        again.resume(folder)
+        kept = gathered(resumed.model.points, term_of(resumed).state()["touched"])
+        np.testing.assert_array_equal(kept, touched)
+        while not resumed.finished:
+            again.record(resumed.step())
+        again.settle()
+        again.close()
+        np.testing.assert_allclose(
+            gathered(resumed.model.points, resumed.model.system.x), x, rtol=0, atol=1e-8
+        )
+        np.testing.assert_array_equal(
+            gathered(resumed.model.points, term_of(resumed).state()["touched"]), at_end
+        )
+        resumed.destroy()
+    few.Free()
+    comm.Barrier()
+
+
+def test_derivatives(comm: MPI.Comm) -> None:
+    """Gradient and Hessian against differences, in the assembled matrix, where the sheets are near."""
+    simulation = thrown(comm, {})
+    system = simulation.model.system
+    for _ in range(12):
+        simulation.step()
+    layout, term = system.points, term_of(simulation)
+    system.discretisation.renew_pattern()
+    rng = np.random.default_rng(2)
+    random = rng.standard_normal((layout.n_vertices_global, 3))
+    way = np.zeros((layout.n_local, 3))
+    way[: layout.n_owned] = random[layout.original]
+    layout.update_ghosts(way)
+    x, n, h = system.x.copy(), layout.n_owned, 1e-6
+
+    def energy(at: Array) -> float:
+        return float(comm.allreduce(float(term.energies(at, None).sum())))
+
+    def gradient(at: Array) -> Array:
+        out = np.zeros_like(at)
+        term.add_gradient(at, None, out)
+        return out[:n]
+
+    assert energy(x) > 0.0
+    slope = comm.allreduce(float(np.vdot(gradient(x), way[:n])))
+    assert slope == pytest.approx((energy(x + h * way) - energy(x - h * way)) / (2 * h), rel=1e-6)
+    rows = system.discretisation.rows
+    values = rows.zeros()
+    term.add_hessian(x, None, 0.0, np.ones(term.n_elements), rows.pattern.offsets, values)
+    product = rows.product(values, way)
+    largest = comm.allreduce(float(np.abs(product).max(initial=0.0)), MPI.MAX)
+    np.testing.assert_allclose(
+        product, (gradient(x + h * way) - gradient(x - h * way)) / (2 * h), rtol=0.0, atol=1e-5 * largest
+    )
+    simulation.destroy()

@@ -1,0 +1,242 @@
+"""Unknowns on edges, by a term that lives in the tests: in equilibrium it is a plain hinge."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from edge_angle_term import IN_PLACE_OF_HINGES
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import CLOTH, gathered, grid, rotation, scene_of
+
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.terms import registry
+from lyra_petsc.terms.term import Elastic
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+SCENE: dict[str, Any] = {
+    "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
+    "material": CLOTH | {"bending": 2e-2},
+    "gravity": [0, 0, -9.81],
+    "handles": [{"box": [[-1, -1, -1], [0.01, 1, 1]]}],
+}
+STEPS = {"end": 0.08, "step": 0.01}
+TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+INTEGRATORS = ("beuler", "midpoint", "bdf2", "alpha2")
+
+
+@pytest.fixture
+def on_edges(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Scenes bend by the term of the tests from here on."""
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
+        yield
+
+
+def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array, Array, Array, int]:
+    """Positions in mesh order, energies, reactions, and unknowns of edges after a whole run."""
+    database = PETSc.Options()
+    for name, value in petsc.items():
+        database[name] = value
+    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
+    while not simulation.finished:
+        simulation.step()
+    budget, layout = simulation.budget, simulation.model.points
+    energies = np.array([budget.kinetic, budget.membrane, budget.bending, budget.potential])
+    reactions = np.array(simulation.ledger.handle_forces(1))
+    found = gathered(layout, simulation.model.system.x), energies, reactions, layout.n_edges_global
+    for name in [*petsc, *simulation.stepper.our_options]:
+        database.delValue(name)
+    simulation.destroy()
+    return found
+
+
+def compare(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, scene: dict[str, Any], **petsc: Any) -> None:
+    """A run with unknowns on edges is the one with plain hinges."""
+    x, energies, reactions, edges = outcome(comm, scene)
+    assert edges == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
+        same = outcome(comm, scene, **petsc)
+    assert same[3] == 5 * 3 + 4 * 4 + 5 * 4  # interior edges: across, along, diagonal
+    np.testing.assert_allclose(same[0], x, rtol=0.0, atol=2e-8)
+    np.testing.assert_allclose(same[1], energies, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(same[2], reactions, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_motion_is_that_of_plain_hinges(
+    comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compare(comm, monkeypatch, {"time": STEPS | {"integrator": integrator}})
+
+
+def test_the_equilibrium_is_that_of_plain_hinges(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    compare(comm, monkeypatch, {"time": {"analysis": "static", "end": 1.0, "step": 0.25}})
+
+
+def test_one_linear_solve_a_step(comm: MPI.Comm, on_edges: None) -> None:
+    time = {"end": 0.01, "step": 1e-3, "integrator": "semi-implicit"}
+    x, energies, _, edges = outcome(comm, {"time": time}, ksp_rtol=1e-10)
+    exact = outcome(comm, {"time": time | {"integrator": "beuler"}})
+    assert edges > 0
+    np.testing.assert_allclose(x, exact[0], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(energies[2], exact[1][2], rtol=0.05)
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "alpha2"])
+def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    time = {"end": 0.05, "step": "auto", "tolerance": 5e-3, "integrator": integrator}
+    compare(comm, monkeypatch, {"time": time})
+
+
+SOLVERS: dict[str, dict[str, Any]] = {
+    "block Jacobi": {"pc_type": "pbjacobi"},
+    "incomplete factors": {"pc_type": "bjacobi", "sub_pc_type": "ilu", "mat_type": "baij"},
+    "our multigrid": {"pc_type": "mg", "pc_mg_levels": 2},
+    "algebraic multigrid": {"pc_type": "gamg"},
+    "direct": {"pc_type": "cholesky"},
+    "assembled operator": {"pc_type": "pbjacobi", "mat_type": "baij"},
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_linear_solver(comm: MPI.Comm, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    compare(comm, monkeypatch, {"time": STEPS | {"end": 0.03}}, ksp_rtol=1e-8, **SOLVERS[name])
+
+
+def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> None:
+    """Δ(kinetic + potential) = −½‖Δv‖² + E(x₁) − E(x₀) − ∇E(x₁)·Δx, of vertices and edges."""
+    simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS, "solver": TIGHT}))
+    system = simulation.model.system
+    n, elastic = system.points.n_owned, system.elastic
+
+    def energy(x: Array) -> float:
+        return sum(float(term.energies(x, system.frozen[term]).sum()) for term in elastic)
+
+    for _ in range(4):
+        x0, v0, before = system.x.copy(), system.v.copy(), simulation.budget.total
+        simulation.step()
+        gradient = np.zeros_like(system.x)
+        for term in elastic:
+            term.add_gradient(system.x, system.frozen[term], gradient)
+        lost = 0.5 * np.sum(system.mass[:, None] * (system.v[:n] - v0[:n]) ** 2)
+        bracket = energy(system.x) - energy(x0) - np.vdot(gradient[:n], (system.x - x0)[:n])
+        expected = comm.allreduce(float(bracket - lost))
+        assert simulation.budget.total - before == pytest.approx(expected, abs=1e-10)
+        # a moment on no edge, and none of them has moved by chance
+        of_edges = gradient[:n].ravel()[system.points.edge_places]
+        assert comm.allreduce(float(np.abs(of_edges).max(initial=0.0)), MPI.MAX) < 1e-8
+        angles = system.x[:n].ravel()[system.points.edge_places]
+        assert comm.allreduce(float(np.abs(angles).max(initial=0.0)), MPI.MAX) > 1e-5
+    simulation.destroy()
+
+
+def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
+    """Gradient and Hessian against differences, with both kinds of unknowns, in the assembled matrix."""
+    simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS}))
+    system, layout = simulation.model.system, simulation.model.points
+    term = simulation.model.terms["edge-angle"]
+    assert isinstance(term, Elastic)
+    turn = rotation([1.0, 2.0, 0.5], 0.9)
+
+    def local(seed: int, size: float) -> Array:
+        random = np.random.default_rng(seed)
+        on_vertices = size * random.uniform(-1, 1, (layout.n_vertices_global, 3))[layout.original]
+        on_edges = size * random.uniform(-1, 1, layout.n_edges_global)[layout.edges]
+        out = np.zeros((layout.n_local, 3))
+        out[: layout.n_owned] = layout.joined(on_vertices, on_edges)
+        layout.update_ghosts(out)
+        return out
+
+    x, way = system.x @ turn.T + local(1, 0.02), local(2, 1.0)
+
+    def energy(at: Array) -> float:
+        return float(comm.allreduce(float(term.energies(at, None).sum())))
+
+    def gradient(at: Array) -> Array:
+        out = np.zeros_like(at)
+        term.add_gradient(at, None, out)
+        return out[: layout.n_owned]
+
+    h = 1e-4
+    slope = comm.allreduce(float(np.vdot(gradient(x), way[: layout.n_owned])))
+    numeric = (
+        8 * (energy(x + h * way) - energy(x - h * way)) - energy(x + 2 * h * way) + energy(x - 2 * h * way)
+    ) / (12 * h)
+    assert slope == pytest.approx(numeric, rel=1e-7)
+    rows = system.discretisation.rows
+    for blend in (0.0, 1.0):
+        values = rows.zeros()
+        term.add_hessian(x, None, blend, np.ones(term.n_elements), rows.pattern.offsets, values)
+        product = rows.product(values, way)
+        if blend == 0.0:
+            difference = 8 * (gradient(x + h * way) - gradient(x - h * way))
+            difference -= gradient(x + 2 * h * way) - gradient(x - 2 * h * way)
+            largest = comm.allreduce(float(np.abs(product).max(initial=0.0)), MPI.MAX)
+            np.testing.assert_allclose(product, difference / (12 * h), rtol=0.0, atol=1e-6 * largest)
+        else:
+            assert comm.allreduce(float(np.vdot(product, way[: layout.n_owned]))) > 0.0
+    vertices = layout.are_vertices(layout.global_number)
+    moved = system.x.copy()
+    moved[vertices] = moved[vertices] @ turn.T + [1.0, 2.0, 3.0]
+    assert energy(moved) < 1e-20
+    simulation.destroy()
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_run_goes_on_with_other_ranks(
+    comm: MPI.Comm, integrator: str, on_edges: None, shared_tmp: Path
+) -> None:
+    scene = SCENE | {"time": STEPS | {"integrator": integrator}, "solver": TIGHT}
+    whole = outcome(comm, scene)[0]
+    folder = shared_tmp / "run"
+    simulation = Simulation(comm, scene_of(scene))
+    recorder = Recorder(simulation)
+    if comm.rank == 0:
+        folder.mkdir()
+    comm.Barrier()
+    recorder.begin(folder)
+    for _ in range(4):
+        recorder.record(simulation.step())
+    recorder.write_checkpoint()
+    recorder.settle()
+    recorder.close()
+    simulation.destroy()
+    # on one rank if they were several, else on this one again
+    few = comm.Split(0 if comm.rank == 0 else 1)
+    if comm.rank == 0:
+        resumed = Simulation(few, scene_of(scene))
+        again = Recorder(resumed)
+        again.resume(folder)
+        assert resumed.step_number == 4
+        reports: list[StepReport] = []
+        while not resumed.finished:
+            reports.append(resumed.step())
+            again.record(reports[-1])
+        again.settle()
+        again.close()
+        np.testing.assert_allclose(
+            gathered(resumed.model.points, resumed.model.system.x), whole, rtol=0.0, atol=2e-8
+        )
+        resumed.destroy()
+    few.Free()
+    comm.Barrier()
+
+
+def test_without_it_there_are_no_unknowns_but_the_vertices(comm: MPI.Comm) -> None:
+    simulation = Simulation(comm, scene_of(SCENE))
+    layout = simulation.model.points
+    assert layout.n_owned == layout.n_vertices == len(layout.original)
+    assert len(layout.padding) == len(layout.edges) == layout.n_edges_global == 0
+    assert simulation.stepper.velocity.getSize() == 3 * layout.n_vertices_global
+    simulation.destroy()
