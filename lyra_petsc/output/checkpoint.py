@@ -19,11 +19,9 @@ from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, cannot_write, read_slab
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
 from lyra_petsc.parallel import on_root
 
-CHECKPOINT = "checkpoint.h5"
-PREVIOUS = "checkpoint-previous.h5"
-NEXT = "checkpoint-next.h5"
 FORMAT = 1
 
 Scalars = dict[str, Any]
@@ -141,17 +139,6 @@ def read_checkpoint(
         f"{newest.message}, and no earlier checkpoint can be used: run without --resume, into a new folder",
         file=newest.file,
     )
-
-
-def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = None) -> list[Path]:
-    """The checkpoints of a run that exist, newest first; with ``comm`` as rank 0 sees them."""
-
-    def work() -> list[Path]:
-        # a kill between the two replacements of a write leaves the newest under NEXT
-        files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
-        return [file for file in files if file.is_file()]
-
-    return work() if comm is None else on_root(comm, work) or []
 
 
 def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:

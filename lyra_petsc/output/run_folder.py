@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 RUNS = Path("runs")
 LOCK_FILE = "run.lock"
+CHECKPOINT = "checkpoint.h5"
+PREVIOUS = "checkpoint-previous.h5"
+NEXT = "checkpoint-next.h5"
 
 # what a run writes, and nothing else: --force removes no other file
 RESULT = re.compile(
@@ -31,6 +34,17 @@ RESULT = re.compile(
 
 EXISTS = "exists; name another folder, or give --resume to go on with its run or --force to replace it"
 NO_CHECKPOINT = "holds no checkpoint to resume from; run without --resume"
+
+
+def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = None) -> list[Path]:
+    """The checkpoints of a run that exist, newest first; with ``comm`` as rank 0 sees them."""
+
+    def work() -> list[Path]:
+        # a kill between the two replacements of a write leaves the newest under NEXT
+        files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
+        return [file for file in files if file.is_file()]
+
+    return work() if comm is None else on_root(comm, work) or []
 
 
 @dataclass(frozen=True)

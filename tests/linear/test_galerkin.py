@@ -62,9 +62,7 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
         rows = list(zip(hierarchy.levels, hierarchy.block_rows(values, mask), strict=True))
         for one, another, share in zip(rows, rows[1:], between, strict=False):
             (level, (of_fine, free)), (coarser, (of_coarse, coarse_free)) = one, another
-            fine, coarse = (
-                AssembledMatrix(at.points, at.pattern, "aij") for at in (level, coarser)
-            )
+            fine, coarse = (AssembledMatrix(at.points, at.pattern, "aij") for at in (level, coarser))
             fine.set(of_fine)
             coarse.set(of_coarse)
             interpolation = Interpolation(share, level, coarser)

@@ -56,7 +56,11 @@ def outcome(
             x = simulation.system.x[:n].copy()
             simulation.step(0.01)
             ledger.record(x)
-        return simulation.x, simulation.v, [value for key, value in vars(ledger.budget).items() if key != "more"]
+        return (
+            simulation.x,
+            simulation.v,
+            [value for key, value in vars(ledger.budget).items() if key != "more"],
+        )
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])

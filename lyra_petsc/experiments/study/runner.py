@@ -15,8 +15,8 @@ from lyra_petsc.experiments.study.case import Job, Result, Timing
 from lyra_petsc.experiments.study.combination import scene_of
 from lyra_petsc.experiments.study.folder import empty_case
 from lyra_petsc.mesh.build import build_mesh
-from lyra_petsc.output.checkpoint import checkpoint_files
 from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.output.run_folder import checkpoint_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
