@@ -31,7 +31,13 @@ PR_SET_PDEATHSIG = 1
 LAUNCHER_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMI_RANK", "PMIX_RANK", "MPI_LOCALNRANKS")
 """Environment variables of processes that a launcher has started."""
 
-NOT_INHERITED = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_")
+NOT_INHERITED = ("OMPI_COMM_", "OMPI_UNIVERSE", "OMPI_APP", "PMIX_", "PMI_", "HYDRA_", "ORTE_SCHIZO_")
+
+OF_ONE_PROCESS = frozenset(
+    f"OMPI_MCA_{name}"
+    for name in ("ess", "pmix", "orte_launch", "orte_ess_num_procs", "orte_precondition_transports")
+)
+"""What Open MPI 4 sets in a process without a launcher, and what mpirun started from there would fail by."""
 
 
 def is_launched(environment: Mapping[str, str]) -> bool:
@@ -67,7 +73,11 @@ def find_launcher(ranks: int) -> list[str]:
 
 def environment() -> dict[str, str]:
     """Environment for a launcher: that of this process without the variables of a parallel job."""
-    ours = {name: value for name, value in os.environ.items() if not name.startswith(NOT_INHERITED)}
+    ours = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(NOT_INHERITED) and name not in OF_ONE_PROCESS
+    }
     ours.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
     ours.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
     ours.setdefault("OMP_NUM_THREADS", "1")

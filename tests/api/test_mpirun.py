@@ -1,0 +1,33 @@
+"""What a launcher inherits from the process that starts it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from lyra_petsc.api.mpirun import environment, find_launcher
+
+LEFT_BY_MPI_INIT = {
+    "OMPI_MCA_ess": "singleton",
+    "OMPI_MCA_orte_launch": "1",
+    "OMPI_MCA_orte_ess_num_procs": "1",
+    "OMPI_MCA_pmix": "^s1,s2,cray,isolated",
+    "ORTE_SCHIZO_DETECTION": "ORTE",
+}
+"""Of Open MPI 4, in a process that no launcher has started."""
+
+
+def test_a_launcher_starts_below_a_process_that_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in LEFT_BY_MPI_INIT.items():
+        monkeypatch.setenv(name, value)
+    code = "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"
+    command = [*find_launcher(2), sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout.split()) == (0, ["2", "2"]), done.stderr
+
+
+def test_what_a_user_sets_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMPI_MCA_btl", "self,tcp")
+    assert environment()["OMPI_MCA_btl"] == "self,tcp"
