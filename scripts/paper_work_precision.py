@@ -74,7 +74,7 @@ def run(setting: str) -> dict[str, Any]:
     )
     simulation = Simulation(MPI.COMM_WORLD, scene)
     times, mean = np.array(REFERENCE["times"]), REFERENCE["mean"]
-    system = simulation.model.system
+    system = simulation.problem.system
     mass = system.mass[:, None]
     kinetic, fall, apart, reports, failure = np.inf, [], [], [], ""
     seconds = -time.process_time()

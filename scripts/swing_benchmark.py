@@ -76,7 +76,7 @@ def measure(c11: float, setting: str, cells: int, more: tuple[str, ...]) -> dict
     except SolverError as error:
         failure = str(error)
     ended = time.process_time()
-    edge = simulation.model.system.x[simulation.model.probes["edge"]].mean(axis=0)[[0, 2]]
+    edge = simulation.problem.system.x[simulation.problem.probes["edge"]].mean(axis=0)[[0, 2]]
     answers = json.loads((ROOT / "tests" / "reference" / "swing.json").read_text(encoding="utf-8"))
     exact = np.array(answers["stiffness"][f"{c11:g}"]["continuum"][-1][1:])
     row = {

@@ -16,7 +16,7 @@ from petsc4py import PETSc
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.problem import Model, build_model
+from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic
@@ -108,13 +108,13 @@ class Simulation:
             database.setValue(name, value)
         self.scene = scene_of(content)
         self.comm = comm
-        self.model: Model = build_model(comm, self.scene, Phases())
-        self.system = self.model.system
-        outline = self.model.outline
+        self.problem: Problem = build_problem(comm, self.scene, Phases())
+        self.system = self.problem.system
+        outline = self.problem.outline
         self.stepper = Stepper(
             self.scene,
             self.system,
-            self.model.surface,
+            self.problem.surface,
             outline.spacing,
             residual_roundoff(self.system, outline.reach),
         )
@@ -127,7 +127,7 @@ class Simulation:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if error is None:  # freeing is collective: a rank that fails must not wait for the others
             self.stepper.destroy()
-            self.model.discretisation.destroy()
+            self.problem.discretisation.destroy()
         database = PETSc.Options()
         for name in [*self._options, *self.stepper.our_options]:
             database.delValue(name)
@@ -136,7 +136,7 @@ class Simulation:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices in mesh order, on every rank."""
-        return gathered(self.model.points, owned)
+        return gathered(self.problem.points, owned)
 
     @property
     def x(self) -> Array:
@@ -155,7 +155,7 @@ class Simulation:
 
     def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
         """Replace positions or velocities, (V, 3) in mesh order."""
-        layout, state = self.model.points, self.system.state
+        layout, state = self.problem.points, self.system.state
         rows = slice(0, layout.n_vertices)
         if x is not None:
             state.x[rows] = x[layout.original]
@@ -165,7 +165,7 @@ class Simulation:
 
     def energy(self, name: str) -> float:
         """Energy [J] of an elastic term, over all ranks."""
-        term = self.model.terms[name]
+        term = self.problem.terms[name]
         assert isinstance(term, Elastic)
         return float(self.comm.allreduce(float(term.energies(self.system.x, self.system.frozen[term]).sum())))
 

@@ -81,7 +81,7 @@ def simulate(
                     recorder.resume(directory.path)
                 else:
                     recorder.begin(directory.path)
-            simulation.model.release()
+            simulation.problem.release()
             _RunLoop(simulation, recorder, directory.path, callbacks, resumed=choice.resume).run(stop)
         except BaseException:
             if comm.size == 1:  # on several ranks some may not come here, and destruction is collective
@@ -181,19 +181,19 @@ class _RunLoop:
 
     def _summarise(self, outcome: str) -> None:
         simulation = self._simulation
-        model = simulation.model
+        problem = simulation.problem
         content: dict[str, Any] = {
             "title": simulation.scene.title,
             "outcome": outcome,
             "versions": self._versions,
             "ranks": self._comm.size,
             "sizes": {
-                "vertices": model.outline.n_vertices,
-                "triangles": model.outline.n_triangles,
-                "unknowns": model.points.n_unknowns,
+                "vertices": problem.outline.n_vertices,
+                "triangles": problem.outline.n_triangles,
+                "unknowns": problem.points.n_unknowns,
             },
-            "terms": model.outline.terms,
-            "partitioner": model.partitioner,
+            "terms": problem.outline.terms,
+            "partitioner": problem.partitioner,
             "linear_solver": simulation.stepper.preset,
             "petsc_options": PETSc.Options().getAll(),
             "unused_petsc_options": unused(simulation.stepper.our_options) if outcome == "done" else [],

@@ -105,10 +105,10 @@ class Simulation:
         with np.errstate(over="ignore", invalid="ignore"):
             stepping = Stepping(self.comm, loaded)
         self._stepping: Stepping | None = stepping
-        model = stepping.model
-        self.mesh: Mesh | None = model.mesh
-        self.vertices: NDArray[np.int64] = model.points.original
-        elements = model.membrane.elements
+        problem = stepping.problem
+        self.mesh: Mesh | None = problem.mesh
+        self.vertices: NDArray[np.int64] = problem.points.original
+        elements = problem.membrane.elements
         self.triangles: NDArray[np.int64] = elements.index[: elements.n_owned].astype(np.int64)
         _OPEN.add(self)
 
@@ -164,12 +164,12 @@ class Simulation:
     @property
     def positions(self) -> Array:
         """(n, 3) current positions [m] of this rank's vertices, a copy."""
-        return self._running.model.system.x[: len(self.vertices)].copy()
+        return self._running.problem.system.x[: len(self.vertices)].copy()
 
     @property
     def velocities(self) -> Array:
         """(n, 3) current velocities [m/s] of this rank's vertices, a copy."""
-        return np.array(self._running.model.system.written_velocity()[: len(self.vertices)])
+        return np.array(self._running.problem.system.written_velocity()[: len(self.vertices)])
 
     def field(self, name: str) -> Array:
         """A field that ``output.fields`` of a scene may name, on this rank's vertices or triangles.
@@ -181,9 +181,9 @@ class Simulation:
         """
         if name not in FIELDS:
             raise InputError(f"unknown field {name!r}, {nearest(name, FIELDS)}", key="field")
-        model = self._running.model
-        check_field(FIELDS[name], model)
-        return np.array(FIELDS[name].compute(model))
+        problem = self._running.problem
+        check_field(FIELDS[name], problem)
+        return np.array(FIELDS[name].compute(problem))
 
     @property
     def energies(self) -> dict[str, float]:

@@ -39,8 +39,8 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
     scene = read_scene(comm, path, settings)
     simulation = Simulation(comm, scene, Phases())
     Recorder(simulation)
-    model = simulation.model
-    points, pattern = model.points, model.pattern
+    problem = simulation.problem
+    points, pattern = problem.points, problem.pattern
     mine = np.array(
         [points.n_owned, points.n_local - points.n_owned, pattern.n_couplings, _elements(simulation)]
     )
@@ -57,12 +57,12 @@ def print_schema(comm: MPI.Comm) -> None:
 
 
 def _elements(simulation: Simulation) -> int:
-    return sum(term.n_elements for term in simulation.model.terms.values())
+    return sum(term.n_elements for term in simulation.problem.terms.values())
 
 
 def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
-    model, scene, control = simulation.model, simulation.scene, simulation.control
-    outline = model.outline
+    problem, scene, control = simulation.problem, simulation.scene, simulation.control
+    outline = problem.outline
     blocks = int(ranks[:, 2].sum())
     time = scene.time
     if time.analysis == "static":
@@ -88,7 +88,7 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
         ("mean edge", f"{outline.spacing:.4g} m"),
         ("active terms", ", ".join(outline.terms)),
         ("handles", str(len(scene.handles))),
-        ("unknowns", f"{model.points.n_unknowns} (velocities)"),
+        ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
         (
             "nonzeros",
             f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row",
@@ -97,7 +97,7 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
         ("integrator", time.scheme),
         ("steps", plan_of_steps),
         ("linear solver", f"{simulation.stepper.preset}: {_solver_options(simulation)}"),
-        ("partitioner", model.partitioner),
+        ("partitioner", problem.partitioner),
     ):
         plan.add_row(name, value)
     console.print(plan)

@@ -102,7 +102,7 @@ class TerminalProgress(ProgressCallbacks):
             simulation.control.end,
             start=simulation.time,
             plain=_petsc_speaks(),
-            unit="s" if simulation.model.system.integrator.moves else "",
+            unit="s" if simulation.problem.system.integrator.moves else "",
         )
         if self._page is not None:
             self._page.show(folder)

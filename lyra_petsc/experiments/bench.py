@@ -94,7 +94,7 @@ class Trial:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices (n_owned, …) in mesh order (V, …), on every rank; collective."""
-        points = self.simulation.model.points
+        points = self.simulation.problem.points
         pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_owned])))
         out = np.empty((points.n_global, *owned.shape[1:]))
         for original, rows in pieces:
@@ -104,25 +104,25 @@ class Trial:
     @property
     def x(self) -> Array:
         """Positions (V, 3) [m] in mesh order."""
-        return self.gather(self.simulation.model.system.x)
+        return self.gather(self.simulation.problem.system.x)
 
     @property
     def v(self) -> Array:
         """Velocities (V, 3) [m/s] in mesh order."""
-        return self.gather(self.simulation.model.system.v)
+        return self.gather(self.simulation.problem.system.v)
 
     @property
     def mass(self) -> Array:
         """Masses (V,) [kg] in mesh order."""
-        return self.gather(self.simulation.model.system.mass)
+        return self.gather(self.simulation.problem.system.mass)
 
     def set_state(self, x: Array | None = None, v: Array | None = None) -> None:
         """Replace positions [m] or velocities [m/s], (V, 3) in mesh order; collective."""
-        model = self.simulation.model
-        for target, values in ((model.system.x, x), (model.system.v, v)):
+        problem = self.simulation.problem
+        for target, values in ((problem.system.x, x), (problem.system.v, v)):
             if values is not None:
-                target[: model.points.n_owned] = values[model.points.original]
-                model.points.update_ghosts(target)
+                target[: problem.points.n_owned] = values[problem.points.original]
+                problem.points.update_ghosts(target)
 
     def total(self, owned: Array) -> float:
         """Sum over all ranks of this rank's values; collective."""

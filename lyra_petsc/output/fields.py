@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.stepping.problem import Model
+from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending import Bending
@@ -18,57 +18,57 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def _velocity(model: Model) -> Array:
-    return model.system.written_velocity()[: model.points.n_vertices]
+def _velocity(problem: Problem) -> Array:
+    return problem.system.written_velocity()[: problem.points.n_vertices]
 
 
-def _green_strain(model: Model) -> Array:
-    return model.membrane.strain_and_stress(model.system.x)[0][: model.membrane.n_owned]
+def _green_strain(problem: Problem) -> Array:
+    return problem.membrane.strain_and_stress(problem.system.x)[0][: problem.membrane.n_owned]
 
 
-def _stress(model: Model) -> Array:
-    return model.membrane.strain_and_stress(model.system.x)[1][: model.membrane.n_owned]
+def _stress(problem: Problem) -> Array:
+    return problem.membrane.strain_and_stress(problem.system.x)[1][: problem.membrane.n_owned]
 
 
-def _membrane_energy(model: Model) -> Array:
-    membrane = model.membrane
-    density: Array = membrane.energies(model.system.x) / membrane.elements.data["area"][: membrane.n_owned]
+def _membrane_energy(problem: Problem) -> Array:
+    membrane = problem.membrane
+    density: Array = membrane.energies(problem.system.x) / membrane.elements.data["area"][: membrane.n_owned]
     return density
 
 
-def _to_vertices(model: Model, bending: Bending, on_hinges: Array) -> Array:
+def _to_vertices(problem: Problem, bending: Bending, on_hinges: Array) -> Array:
     """Halves of what hinges carry, summed on their edges' ends and divided by the vertices' rest area."""
-    n_local, n_owned = model.points.n_local, model.points.n_vertices
+    n_local, n_owned = problem.points.n_local, problem.points.n_vertices
     ends = bending.stencil[:, :2].ravel()
     carried = np.bincount(ends, np.repeat(0.5 * on_hinges, 2), n_local)
-    membrane = model.membrane
+    membrane = problem.membrane
     thirds = np.repeat(membrane.elements.data["area"] / 3.0, 3)
     area = np.bincount(membrane.stencil.ravel(), thirds, n_local)
     density: Array = carried[:n_owned] / area[:n_owned]
     return density
 
 
-def _bending_energy(model: Model) -> Array:
-    bending = _bending(model)
-    return _to_vertices(model, bending, bending.all_energies(model.system.x, bending.n_elements))
+def _bending_energy(problem: Problem) -> Array:
+    bending = _bending(problem)
+    return _to_vertices(problem, bending, bending.all_energies(problem.system.x, bending.n_elements))
 
 
-def _curvature(model: Model) -> Array:
-    bending, x = _bending(model), model.system.x
+def _curvature(problem: Problem) -> Array:
+    bending, x = _bending(problem), problem.system.x
     # what a collapsed triangle has for an angle says nothing
     angles = bending.weights(x) * bending.angles(x)
-    return _to_vertices(model, bending, -bending.elements.data["length"] * angles)
+    return _to_vertices(problem, bending, -bending.elements.data["length"] * angles)
 
 
-def _bending(model: Model) -> Bending:
+def _bending(problem: Problem) -> Bending:
     """The term of the hinges, which `check_field` has seen."""
     from lyra_petsc.terms.bending import Bending
 
-    return next(term for term in model.terms.values() if isinstance(term, Bending))
+    return next(term for term in problem.terms.values() if isinstance(term, Bending))
 
 
-def _rank(model: Model) -> Array:
-    return np.full(model.points.n_vertices, float(model.points.comm.rank))
+def _rank(problem: Problem) -> Array:
+    return np.full(problem.points.n_vertices, float(problem.points.comm.rank))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Field:
     name: str
     on: Literal["vertex", "triangle"]
     meaning: str
-    compute: Callable[[Model], Array]
+    compute: Callable[[Problem], Array]
     term: str = "membrane"
 
 
@@ -102,7 +102,7 @@ FIELDS = {
 }
 
 
-def chosen(model: Model) -> list[Field]:
+def chosen(problem: Problem) -> list[Field]:
     """The fields a scene asks for.
 
     Raises
@@ -110,22 +110,22 @@ def chosen(model: Model) -> list[Field]:
     InputError
         For a field of a term that the scene does not have.
     """
-    fields = [FIELDS[name] for name in model.scene.output.fields]
+    fields = [FIELDS[name] for name in problem.scene.output.fields]
     for field in fields:
-        check_field(field, model)
+        check_field(field, problem)
     return fields
 
 
-def check_field(field: Field, model: Model) -> None:
+def check_field(field: Field, problem: Problem) -> None:
     """Refuse a field of a term that the scene does not have.
 
     Raises
     ------
     InputError
     """
-    if field.term not in model.terms:
+    if field.term not in problem.terms:
         raise InputError(
             f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",
-            file=model.scene.source,
+            file=problem.scene.source,
             key="output.fields",
         )

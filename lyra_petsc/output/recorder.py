@@ -59,18 +59,18 @@ class Recorder:
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
-        model = simulation.model
-        self._fields: list[Field] = chosen(model)
-        points = model.points
+        problem = simulation.problem
+        self._fields: list[Field] = chosen(problem)
+        points = problem.points
         self._vertices = FileOrder(points.comm, points.original, points.n_vertices_global)
         self._edges: FileOrder | None = None
         if points.n_edges_global:
             self._edges = FileOrder(points.comm, points.edges, points.n_edges_global)
         self._triangles: FileOrder | None = None
         if any(field.on == "triangle" for field in self._fields):
-            elements = model.membrane.elements
+            elements = problem.membrane.elements
             own = elements.index[: elements.n_owned].astype(np.int64)
-            self._triangles = FileOrder(points.comm, own, model.outline.n_triangles)
+            self._triangles = FileOrder(points.comm, own, problem.outline.n_triangles)
         self._comm = points.comm
         self._background = Background(points.comm)
         self._last_checkpoint = clock.monotonic()
@@ -84,10 +84,10 @@ class Recorder:
     def begin(self, folder: Path) -> None:
         """Write the mesh, the scene as understood, the initial state, row and checkpoint."""
         simulation = self._simulation
-        model = simulation.model
-        scene = model.scene
-        write_mesh(folder, model.mesh, model.points.comm)
-        on_root(model.points.comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
+        problem = simulation.problem
+        scene = problem.scene
+        write_mesh(folder, problem.mesh, problem.points.comm)
+        on_root(problem.points.comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._open(folder, None)
         self._write_row(StepReport(0, 0.0, 0.0, 0, 0, 0, 0.0, 0.0))
         self.write_state()
@@ -102,9 +102,9 @@ class Recorder:
             If the run in the folder cannot go on with this scene; the folder is untouched.
         """
         simulation = self._simulation
-        model, scene = simulation.model, simulation.scene
-        system, layout = model.system, model.points
-        check_same_mesh(folder, model.mesh, _groups(scene), self._comm)
+        problem, scene = simulation.problem, simulation.scene
+        system, layout = problem.system, problem.points
+        check_same_mesh(folder, problem.mesh, _groups(scene), self._comm)
         checkpoint = read_checkpoint(folder, self._vertices, self._edges)
         on_root(self._comm, lambda: self._check_kind(folder, checkpoint))
         memory = checkpoint.scalars
@@ -177,7 +177,7 @@ class Recorder:
             folder,
             self._vertices,
             self._triangles,
-            n_triangles=self._simulation.model.outline.n_triangles,
+            n_triangles=self._simulation.problem.outline.n_triangles,
             resume_after=resume_after,
             vtkhdf=self._simulation.scene.output.vtkhdf,
             background=self._background,
@@ -257,14 +257,14 @@ class Recorder:
 
     def _probe_means(self) -> dict[str, Array]:
         """Mean position [m] of each probe's vertices."""
-        model = self._simulation.model
-        local = np.zeros((len(model.probes), 4))
-        for row, vertices in enumerate(model.probes.values()):
-            local[row, :3] = model.system.x[vertices].sum(axis=0)
+        problem = self._simulation.problem
+        local = np.zeros((len(problem.probes), 4))
+        for row, vertices in enumerate(problem.probes.values()):
+            local[row, :3] = problem.system.x[vertices].sum(axis=0)
             local[row, 3] = len(vertices)
         total = np.empty_like(local)
-        model.points.comm.Allreduce(local, total, MPI.SUM)
-        return {name: total[row, :3] / total[row, 3] for row, name in enumerate(model.probes)}
+        problem.points.comm.Allreduce(local, total, MPI.SUM)
+        return {name: total[row, :3] / total[row, 3] for row, name in enumerate(problem.probes)}
 
     # -- states --------------------------------------------------------------------------------------
 
@@ -274,13 +274,13 @@ class Recorder:
         if simulation.step_number == self._last_state:
             self.write_checkpoint()
             return
-        model = simulation.model
-        values = {field: field.compute(model) for field in self._fields}
+        problem = simulation.problem
+        values = {field: field.compute(problem) for field in self._fields}
         with self._checkpoint(last_state=simulation.step_number) as checkpoint:
             self._states.write(
                 simulation.step_number,
                 simulation.time,
-                model.system.x[: model.points.n_vertices],
+                problem.system.x[: problem.points.n_vertices],
                 {field.name: value for field, value in values.items() if field.on == "vertex"},
                 {field.name: value for field, value in values.items() if field.on == "triangle"},
                 beside=[checkpoint],  # what is announced is not written again after a kill
@@ -296,7 +296,7 @@ class Recorder:
     def _checkpoint(self, last_state: int) -> Iterator[NewFile]:
         """A checkpoint of the present state, to be written within the context."""
         simulation = self._simulation
-        system, layout = simulation.model.system, simulation.model.points
+        system, layout = simulation.problem.system, simulation.problem.points
         n = layout.n_owned
         rows = {"position": system.x[:n], "velocity": system.v[:n], **simulation.arrays()}
         for number, start in enumerate(sorted(system.reference.late)):
@@ -317,7 +317,7 @@ class Recorder:
         """Write why the last step could not be taken: the state before it and the failing iterate."""
         simulation, failure = self._simulation, self._simulation.failure
         assert failure is not None
-        system, n = simulation.model.system, simulation.model.points.n_vertices
+        system, n = simulation.problem.system, simulation.problem.points.n_vertices
         stuck = failure.stuck.of_vertices(n)
         before = {"velocity": system.v[:n]}  # the equations of the failed step say nothing of it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
@@ -326,7 +326,7 @@ class Recorder:
         write_failure(
             self._folder,
             self._vertices,
-            simulation.model.outline.n_triangles,
+            simulation.problem.outline.n_triangles,
             simulation.step_number,
             (Moment(failure.time, system.x[:n], before), Moment(stuck.time, position, failing)),
             failure.text,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.stepping.problem import Model
+from lyra_petsc.stepping.problem import Problem
 from lyra_petsc.terms.stretch import SOFTENS_BELOW, principal_stretches
 
 
@@ -14,7 +14,7 @@ class Compression:
 
     Parameters
     ----------
-    model : Model
+    problem : Problem
 
     Attributes
     ----------
@@ -22,17 +22,17 @@ class Compression:
         Principal stretches of the state looked at last; 1 before the first.
     """
 
-    def __init__(self, model: Model) -> None:
-        self._model = model
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
         self._told = False
         self.smallest = self.largest = 1.0
 
     def look(self, when: str) -> str | None:
         """Measure the present state, ``when`` in words; what there is to tell, the first time there is."""
-        membrane, comm = self._model.membrane, self._model.points.comm
+        membrane, comm = self._problem.membrane, self._problem.points.comm
         n = membrane.n_owned
         stretches = principal_stretches(
-            self._model.system.x, membrane.stencil, membrane.elements.data["inverse"], n
+            self._problem.system.x, membrane.stencil, membrane.elements.data["inverse"], n
         )
         local = np.array([np.inf, -np.inf])
         if n:

@@ -58,7 +58,7 @@ class Outline:
 
 
 @dataclass
-class Model:
+class Problem:
     """One rank's part of a scene, ready to step.
 
     Attributes
@@ -111,7 +111,7 @@ class Model:
         return next(term for term in self.terms.values() if isinstance(term, Membrane))
 
 
-def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
+def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
     """Mesh, partition, terms and matrix pattern of a scene; collective.
 
     Raises
@@ -135,10 +135,10 @@ def build_model(comm: MPI.Comm, scene: Scene, phases: Phases) -> Model:
         part = distribute(comm, whole)
         whole = None
     with phases("assembly"):
-        model = _local(scene, outline, part, mesh)
+        problem = _local(scene, outline, part, mesh)
         del part
         _give_back_freed()
-        return model
+        return problem
 
 
 def _give_back_freed() -> None:
@@ -201,7 +201,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges)
 
 
-def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Model:
+def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:
     layout = part.layout
     terms: dict[str, Term] = {}
     for name in outline.terms:
@@ -239,7 +239,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Mod
     system.state.update_ghosts()
     system.rest_at(0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
-    return Model(
+    return Problem(
         scene,
         outline,
         discretisation,

@@ -24,7 +24,7 @@ from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
-from lyra_petsc.stepping.problem import Model, build_model, events
+from lyra_petsc.stepping.problem import Problem, build_problem, events
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.step_control import LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
@@ -80,7 +80,7 @@ class Simulation:
     ----------
     scene : Scene
         With the integrator and the kind of steps that PETSc's options chose.
-    model : Model
+    problem : Problem
     time : float
         [s]
     step_number : int
@@ -107,9 +107,9 @@ class Simulation:
             raise
 
     def _set_up(self, scene: Scene) -> None:
-        self.model: Model = build_model(self.comm, scene, self.phases)
-        self.notes = list(self.model.outline.notes)
-        outline, system = self.model.outline, self.model.system
+        self.problem: Problem = build_problem(self.comm, scene, self.phases)
+        self.notes = list(self.problem.outline.notes)
+        outline, system = self.problem.outline, self.problem.system
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
             if not math.isfinite(floor):
@@ -118,7 +118,7 @@ class Simulation:
                     file=scene.source,
                     key="material",
                 )
-            self.stepper = Stepper(scene, system, self.model.surface, outline.spacing, floor)
+            self.stepper = Stepper(scene, system, self.problem.surface, outline.spacing, floor)
         self._floor = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
@@ -129,7 +129,7 @@ class Simulation:
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
-        self.compression = Compression(self.model)
+        self.compression = Compression(self.problem)
         self._told_of_error = self._told_of_roundoff = False
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
@@ -171,7 +171,7 @@ class Simulation:
             If even the smallest Δt fails; the state is that before the step.
         """
         started = clock.perf_counter()
-        system, n = self.model.system, self.model.points.n_owned
+        system, n = self.problem.system, self.problem.points.n_owned
         x_before = system.x.copy()
         v_before = system.v.copy() if self.local_error is not None else system.v  # else no step is undone
         newton = linear = rejected = 0
@@ -214,7 +214,7 @@ class Simulation:
 
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
-        loads = float(np.sum(self.model.system.loads_now**2))
+        loads = float(np.sum(self.problem.system.loads_now**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
             self._told_of_roundoff = True
@@ -225,7 +225,7 @@ class Simulation:
 
     def _now(self) -> str:
         """The present time, or load factor, in words."""
-        moves = self.model.system.integrator.moves
+        moves = self.problem.system.integrator.moves
         return f"t = {self.time:g} s" if moves else f"load factor {self.time:g}"
 
     def _accurate(self, v_before: Array, dt: float) -> bool:
@@ -233,10 +233,10 @@ class Simulation:
         control = self.control
         if self.local_error is None or not isinstance(control, ToleranceControl):
             return True
-        size = self.model.outline.size
+        size = self.problem.outline.size
         error = self.local_error.of(v_before, dt) / size
         share = (self.scene.time.tolerance or 0.0) * dt / control.end
-        stands = control.judge(dt, error / share, self.model.system.integrator.order)
+        stands = control.judge(dt, error / share, self.problem.system.integrator.order)
         if stands:
             self.local_error.accepted(v_before, dt)
             self.estimated_error += error
@@ -267,11 +267,11 @@ class Simulation:
 
     def _explain(self, attempt: Attempt, end: float) -> Failure:
         """Why the last attempt at a step failed; collective."""
-        model, scene, stuck = self.model, self.scene, attempt.stuck
+        problem, scene, stuck = self.problem, self.scene, attempt.stuck
         assert stuck is not None
-        system, outline, stepper = model.system, model.outline, self.stepper
+        system, outline, stepper = problem.system, problem.outline, self.stepper
         diagnosis = diagnose(
-            model.points, model.membrane, system.held, stuck, system.x, system.mass, model.tags
+            problem.points, problem.membrane, system.held, stuck, system.x, system.mass, problem.tags
         )
         now = Circumstances(
             dt=end - self.time,
@@ -308,16 +308,16 @@ class Simulation:
             "integrator": self._numbers(),
             "blend": self.stepper.blend,
             "preset": self.stepper.preset,
-            "late_starts": sorted(self.model.system.reference.late),
+            "late_starts": sorted(self.problem.system.reference.late),
         }
 
     def _numbers(self) -> dict[str, float]:
-        numbers = self.model.system.integrator.memory()[1]
+        numbers = self.problem.system.integrator.memory()[1]
         return numbers if self.local_error is None else numbers | self.local_error.memory()[1]
 
     def arrays(self) -> dict[str, Array]:
         """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
-        arrays = dict(self.model.system.integrator.memory()[0])
+        arrays = dict(self.problem.system.integrator.memory()[0])
         if self.local_error is not None:
             arrays |= self.local_error.memory()[0]
         return arrays
@@ -326,13 +326,13 @@ class Simulation:
         """Vertex arrays (n_vertices, 3) that terms with a state keep in a checkpoint, by ``term.name``."""
         return {
             f"{term.name}.{name}": values
-            for term in self.model.system.elastic
+            for term in self.problem.system.elastic
             for name, values in term.state().items()
         }
 
     def resume(self, memory: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-        """Go on from a state already put into ``model.system`` (x and v of owned rows)."""
-        system = self.model.system
+        """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
+        system = self.problem.system
         system.state.update_ghosts()
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
         for name, value in memory["budget"].items():
@@ -359,7 +359,7 @@ class Simulation:
     def destroy(self) -> None:
         """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""
         self.stepper.destroy()
-        self.model.discretisation.destroy()
+        self.problem.discretisation.destroy()
         self._take_back_options()
 
     def _take_back_options(self) -> None:

@@ -107,7 +107,7 @@ def steps(comm: Comm, job: Result) -> Result:
     before, _ = resident()
     began = now(comm)
     simulation = Simulation(comm, Scene.model_validate(job["scene"]))
-    simulation.model.release()
+    simulation.problem.release()
     built = now(comm) - began
     simulation.step()
     set_up = now(comm) - began
@@ -137,10 +137,10 @@ def steps(comm: Comm, job: Result) -> Result:
         if comm.bcast(time.perf_counter() - first > job["seconds"] and len(rows) >= FEWEST):
             break
     _, peak = resident()
-    outline, stepper = simulation.model.outline, simulation.stepper
-    operator, pattern = stepper.linear.operator, simulation.model.pattern
+    outline, stepper = simulation.problem.outline, simulation.stepper
+    operator, pattern = stepper.linear.operator, simulation.problem.pattern
     # PETSc's own product, with the storage that has as many entries as ours
-    assembled = AssembledMatrix(simulation.model.points, pattern, "sbaij")
+    assembled = AssembledMatrix(simulation.problem.points, pattern, "sbaij")
     assembled.set(operator.rows)
     return {
         "vertices": outline.n_vertices,
@@ -180,7 +180,7 @@ def overhead(comm: Comm, job: Result) -> Result:
             newton += simulation.step().newton_iterations
         rates.append(job["steps"] / (now(comm) - began))
     return {
-        "triangles": simulation.model.outline.n_triangles,
+        "triangles": simulation.problem.outline.n_triangles,
         "preset": simulation.stepper.preset,
         "newton": newton / (job["steps"] * job["blocks"]),
         "steps_a_second": rates,
@@ -209,7 +209,7 @@ def output(comm: Comm, job: Result) -> Result:
         sizes.append(sum(written))
     recorder.close()
     return {
-        "vertices": simulation.model.outline.n_vertices,
+        "vertices": simulation.problem.outline.n_vertices,
         "bytes": statistics.median(sizes),
         "states_bytes_a_second": [size / seconds for size, seconds in zip(sizes, ours, strict=True)],
         "plain_bytes_a_second": [size / seconds for size, seconds in zip(sizes, raw, strict=True)],

@@ -173,7 +173,7 @@ sys.exit(run_command_line(sys.argv))
 @pytest.mark.parametrize(
     ("module", "name", "after"),
     [
-        ("stepping.simulation", "build_model", 0),
+        ("stepping.simulation", "build_problem", 0),
         ("stepping.stage_equations", "StageEquations.residual", 7),
         ("stepping.stage_equations", "StageEquations.jacobian", 3),
     ],

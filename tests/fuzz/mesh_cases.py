@@ -189,7 +189,7 @@ STATEMENTS = [
     "Mesh 3;",
     "RefineMesh;",
     "RecombineMesh;",
-    "Delete Model;",
+    "Delete Problem;",
     "Delete { Surface{1}; }",
     "NewModel;",
     "SyncModel;",

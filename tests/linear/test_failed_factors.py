@@ -95,7 +95,7 @@ def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
             assert simulation.notes == []
             used = database.getInt(WORKSPACE)
             assert used == margin if margin > 0 else used >= MARGIN
-            ends.append(gathered(simulation.model.points, simulation.model.system.x))
+            ends.append(gathered(simulation.problem.points, simulation.problem.system.x))
             simulation.destroy()
         finally:
             for name in [*asked, WORKSPACE, *simulation.stepper.our_options]:

@@ -46,16 +46,16 @@ class Interpolation:
 @pytest.mark.parametrize("held", [False, True], ids=["free", "some held"])
 def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 60, 48), "material": CLOTH}, comm) as simulation:
-        model = simulation.model
-        points, pattern = model.points, model.pattern
+        problem = simulation.problem
+        points, pattern = problem.points, problem.pattern
         mask = np.zeros((points.n_local, 3), dtype=bool)
         if held:
             mask[:, 0] = points.global_number % 7 == 0
             mask[points.global_number % 11 == 0] = True
         rng = np.random.default_rng(comm.rank)
         values = symmetric(points, pattern)
-        model.discretisation.rows.constrain(values, mask, np.arange(points.n_owned))
-        between = interpolations(points, model.surface, 3)
+        problem.discretisation.rows.constrain(values, mask, np.arange(points.n_owned))
+        between = interpolations(points, problem.surface, 3)
         hierarchy = Hierarchy(points, pattern, between)
         assert len(hierarchy.levels) == 3
         list(hierarchy.block_rows(np.ones_like(values), ~mask))  # what is left from before must not show
@@ -87,14 +87,14 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
 @pytest.mark.parallel
 def test_nothing_is_interpolated_to_held_coordinates(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 30, 24), "material": CLOTH}, comm) as simulation:
-        points = simulation.model.points
-        between = interpolations(points, simulation.model.surface, 2)
-        hierarchy = Hierarchy(points, simulation.model.pattern, between)
+        points = simulation.problem.points
+        between = interpolations(points, simulation.problem.surface, 2)
+        hierarchy = Hierarchy(points, simulation.problem.pattern, between)
         mask = np.zeros((points.n_local, 3), dtype=bool)
         mask[points.global_number % 3 == 0, 1] = True
         interpolation = Interpolation(between[0], *hierarchy.levels)
         for held in (~mask, mask):
-            rows = np.zeros((simulation.model.pattern.n_blocks, 3, 3))
+            rows = np.zeros((simulation.problem.pattern.n_blocks, 3, 3))
             _, free = next(hierarchy.block_rows(rows, held))
             interpolation.set(free)
             ones, out = interpolation.mat.createVecs()

@@ -45,13 +45,13 @@ EVERYTHING: dict[str, Any] = {
 def bent_state(simulation: Simulation) -> tuple[Array, Array]:
     """Set a state far from rest and begin a step; owned velocities of an iterate, and a direction."""
     rng = np.random.default_rng(11)
-    n = simulation.model.points.n_global
+    n = simulation.problem.points.n_global
     x = simulation.x
     simulation.set_state(
         x=(x + rng.uniform(-0.04, 0.04, (n, 3))) @ rotation([1, 1, 0], 0.3).T, v=rng.uniform(-1, 1, (n, 3))
     )
     simulation.system.begin_step(0.0, DT)
-    original = simulation.model.points.original
+    original = simulation.problem.points.original
     iterate, direction = rng.uniform(-1, 1, (n, 3)), rng.uniform(-1, 1, (n, 3))
     return iterate[original], direction[original]
 
@@ -71,7 +71,7 @@ def jacobian(simulation: Simulation, v: Array, blend: float) -> Array:
 
 def matrix_of(simulation: Simulation, kind: str) -> Matrix:
     """An empty matrix of a PETSc type: ``python`` multiplies by our rows."""
-    points, pattern = simulation.model.points, simulation.model.pattern
+    points, pattern = simulation.problem.points, simulation.problem.pattern
     if kind == "python":
         return BlockMatrix(points, pattern)
     database = PETSc.Options()
@@ -167,7 +167,7 @@ def test_product_of_rows_needs_no_petsc(comm: MPI.Comm) -> None:
         values = jacobian(simulation, v, 0.0)
         matrix = matrix_of(simulation, "aij")
         matrix.set(values)
-        points = simulation.model.points
+        points = simulation.problem.points
         local = np.zeros((points.n_local, 3))
         local[: points.n_owned] = direction
         points.update_ghosts(local)
@@ -182,7 +182,7 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
     with Simulation(EVERYTHING, comm) as simulation:
         bent_state(simulation)
         system = simulation.system
-        rows, x, n = system.discretisation.rows, system.x, simulation.model.points.n_owned
+        rows, x, n = system.discretisation.rows, system.x, simulation.problem.points.n_owned
         for term in system.elastic:
             weight, frozen = 1.0 + np.arange(term.n_elements), system.frozen[term]
             iterates: list[Array | None] = [None]

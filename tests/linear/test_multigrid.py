@@ -53,7 +53,7 @@ def stepped(
         simulation = Simulation(comm, Scene.model_validate(content))
         filled = simulation.stepper.our_options
         counts = [simulation.step().linear_iterations for _ in range(steps)]
-        x = gathered(simulation.model.points, simulation.model.system.x)
+        x = gathered(simulation.problem.points, simulation.problem.system.x)
         simulation.destroy()
     finally:
         for name in [*given, *filled]:

@@ -20,7 +20,7 @@ NX, NY = 6, 5
 def couplings(mesh: dict[str, Any], comm: MPI.Comm, **more: Any) -> set[tuple[int, int]]:
     """Coupled vertex pairs (mesh numbers) of a scene's matrix, its own with itself too, on every rank."""
     with Simulation({"mesh": mesh} | more, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         mesh_number = np.empty(points.n_global, dtype=np.int64)
         for start, original in comm.allgather((points.start, points.original)):
             mesh_number[start : start + len(original)] = original
@@ -77,7 +77,7 @@ def test_hinges_couple_opposite_vertices_too(comm: MPI.Comm) -> None:
 @pytest.mark.parallel
 def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, NX, NY)}, comm) as simulation:
-        assert list(simulation.model.terms) == ["membrane"]
+        assert list(simulation.problem.terms) == ["membrane"]
         system = simulation.system
         assert not system.held
         assert not system.viscous
@@ -85,7 +85,7 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert not system._damping.acts
         assert system._damping._values is None
         assert len(system.prescribed.goal) == len(system.prescribed.rows) == 0
-        assert simulation.model.probes == {}
+        assert simulation.problem.probes == {}
 
 
 SCRIPT = """
@@ -95,12 +95,12 @@ petsc4py.init(["test", "-pc_type", "lu"])
 from mpi4py import MPI
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.problem import build_model
+from lyra_petsc.stepping.problem import build_problem
 from lyra_petsc.stepping.stepper import Stepper
 
 scene = Scene.model_validate(json.loads(sys.argv[1]))
-model = build_model(MPI.COMM_SELF, scene, Phases())
-stepper = Stepper(scene, model.system, model.surface, model.outline.spacing, 1e-12)
+problem = build_problem(MPI.COMM_SELF, scene, Phases())
+stepper = Stepper(scene, problem.system, problem.surface, problem.outline.spacing, 1e-12)
 stepper.start(0.0, 0)
 assert stepper.attempt(0.0, 0.01).converged
 print(json.dumps(sorted(m for m in sys.modules if m.startswith("lyra_petsc.") or m in HEAVY)))

@@ -28,7 +28,7 @@ def symmetric(points: Points, pattern: BlockPattern, shift: float) -> np.ndarray
 @pytest.mark.parametrize("kind", ["aij", "baij", "sbaij"])
 def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         first, second = symmetric(points, pattern, 0.0), symmetric(points, pattern, 1.0)
         once, twice = (AssembledMatrix(points, pattern, kind) for _ in range(2))
         assert once.kind == kind
@@ -45,7 +45,7 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
         local = np.empty((points.n_local, 3))
         local[: points.n_owned] = x.getArray().reshape(-1, 3)
         points.update_ghosts(local)
-        expected = simulation.model.discretisation.rows.product(second, local)
+        expected = simulation.problem.discretisation.rows.product(second, local)
         np.testing.assert_allclose(y.getArray().reshape(-1, 3), expected, rtol=0.0, atol=1e-12)
         for matrix in (once, twice):
             matrix.destroy()
@@ -55,7 +55,7 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
 @pytest.mark.parametrize("kind", ["baij", "sbaij"])
 def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         matrix = AssembledMatrix(points, pattern, kind)
         matrix.set(symmetric(points, pattern, 0.5))
         copy = matrix.mat.duplicate(copy=True)
@@ -73,7 +73,7 @@ def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Co
 @pytest.mark.parallel
 def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
         told = []
         ours.followers.append(lambda rows: told.append(rows.copy()))
@@ -100,7 +100,7 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
 @pytest.mark.parametrize("kind", ["baij", "aij", "sbaij"])
 def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
         enlarged = values.copy()
         enlarged[pattern.indptr[:-1]] *= 1.3
@@ -121,7 +121,7 @@ def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> 
 @pytest.mark.parametrize("kind", ["baij", "aij"])
 def test_of_a_diagonal_matrix_other_blocks_are_left_out(kind: str, comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
-        points, pattern = simulation.model.points, simulation.model.pattern
+        points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
         part = AssembledMatrix(points, pattern, kind, diagonal=True)
         assert part.rows.shape == values.shape

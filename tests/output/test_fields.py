@@ -17,7 +17,7 @@ ALL = {"mesh": grid(1.0, 1.0, 8, 8), "material": MATERIAL, "output": {"fields": 
 
 
 def value(simulation: Simulation, name: str) -> np.ndarray:
-    return FIELDS[name].compute(simulation.model)
+    return FIELDS[name].compute(simulation.problem)
 
 
 def test_scene_and_program_know_the_same_fields() -> None:
@@ -32,7 +32,7 @@ def test_curvature_of_a_cylinder(sign: float) -> None:
         angle = flat[:, 0] / radius
         bent = np.column_stack([radius * np.sin(angle), flat[:, 1], sign * radius * (1.0 - np.cos(angle))])
         simulation.set_state(x=bent)
-        original = simulation.model.points.original
+        original = simulation.problem.points.original
         inside = (np.abs(flat[original, :2] - 0.5) < 0.45).all(axis=1)
         curvature = value(simulation, "curvature")[inside]
     # curling towards the normal (+z) counts as positive
@@ -43,7 +43,7 @@ def test_collapsed_triangles_have_no_curvature() -> None:
     with Simulation(ALL, MPI.COMM_SELF) as simulation:
         flat, noise = simulation.x, np.random.default_rng(3).normal(0.0, 1e-9, simulation.x.shape)
         simulation.set_state(x=flat * [0.0, 1.0, 1.0] + noise)
-        bending = simulation.model.terms["bending"]
+        bending = simulation.problem.terms["bending"]
         assert isinstance(bending, Bending)
         angles = bending.angles(simulation.system.x)
         curvature, energy = value(simulation, "curvature"), value(simulation, "bending_energy")
@@ -55,11 +55,11 @@ def test_collapsed_triangles_have_no_curvature() -> None:
 def test_energy_densities_add_up() -> None:
     with Simulation(ALL, MPI.COMM_SELF) as simulation:
         simulation.set_state(x=simulation.x + np.random.default_rng(3).normal(0.0, 0.01, simulation.x.shape))
-        area = simulation.model.membrane.elements.data["area"]
+        area = simulation.problem.membrane.elements.data["area"]
         total = value(simulation, "membrane_energy") @ area
         assert total == pytest.approx(simulation.energy("membrane"))
         vertex_area = simulation.mass / 0.2
-        bending = value(simulation, "bending_energy") @ vertex_area[simulation.model.points.original]
+        bending = value(simulation, "bending_energy") @ vertex_area[simulation.problem.points.original]
         assert bending == pytest.approx(simulation.energy("bending"))
 
 
@@ -74,4 +74,4 @@ def test_strain_and_stress_of_a_stretch() -> None:
 def test_a_field_of_an_absent_term_is_refused() -> None:
     content = ALL | {"material": MATERIAL | {"bending": 0}, "output": {"fields": ["curvature"]}}
     with Simulation(content, MPI.COMM_SELF) as simulation, pytest.raises(InputError, match="bending"):
-        chosen(simulation.model)
+        chosen(simulation.problem)

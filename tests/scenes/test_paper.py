@@ -28,7 +28,7 @@ def end_of(integrator: str, step: float) -> tuple[float, float]:
     try:
         while not simulation.finished:
             simulation.step()
-        system, mean = simulation.model.system, ANSWERS["mean"]
+        system, mean = simulation.problem.system, ANSWERS["mean"]
         centre = system.mass @ system.x / system.mass.sum()
         apart = np.linalg.norm(centre[1:] - [mean["mean_y"][-1], mean["mean_z"][-1]])
         return simulation.budget.kinetic / mean["kinetic_energy"][-1] - 1.0, float(apart)

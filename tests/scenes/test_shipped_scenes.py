@@ -31,7 +31,7 @@ def simulated(name: str, *settings: str) -> Iterator[Simulation]:
 
 
 def mean_of(simulation: Simulation, probe: str) -> NDArray[np.float64]:
-    mean: NDArray[np.float64] = simulation.model.system.x[simulation.model.probes[probe]].mean(axis=0)
+    mean: NDArray[np.float64] = simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
     return mean
 
 
@@ -51,7 +51,7 @@ def test_draped_square_hangs_with_its_whole_weight() -> None:
         "drape", "mesh.size=0.1", "time.step=0.25", "time.end=20", "output.every=20"
     ) as simulation:
         pull = sum(simulation.ledger.handle_forces(2))
-        lowest = simulation.model.system.x[:, 2].min()
+        lowest = simulation.problem.system.x[:, 2].min()
     np.testing.assert_allclose(pull, [0.0, 0.0, 0.187 * 9.81], atol=2e-3)
     assert lowest < -0.9
 
@@ -61,7 +61,7 @@ def test_spun_corners_stand_opposite_after_half_a_turn() -> None:
     with simulated(
         "spin", "mesh.size=0.12", "time.end=3.5", "time.step=0.05", "output.every=3.5"
     ) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         corners = {number: system.x[system.held.vertices(number)][0] for number in (0, 1)}
     ends = sorted(corner[0] for corner in corners.values())
     np.testing.assert_allclose(ends, [-0.5, 0.5], atol=1e-9)
@@ -70,9 +70,9 @@ def test_spun_corners_stand_opposite_after_half_a_turn() -> None:
 
 def test_sail_passes_wind_and_weight_on_to_its_handles() -> None:
     with simulated("sail", "mesh.size=0.2", "time.step=0.1", "time.end=20", "output.every=20") as simulation:
-        system, scene = simulation.model.system, simulation.scene
+        system, scene = simulation.problem.system, simulation.scene
         pull = sum(simulation.ledger.handle_forces(2))
-        membrane = simulation.model.membrane
+        membrane = simulation.problem.membrane
         corners = system.x[membrane.stencil]
         area = membrane.elements.data["area"][:, None]
         weight = system.mass.sum() * np.asarray(scene.gravity)
@@ -114,7 +114,7 @@ def test_swings_free_edge_falls_freely_and_swings_in() -> None:
 def test_paper_falls_with_the_energy_it_must_have() -> None:
     # known from an ensemble: at 0.2 s, before the wrinkles matter, 0.1623 J moving
     with simulated("paper", "time.end=0.2") as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         height = float(system.mass @ system.x[:, 2] / system.mass.sum())
         moving = simulation.budget.kinetic
     assert moving == pytest.approx(0.1623, abs=5e-4)

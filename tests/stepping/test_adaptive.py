@@ -48,7 +48,7 @@ def simulated(comm: MPI.Comm, options: dict[str, str] | None = None, **content: 
 
 
 def positions(simulation: Simulation) -> Array:
-    return gathered(simulation.model.points, simulation.model.system.x)
+    return gathered(simulation.problem.points, simulation.problem.system.x)
 
 
 @pytest.fixture(scope="module")

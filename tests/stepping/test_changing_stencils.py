@@ -49,7 +49,7 @@ def repulsion(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> Simulation:
     """Two sheets that fly at each other."""
     simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
-    system = simulation.model.system
+    system = simulation.problem.system
     n = system.points.n_owned
     v = np.zeros((n, 3))
     v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, -SPEED, SPEED)
@@ -60,14 +60,14 @@ def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> Simulation:
 
 
 def term_of(simulation: Simulation) -> Repulsion:
-    term = simulation.model.terms["repulsion"]
+    term = simulation.problem.terms["repulsion"]
     assert isinstance(term, Repulsion)
     return term
 
 
 def momentum(simulation: Simulation) -> Array:
     """(3,) [kg m/s]."""
-    system = simulation.model.system
+    system = simulation.problem.system
     n = system.points.n_owned
     return np.asarray(system.points.summed(*(system.mass @ system.v[:n])))
 
@@ -88,8 +88,8 @@ def flown(
         simulation.step()
         watch(simulation)
         pairs = max(pairs, simulation.ledger.columns()["pairs"])
-    layout = simulation.model.points
-    x, v = (gathered(layout, rows) for rows in (simulation.model.system.x, simulation.model.system.v))
+    layout = simulation.problem.points
+    x, v = (gathered(layout, rows) for rows in (simulation.problem.system.x, simulation.problem.system.v))
     for name in [*petsc, *simulation.stepper.our_options]:
         database.delValue(name)
     simulation.destroy()
@@ -99,7 +99,7 @@ def flown(
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
     def watch(simulation: Simulation) -> None:
-        system, term = simulation.model.system, term_of(simulation)
+        system, term = simulation.problem.system, term_of(simulation)
         force = np.zeros((system.points.n_local, 3))
         term.add_gradient(system.x, None, force)
         own = force[: system.points.n_owned]
@@ -123,7 +123,7 @@ def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None
 
     def watch(simulation: Simulation) -> None:
         nearest.append(simulation.ledger.columns()["nearest"])
-        assert simulation.model.system.limits_step
+        assert simulation.problem.system.limits_step
 
     flown(comm, {"time": {"end": 0.06, "step": 0.02}}, watch)
     assert 0.0 < min(nearest) < DISTANCE
@@ -177,7 +177,7 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
     simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | pressed))
     while not simulation.finished:
         simulation.step()
-    system = simulation.model.system
+    system = simulation.problem.system
     force = np.zeros((system.points.n_local, 3))
     term_of(simulation).add_gradient(system.x, None, force)
     upper = system.x[: system.points.n_owned, 2] > 0.01
@@ -216,12 +216,12 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
     recorder.write_checkpoint()
     recorder.settle()
     recorder.close()
-    touched = gathered(simulation.model.points, term_of(simulation).state()["touched"])
+    touched = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
     assert touched.max() > 1.0
     while not simulation.finished:
         simulation.step()
-    x = gathered(simulation.model.points, simulation.model.system.x)
-    at_end = gathered(simulation.model.points, term_of(simulation).state()["touched"])
+    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    at_end = gathered(simulation.problem.points, term_of(simulation).state()["touched"])
     simulation.destroy()
     if comm.rank == 0:
         header, *rows = (folder / "history.csv").read_text().splitlines()
@@ -232,17 +232,17 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
         resumed = Simulation(few, scene_of(SCENE | {"solver": TIGHT}))
         again = Recorder(resumed)
         again.resume(folder)
-        kept = gathered(resumed.model.points, term_of(resumed).state()["touched"])
+        kept = gathered(resumed.problem.points, term_of(resumed).state()["touched"])
         np.testing.assert_array_equal(kept, touched)
         while not resumed.finished:
             again.record(resumed.step())
         again.settle()
         again.close()
         np.testing.assert_allclose(
-            gathered(resumed.model.points, resumed.model.system.x), x, rtol=0, atol=1e-8
+            gathered(resumed.problem.points, resumed.problem.system.x), x, rtol=0, atol=1e-8
         )
         np.testing.assert_array_equal(
-            gathered(resumed.model.points, term_of(resumed).state()["touched"]), at_end
+            gathered(resumed.problem.points, term_of(resumed).state()["touched"]), at_end
         )
         resumed.destroy()
     few.Free()
@@ -252,7 +252,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
 def test_derivatives(comm: MPI.Comm) -> None:
     """Gradient and Hessian against differences, in the assembled matrix, where the sheets are near."""
     simulation = thrown(comm, {})
-    system = simulation.model.system
+    system = simulation.problem.system
     for _ in range(12):
         simulation.step()
     layout, term = system.points, term_of(simulation)

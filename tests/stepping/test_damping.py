@@ -18,7 +18,7 @@ MATERIAL = {
 @pytest.mark.parallel
 def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         damping, blocks = system._damping, system.discretisation.rows
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
         damping.freeze(x, system.frozen)
@@ -41,7 +41,7 @@ def test_two_factors_are_no_multiple() -> None:
         "handles": [{"nodes": [0], "stiffness": 3.0}],
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         system._damping.freeze(system.x, system.frozen)
         values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
@@ -50,7 +50,7 @@ def test_two_factors_are_no_multiple() -> None:
 
 def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         v = np.cos(5.0 * system.x)
         system._damping.freeze(system.x, system.frozen)
         once = system._damping.product(v)
@@ -71,7 +71,7 @@ def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None
         "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
     }
     with Simulation(scene, comm) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         for _ in range(3):
             simulation.step(0.01)
         matrix = simulation.stepper.linear.operator.rows.copy()
@@ -96,7 +96,7 @@ def test_rows_that_become_another_matrix_are_let_go() -> None:
         "time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"},
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
-        system = simulation.model.system
+        system = simulation.problem.system
         damping, rows, none = system._damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         damping.freeze(system.x, system.frozen)
         assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)

@@ -53,7 +53,7 @@ def failing(
         database.setValue(name, value)
     simulation = Simulation(comm, scene_of({**SCENE, **scene}))
     if spoil is not None:
-        system = simulation.model.system
+        system = simulation.problem.system
         plain = system.residual
 
         def spoiled(v: Array, vdot: Array, out: Array) -> None:
@@ -79,7 +79,7 @@ def pushed(vertex: int, value: float) -> Spoil:
     """Put a force that nothing balances on one vertex of the mesh."""
 
     def spoil(simulation: Simulation, out: Array) -> None:
-        out[simulation.model.points.original == vertex] = value
+        out[simulation.problem.points.original == vertex] = value
 
     return spoil
 
@@ -89,7 +89,7 @@ def test_the_vertex_and_triangle_with_the_largest_residual_are_named(comm: MPI.C
         assert error.collective
         vertex, triangle = failure.diagnosis.vertex, failure.diagnosis.triangle
         assert vertex.number == 17
-        mesh = simulation.model.mesh
+        mesh = simulation.problem.mesh
         stored = comm.bcast((mesh.positions, mesh.triangles) if mesh is not None else None)
         assert vertex.before == pytest.approx(stored[0][17])
         # all triangles around it are as bad: the smallest number is named
@@ -127,7 +127,7 @@ def test_the_place_does_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
         for one, other in ((alone.diagnosis.vertex, together.diagnosis.vertex),
                            (alone.diagnosis.triangle, together.diagnosis.triangle)):  # fmt: skip
             assert one.number == other.number
-        residual = gathered(simulation.model.points, together.stuck.residual)
+        residual = gathered(simulation.problem.points, together.stuck.residual)
         residual[[0, 5]] = 0.0
         sizes = np.linalg.norm(residual, axis=1)
         assert together.diagnosis.vertex.number == sizes.argmax()
@@ -196,7 +196,7 @@ def test_a_load_step_that_gives_up(comm: MPI.Comm, monkeypatch: pytest.MonkeyPat
         force = failure.stuck.residual
         assert np.sqrt(comm.allreduce(float(np.vdot(force, force)))) == pytest.approx(failure.diagnosis.norm)
         # the state is the one before the load step, the iterate another
-        x = simulation.model.system.x[: simulation.model.points.n_owned]
+        x = simulation.problem.system.x[: simulation.problem.points.n_owned]
         assert comm.allreduce(float(np.abs(x[:, 2]).max(initial=0.0)), MPI.MAX) == 0.0
         assert comm.allreduce(float(np.abs(failure.stuck.position - x).max(initial=0.0)), MPI.MAX) > 0.0
 

@@ -270,7 +270,7 @@ def test_a_soft_handle_pulls_towards_the_moving_target() -> None:
 def test_a_fading_handle_weakens_as_the_fourth_power_and_then_is_gone(soft: bool) -> None:
     handle = {"nodes": [0], "until": 0.1, "fade": 0.2} | ({"stiffness": 400.0} if soft else {})
     with Simulation(held_scene([handle]), MPI.COMM_SELF) as simulation:
-        spring = simulation.model.terms["spring"]
+        spring = simulation.problem.terms["spring"]
         assert isinstance(spring, Spring)
         full = 400.0 if soft else 1000.0
         start = simulation.x[0]

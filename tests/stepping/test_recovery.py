@@ -30,7 +30,7 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     """Positions at the end and rejected steps; attempts of these numbers are made to fail."""
     time = {"end": 0.12, "step": step, "integrator": integrator}
     simulation = Simulation(comm, scene_of(SCENE | {"time": time}))
-    system, attempts = simulation.model.system, 0
+    system, attempts = simulation.problem.system, 0
     residual = system.residual
 
     def spoiled(v: Array, vdot: Array, out: Array) -> None:
@@ -50,7 +50,7 @@ def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int
     rejected = 0
     while not simulation.finished:
         rejected += simulation.step().rejected
-    x = gathered(simulation.model.points, system.x)
+    x = gathered(simulation.problem.points, system.x)
     simulation.destroy()
     for name in simulation.stepper.our_options:
         PETSc.Options().delValue(name)

@@ -29,8 +29,8 @@ def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
     simulation = Simulation(comm, scene_of(scene))
     while not simulation.finished:
         simulation.step()
-    points = simulation.model.points
-    lowest = float(gathered(points, simulation.model.system.x)[:, 2].min())
+    points = simulation.problem.points
+    lowest = float(gathered(points, simulation.problem.system.x)[:, 2].min())
     notes = [note for note in simulation.notes if "round-off" in note]
     simulation.destroy()
     return lowest, notes

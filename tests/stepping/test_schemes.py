@@ -119,7 +119,7 @@ def test_handles_are_where_their_motion_says(integrator: str, comm: MPI.Comm) ->
         start = simulation.x
         simulation.run(0.05, 5)
         held = simulation.system.held
-        points = simulation.model.points
+        points = simulation.problem.points
         goal = start[points.original].copy()
         simulation.system.prescribed.targets(simulation.time, simulation.time, simulation.time, goal)
         for number in held.active(simulation.time, simulation.time):

@@ -89,7 +89,7 @@ def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, l
     simulation = Simulation(comm, scene)
     for _ in range(25):
         simulation.step()
-    x = gathered(simulation.model.points, simulation.model.system.x)
+    x = gathered(simulation.problem.points, simulation.problem.system.x)
     simulation.destroy()
     for name in ["ksp_rtol", *simulation.stepper.our_options]:
         PETSc.Options().delValue(name)

@@ -51,12 +51,12 @@ def motion(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
 
 def out_of_balance(simulation: Simulation) -> float:
     """Largest force [N] on a free coordinate."""
-    system = simulation.model.system
+    system = simulation.problem.system
     return float(simulation.comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
 
 
 def shape(simulation: Simulation) -> Array:
-    return gathered(simulation.model.points, simulation.model.system.x)
+    return gathered(simulation.problem.points, simulation.problem.system.x)
 
 
 MOVED = {

@@ -29,7 +29,7 @@ def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:
 
 
 def state_of(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
-    return simulation.model.system.x, simulation.model.system.v
+    return simulation.problem.system.x, simulation.problem.system.v
 
 
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
@@ -39,16 +39,16 @@ def test_positions_are_as_near_as_asked(
 ) -> None:
     asked = Simulation(comm, scene_of(sheet(stiffness, dt, tolerance)))
     exact = Simulation(comm, scene_of(sheet(stiffness, dt, 1e-11)))
-    spacing = asked.model.outline.spacing
+    spacing = asked.problem.outline.spacing
     iterations = []
     while not asked.finished:
         for values, state in zip(state_of(exact), state_of(asked), strict=True):
-            points = exact.model.points
-            values[: points.n_owned] = gathered(asked.model.points, state)[points.original]
+            points = exact.problem.points
+            values[: points.n_owned] = gathered(asked.problem.points, state)[points.original]
             points.update_ghosts(values)
         report, beside = asked.step(), exact.step()
         iterations.append((report.newton_iterations, beside.newton_iterations))
-        x, true = (gathered(one.model.points, one.model.system.x) for one in (asked, exact))
+        x, true = (gathered(one.problem.points, one.problem.system.x) for one in (asked, exact))
         assert np.abs(x - true).max() <= tolerance * spacing
         assert report.left <= tolerance * spacing
     assert any(fewer < more for fewer, more in iterations)

@@ -14,10 +14,10 @@ from leftovers import ENDLESS, SHEET, announced, wait_for_states
 SLOW_SET_UP = """
 import sys, time
 from pathlib import Path
-import lyra_petsc.stepping.problem as model
+import lyra_petsc.stepping.problem as problem
 from lyra_petsc.cli.app import run_command_line
 
-build = model.build_mesh
+build = problem.build_mesh
 
 def slow(*arguments, **keywords):
     Path("in-set-up").touch()
@@ -25,7 +25,7 @@ def slow(*arguments, **keywords):
         time.sleep(0.01)
     return build(*arguments, **keywords)
 
-model.build_mesh = slow
+problem.build_mesh = slow
 sys.exit(run_command_line(sys.argv))
 """
 

@@ -54,8 +54,8 @@ def simulation(name: str, tmp_path: Path) -> Iterator[Simulation]:
 
 @pytest.fixture
 def term(simulation: Simulation, name: str) -> Term:
-    assert name in simulation.model.terms, f"the example scene does not activate '{name}'"
-    return simulation.model.terms[name]
+    assert name in simulation.problem.terms, f"the example scene does not activate '{name}'"
+    return simulation.problem.terms[name]
 
 
 def disturbed(x: Array, size: float, seed: int = 3) -> Array:
@@ -147,7 +147,7 @@ def test_regularised_hessian_is_positive_semidefinite(
 def test_exact_hessian_of_a_compressed_sheet_is_indefinite(tmp_path: Path) -> None:
     # what the regularisation is there for: without it the test above would say nothing
     with example("membrane", tmp_path) as simulation:
-        term = simulation.model.membrane
+        term = simulation.problem.membrane
         matrices = element_hessians(term, 0.4 * simulation.system.x, None, 0.0)
     assert np.linalg.eigvalsh(matrices).min() < -0.1
 

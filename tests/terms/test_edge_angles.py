@@ -50,10 +50,10 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array,
     simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
     while not simulation.finished:
         simulation.step()
-    budget, layout = simulation.budget, simulation.model.points
+    budget, layout = simulation.budget, simulation.problem.points
     energies = np.array([budget.kinetic, budget.membrane, budget.bending, budget.potential])
     reactions = np.array(simulation.ledger.handle_forces(1))
-    found = gathered(layout, simulation.model.system.x), energies, reactions, layout.n_edges_global
+    found = gathered(layout, simulation.problem.system.x), energies, reactions, layout.n_edges_global
     for name in [*petsc, *simulation.stepper.our_options]:
         database.delValue(name)
     simulation.destroy()
@@ -117,7 +117,7 @@ def test_every_linear_solver(comm: MPI.Comm, name: str, monkeypatch: pytest.Monk
 def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> None:
     """Δ(kinetic + potential) = −½‖Δv‖² + E(x₁) − E(x₀) − ∇E(x₁)·Δx, of vertices and edges."""
     simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS, "solver": TIGHT}))
-    system = simulation.model.system
+    system = simulation.problem.system
     n, elastic = system.points.n_owned, system.elastic
 
     def energy(x: Array) -> float:
@@ -144,8 +144,8 @@ def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> No
 def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
     """Gradient and Hessian against differences, with both kinds of unknowns, in the assembled matrix."""
     simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS}))
-    system, layout = simulation.model.system, simulation.model.points
-    term = simulation.model.terms["edge-angle"]
+    system, layout = simulation.problem.system, simulation.problem.points
+    term = simulation.problem.terms["edge-angle"]
     assert isinstance(term, Elastic)
     turn = rotation([1.0, 2.0, 0.5], 0.9)
 
@@ -226,7 +226,7 @@ def test_a_run_goes_on_with_other_ranks(
         again.settle()
         again.close()
         np.testing.assert_allclose(
-            gathered(resumed.model.points, resumed.model.system.x), whole, rtol=0.0, atol=2e-8
+            gathered(resumed.problem.points, resumed.problem.system.x), whole, rtol=0.0, atol=2e-8
         )
         resumed.destroy()
     few.Free()
@@ -235,7 +235,7 @@ def test_a_run_goes_on_with_other_ranks(
 
 def test_without_it_there_are_no_unknowns_but_the_vertices(comm: MPI.Comm) -> None:
     simulation = Simulation(comm, scene_of(SCENE))
-    layout = simulation.model.points
+    layout = simulation.problem.points
     assert layout.n_owned == layout.n_vertices == len(layout.original)
     assert len(layout.padding) == len(layout.edges) == layout.n_edges_global == 0
     assert simulation.stepper.velocity.getSize() == 3 * layout.n_vertices_global

@@ -63,7 +63,7 @@ def test_regularisation_keeps_the_stress_of_extension_along_the_material_axes(
     mesh = obj_file(tmp_path / "one.obj", [(0, 0, 0), (1, 0.1, 0), (0.2, 0.8, 0)], [(0, 1, 2)])
     f = rotation([0, 0, 1], 0.4)[:2, :2] @ np.diag(stretches) @ rotation([0, 0, 1], 0.7)[:2, :2]
     with Simulation({"mesh": mesh}, MPI.COMM_SELF) as simulation:
-        membrane = simulation.model.membrane
+        membrane = simulation.problem.membrane
         x = simulation.system.x.copy()
         x[:, :2] = x[:, :2] @ f.T
         exact, regularised = (hessian(membrane, x, None, blend) for blend in (0.0, 1.0))
@@ -95,7 +95,7 @@ def test_energy_strain_stress_and_boundary_forces(patch: Simulation, row: list[o
 
     assert patch.energy("membrane") == pytest.approx(AREA * float(density), rel=1e-12, abs=1e-12)
 
-    membrane = patch.model.membrane
+    membrane = patch.problem.membrane
     strains, stresses = membrane.strain_and_stress(patch.system.x)
     e11, e22, shear = green
     np.testing.assert_allclose(strains, np.tile([e11, e22, 0.5 * shear], (8, 1)), rtol=1e-12, atol=1e-14)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def bending_of(simulation: Simulation) -> Bending:
-    term = simulation.model.terms["bending"]
+    term = simulation.problem.terms["bending"]
     assert isinstance(term, Bending)
     return term
 
@@ -29,7 +29,7 @@ def test_cylinder_at_rest_is_curved_and_free_of_force(tmp_path: Path) -> None:
         assert np.abs(bending.angles(simulation.system.x)).max() > 0.1
         force = np.zeros_like(simulation.system.x)
         bending.add_gradient(simulation.system.x, None, force)
-        simulation.model.membrane.add_gradient(simulation.system.x, None, force)
+        simulation.problem.membrane.add_gradient(simulation.system.x, None, force)
         assert np.abs(force).max() < 1e-11
         before = simulation.x
         np.testing.assert_allclose(simulation.run(0.05, 3), before, atol=1e-13)

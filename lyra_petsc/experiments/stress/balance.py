@@ -107,7 +107,7 @@ class Accountant:
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
-        self._system = simulation.model.system
+        self._system = simulation.problem.system
         pulls = [term for term in self._system.elastic if term.registration.role is Role.CONSTRAINT]
         self._pulling, self._elastic = pulls, [t for t in self._system.elastic if t not in pulls]
         self.look()
@@ -219,7 +219,7 @@ class Accountant:
         free = ~system.prescribed.mask[: system.points.n_owned]
         squares = np.array([float(np.sum(part**2, where=free)) for part in parts.values()])
         norms = dict(zip(parts, np.sqrt(system.points.comm.allreduce(squares)).tolist(), strict=True))
-        floor = residual_roundoff(system, max(reach, simulation.model.outline.reach))
+        floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
         promised = max(simulation.scene.solver.force_tolerance * max(norms.values()), floor)
         return promised, floor, max(norm for name, norm in norms.items() if name != "internal")
 

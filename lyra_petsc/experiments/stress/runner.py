@@ -83,7 +83,7 @@ class BaseClock:
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
         seconds: list[tuple[float, float]] = []
         with Bench(self._comm, self._watch, exact=False) as bench, bench.simulation(content) as trial:
-            self.size = trial.simulation.model.outline.size
+            self.size = trial.simulation.problem.outline.size
             while not trial.simulation.finished:
                 began = time.process_time()
                 seconds.append((trial.step().wall_seconds, time.process_time() - began))
@@ -150,10 +150,10 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
     """Step to the end, or to the deadline, and note everything."""
     simulation = trial.simulation
     comm = simulation.comm
-    mesh = simulation.model.mesh
+    mesh = simulation.problem.mesh
     record.triangles = mesh.triangles if mesh is not None else None
     if case.shape is not None:
-        shape = case.shape(trial.x, simulation.model.outline.spacing)
+        shape = case.shape(trial.x, simulation.problem.outline.spacing)
         trial.set_state(x=shape)
         simulation.ledger.measure()
     record.start_energy = _energy(trial)

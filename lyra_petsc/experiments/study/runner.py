@@ -68,7 +68,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
 
 def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
     with simulated(comm, scene) as simulation:
-        simulation.model.release()
+        simulation.problem.release()
         if not simulation.finished:
             simulation.step()
 
@@ -84,11 +84,11 @@ def _repeat(
         set_up = time.perf_counter() - began
         recorder = None
         if repeat == 0:
-            result.describe(simulation.model.outline, _sheets(comm, scene))
+            result.describe(simulation.problem.outline, _sheets(comm, scene))
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)
-        simulation.model.release()
+        simulation.problem.release()
         run, reports = 0.0, []
         while not simulation.finished:
             started = time.perf_counter()

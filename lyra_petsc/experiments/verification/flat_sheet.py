@@ -42,13 +42,13 @@ class HingeBlocks:
 
 def hinge_blocks(trial: Trial) -> HingeBlocks:
     """The bending term's Hessians at the start shape, each hinge once; collective."""
-    model = trial.simulation.model
-    term = next(term for term in model.terms.values() if isinstance(term, Bending))
+    problem = trial.simulation.problem
+    term = next(term for term in problem.terms.values() if isinstance(term, Bending))
     n = term.n_owned
-    slopes = _slopes(model.system.x[term.stencil[:n], :2])
+    slopes = _slopes(problem.system.x[term.stencil[:n], :2])
     blocks = 2.0 * term.elements.data["k"][:n, None, None] * slopes[:, :, None] * slopes[:, None, :]
     mine = (term.elements.index[:n], mesh_numbers(trial)[term.stencil[:n]], blocks)
-    pieces = model.points.comm.allgather(mine)
+    pieces = problem.points.comm.allgather(mine)
     index, stencils, blocks = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
     order = np.argsort(index)
     return HingeBlocks(stencils[order], blocks[order])
@@ -75,7 +75,7 @@ def _slopes(corners: Array) -> Array:
 
 def mesh_numbers(trial: Trial) -> Ints:
     """Number in the mesh of every local vertex (n_local,); collective."""
-    points = trial.simulation.model.points
+    points = trial.simulation.problem.points
     of_global: Ints = np.concatenate(points.comm.allgather(points.original))
     return of_global[points.global_number]
 
@@ -138,12 +138,12 @@ class Stiffness:
 
 def stiffness(trial: Trial) -> Stiffness:
     """Bending and clamps of the start shape, assembled by the program; collective."""
-    model = trial.simulation.model
-    system, pattern, points = model.system, model.pattern, model.points
+    problem = trial.simulation.problem
+    system, pattern, points = problem.system, problem.pattern, problem.points
     rows = BlockRows(pattern)
     values = rows.zeros()
     for name in BENDING_TERMS:
-        term = model.terms.get(name)
+        term = problem.terms.get(name)
         if isinstance(term, Elastic):
             frozen = term.freeze(Step(0.0, 1.0, 1.0, system.x, system.reference.at))
             rows.add_stiffness(term, system.x, frozen, 0.0, 1.0, values)

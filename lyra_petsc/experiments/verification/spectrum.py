@@ -45,11 +45,11 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     SolverError
         If the iteration does not converge, as where the state is unstable.
     """
-    model = trial.simulation.model
-    system, points = model.system, model.points
-    rows, n = BlockRows(model.pattern), points.n_owned
+    problem = trial.simulation.problem
+    system, points = problem.system, problem.points
+    rows, n = BlockRows(problem.pattern), points.n_owned
     values = rows.zeros()
-    for term in model.terms.values():
+    for term in problem.terms.values():
         if isinstance(term, Elastic):
             rows.add_stiffness(term, system.x, system.frozen[term], 0.0, 1.0, values)
     held = np.zeros((points.n_local, 3))
@@ -57,7 +57,7 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     points.update_ghosts(held)
     mask = held > 0.5
     rows.constrain(values, mask, rows.beside(mask)[0])
-    matrix = AssembledMatrix(points, model.pattern, "aij")
+    matrix = AssembledMatrix(points, problem.pattern, "aij")
     matrix.set(values)
     solver = direct_solver(points.comm, matrix.mat, "verify_modes_")
     mass = np.where(mask[:n], 0.0, system.mass[:, None]).ravel()
@@ -72,7 +72,7 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
 
 def _first_vectors(trial: Trial, held: NDArray[np.bool_], count: int) -> Array:
     """Random vectors (3 n_owned, m), the same on any number of ranks; zero where held."""
-    points = trial.simulation.model.points
+    points = trial.simulation.problem.points
     n_free = points.comm.allreduce(int(np.sum(~held)))
     m = min(2 * count + MORE_VECTORS, n_free)
     random = np.random.default_rng(0).standard_normal((points.n_global, 3, m))[points.original]

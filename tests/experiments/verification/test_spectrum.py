@@ -26,15 +26,15 @@ SHEET: dict[str, Any] = {
 
 def dense(trial: Trial) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Every ω² of a simulation on one rank, from element Hessians summed here."""
-    model = trial.simulation.model
-    n = model.points.n_owned
+    problem = trial.simulation.problem
+    n = problem.points.n_owned
     stiffness = np.zeros((n, 3, n, 3))
-    for term in model.terms.values():
+    for term in problem.terms.values():
         if isinstance(term, Elastic):
-            blocks = blocks_of(term, model.system.x, model.system.frozen[term])
+            blocks = blocks_of(term, problem.system.x, problem.system.frozen[term])
             stiffness += summed(term.stencil, blocks, n)
-    free = ~model.system.held.mask(0.0, 0.0, n).ravel()
-    root = np.sqrt(np.repeat(model.system.mass, 3))[free]
+    free = ~problem.system.held.mask(0.0, 0.0, n).ravel()
+    root = np.sqrt(np.repeat(problem.system.mass, 3))[free]
     matrix = stiffness.reshape(3 * n, 3 * n)[np.ix_(free, free)] / np.outer(root, root)
     return np.linalg.eigvalsh(matrix)
 

@@ -53,20 +53,20 @@ def patch_states(bench: Bench, n: float) -> Sequence[Measured]:
 
 
 def _of_state(trial: Trial, state: dict[str, Any]) -> list[Measured]:
-    model = trial.simulation.model
-    membrane, points = model.membrane, model.points
+    problem = trial.simulation.problem
+    membrane, points = problem.membrane, problem.points
     c = DATA["materials"][state["material"]]
     stiffness, area = max(c["c11"], c["c22"]), WIDTH * HEIGHT
-    energy = trial.total(membrane.energies(model.system.x)) / area
+    energy = trial.total(membrane.energies(problem.system.x)) / area
     force = np.zeros((points.n_local, 3))
-    membrane.add_gradient(model.system.x, None, force)
+    membrane.add_gradient(problem.system.x, None, force)
     x, y = trial.start.T[:2]
     inner = (x > NEAR) & (x < WIDTH - NEAR) & (y > NEAR) & (y < HEIGHT - NEAR)
     residual = np.abs(trial.gather(force)[inner]).max(initial=0.0)
     scale = float(max(stiffness, *np.abs(state["S"])))
     # [N] that one triangle of the mean size puts on a vertex
-    nodal = scale * float(np.sqrt(area / model.outline.n_triangles))
-    mine = membrane.strain_and_stress(model.system.x)[1][: membrane.n_owned]
+    nodal = scale * float(np.sqrt(area / problem.outline.n_triangles))
+    mine = membrane.strain_and_stress(problem.system.x)[1][: membrane.n_owned]
     stress = np.concatenate(points.comm.allgather(mine))
     measured = [
         Measured("energy per area", energy, state["energy"], "J/m²", max(stiffness, state["energy"])),
@@ -100,11 +100,11 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
         static = {"handles": handles, "motions": {"pull": pulled}, "time": {"analysis": "static"}}
         with bench.simulation(_scene(mesh, material, **static)) as trial:
             trial.run()
-            model = trial.simulation.model
+            problem = trial.simulation.problem
             exact = vertices * [along, across, 0.0]
             off = float(np.abs(trial.x - exact).max())
-            force = np.zeros((model.points.n_local, 3))
-            model.membrane.add_gradient(model.system.x, None, force)
+            force = np.zeros((problem.points.n_local, 3))
+            problem.membrane.add_gradient(problem.system.x, None, force)
             end = vertices[:, 0] > WIDTH - NEAR
             found = float(trial.gather(force)[end, 0].sum()) / HEIGHT
         name = f"{material}, stretched by {along:g}"
