@@ -1,9 +1,9 @@
-"""What kernels do with 3×3 blocks and numba has no words for.
+"""SIMD operations on 3×3 blocks, and prefetching, as LLVM code that numba calls.
 
-A row of blocks is multiplied a column of a block at a time in the processor's vectors. Numba leaves such
-loops scalar; here they are written in LLVM's language, which every processor has vectors or a substitute
-for. Blocks are (n_blocks, 9), column by column. A fourth number is read, and computed, with each three; of
-the blocks it is always one of the same block. And what will soon be needed is fetched into the caches.
+Numba leaves these loops scalar. Blocks are (n_blocks, 9), column by column; a row of blocks is multiplied
+one column of a block at a time. A fourth number is read and computed with each three; of the blocks it is
+always one of the same block. ``tests/kernels/plain_vectors.py`` has the same functions in plain numba;
+docs/performance.md says what the difference is.
 """
 
 from __future__ import annotations
