@@ -73,7 +73,7 @@ def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -
         Called without arguments on rank 0.
     share : bool
         With ``False`` the result stays on rank 0 (others get ``None``) and only the
-        outcome is told: for results as large as a mesh.
+        outcome is sent: for results as large as a mesh.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def plain_table(words: Sequence[str], numbers: Sequence[str]) -> Table:
 
 
 class Terminal:
-    """Tells of cases on the terminal; on rank 0, without a word on others.
+    """Shows the progress of cases on the terminal; on rank 0 only.
 
     Parameters
     ----------

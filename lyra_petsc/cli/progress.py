@@ -57,7 +57,7 @@ class ProgressBar:
         """Print a line for the user, above the bar."""
         if not self._shown:
             return
-        with suppress(OSError):  # a run goes on also if nobody reads its messages
+        with suppress(OSError):  # a run goes on also if its messages cannot be written
             if self._bar is not None:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:

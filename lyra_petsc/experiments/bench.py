@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
-"""Where a scene of a case says nothing: Newton being quadratic, it ends at round-off."""
+"""Default where a case's scene has no tolerance: Newton being quadratic, it ends at round-off."""
 
 
 @contextmanager
@@ -214,7 +214,7 @@ class Bench:
     def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
         """Set a scene up; freed, with the options it set, when the block ends; collective.
 
-        ``content`` is a scene as in a file. Filled in where it says nothing: no output times, and on an
+        ``content`` is a scene as in a file. Defaults that are filled in: no output times, and on an
         exact bench a direct linear solver and tight tolerances.
         """
         filled: dict[str, Any] = {"output": {"every": None}} | dict(content)

@@ -61,7 +61,7 @@ class View(ABC, Generic[O]):
 
 
 class Show(Protocol[C, O]):  # type: ignore[misc]
-    """Who is told of the cases as they run."""
+    """Receives the cases as they run."""
 
     def begin(self, case: C) -> None:
         """A case begins."""

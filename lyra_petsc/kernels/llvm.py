@@ -188,7 +188,7 @@ class Code:
             at = at if at.type == INDEX else builder.sext(at, INDEX)
             self.add_block(self.at(begin, at, 9), *blocks[pair])
 
-        # whoever has the rows of all three points has all blocks
+        # a rank that owns the rows of all three points owns all blocks
         own = builder.or_(builder.or_(offsets[0], offsets[3]), offsets[5])
         with builder.if_else(self.is_ours(own), likely=True) as (all_of_them, some):
             with all_of_them:

@@ -57,7 +57,7 @@ def _gather(typing: Any, blocks: Any, columns: Any, x: Any, lo: Any, hi: Any, ah
 
 
 def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
-    """out[columns[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; out (n, 4), the last of no meaning."""
+    """out[columns[k]] += blocks[k]ᵀ factors for lo ≤ k < hi; out (n, 4), its last column is padding."""
     _check(blocks, out)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -66,7 +66,7 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
         row = code.filled(code.numbers("factors"))
         with code.loop() as (k, _):
             a, b, c = (code.times(column, row) for column in code.columns(code.at(block_rows, k, 9)))
-            # the sums of a, b and c, whose fourth numbers mean nothing
+            # the sums of a, b and c, without their padding
             ab, last = code.pick(a, b, 0, 4, 1, 5), code.pick(a, b, 2, 6, 2, 6)
             first, second = code.pick(ab, c, 0, 1, 4, 4), code.pick(ab, c, 2, 3, 5, 5)
             total = code.plus(code.plus(first, second), code.pick(last, c, 0, 1, 6, 6))

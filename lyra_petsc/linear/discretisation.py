@@ -3,7 +3,7 @@
 Terms with fixed stencils give a pattern once. Terms whose stencils change (``Registration.neighbours``) look
 for their elements anew when a vertex has moved by more than half their skin; points of other ranks that they
 need become further ghosts, after the present ones, so that what fixed stencils refer to stays where it is.
-The pattern behind follows when a matrix is wanted (`Discretisation.renew_pattern`). Whoever keeps arrays of
+The pattern behind follows when a matrix is wanted (`Discretisation.renew_pattern`). Code that keeps arrays of
 n_local rows or of n_blocks blocks compares them with ``layout`` and ``rows``.
 """
 

@@ -82,7 +82,7 @@ class SharedBlocks:
         self._target = np.zeros(0, dtype=np.int64)
 
     def into(self, target: Ints) -> None:
-        """Say where each block that comes in is to be added; ``rows`` and ``columns`` are let go."""
+        """Set where each received block is to be added; frees ``rows`` and ``columns``."""
         self._target = target
         self.rows = self.columns = np.empty(0, dtype=np.int64)
 

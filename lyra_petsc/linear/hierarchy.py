@@ -106,7 +106,7 @@ class Hierarchy:
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
         """Of each level, finest first, the block rows that those of the finest make; collective.
 
-        Each is made when it is asked for, and there is room for it only if the one before is let go.
+        Each is made when it is asked for, and the one before should be freed by then.
 
         Parameters
         ----------

@@ -124,7 +124,7 @@ class AssembledMatrix:
     points : Points
     pattern : BlockPattern
     kind : str
-        PETSc matrix type where ``-mat_type`` says nothing (``baij``, ``aij``, ``sbaij``).
+        PETSc matrix type without ``-mat_type`` (``baij``, ``aij``, ``sbaij``).
     prefix : str
         Of the options that count, such as ``-mat_type``.
     diagonal : bool
@@ -162,7 +162,7 @@ class AssembledMatrix:
             self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
         _set_vec_type(self.mat)
         self.mat.setUp()
-        # zeros that nobody touches take no memory
+        # zeros that are never read or written take no memory
         self._stored.insert(np.zeros((pattern.n_blocks, 3, 3)), self.mat)
         self._storage: Storage | None = None
         ascending = bool(np.all(np.diff(points.ghosts) > 0))

@@ -23,7 +23,7 @@ READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidu
 
 
 def fill_gaps(options: Mapping[str, Value]) -> list[str]:
-    """Set each option that nobody has set; returns the names that were set."""
+    """Set each option that is not set yet; returns the names that were set."""
     database = PETSc.Options()
     filled = []
     for name, value in options.items():

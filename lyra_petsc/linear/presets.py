@@ -68,7 +68,7 @@ PRESETS: dict[str, dict[str, Value]] = {
 }
 
 CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
-"""Krylov methods that but multiply by their operator, and watch the true residual if they are told to."""
+"""Krylov methods that only multiply by their operator, and can monitor the true residual."""
 
 INCOMPLETE = ("ilu", "block-ilu")
 FACTORISATIONS = ("direct", "cholesky")
@@ -169,6 +169,6 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
 
 
 def matrix_type(preset: str) -> str:
-    """PETSc matrix type that a preset's preconditioner is built from, where ``-mat_type`` says nothing."""
+    """PETSc matrix type that a preset's preconditioner is built from, without ``-mat_type``."""
     blocks = PETSc.Options().getString("pc_type", "") in BAIJ_PRECONDITIONERS or preset == "block-ilu"
     return "baij" if blocks else "aij"

@@ -141,7 +141,7 @@ class Smoother:
     def after(self, coarse: Floats) -> None:
         """Add what the coarser level found, and sweep; collective.
 
-        What is interpolated to ghosts is not worth a message: ``before`` left them as their owners have them.
+        Ghosts are interpolated here as by their owners, without a message: ``before`` left them up to date.
         """
         self._coarse.update_ghosts(coarse)
         sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
@@ -262,7 +262,7 @@ class VCycle:
         self.detach()
 
     def detach(self) -> None:
-        """Let go of the levels; collective."""
+        """Free the levels; collective."""
         for level in self._levels:
             if isinstance(level, Coarsest):
                 level.destroy()

@@ -127,7 +127,7 @@ def _parse(text: str, path: Path) -> _Raw:
 
 
 class _FaceError(ValueError):
-    """A face whose mistake has words."""
+    """A malformed face, with the message for it."""
 
 
 def _parse_face(raw: _Raw, parts: list[str], number: int) -> None:

@@ -55,7 +55,7 @@ def _bending_energy(problem: Problem) -> Array:
 
 def _curvature(problem: Problem) -> Array:
     bending, x = _bending(problem), problem.system.x
-    # what a collapsed triangle has for an angle says nothing
+    # the angle of a collapsed triangle is undefined
     angles = bending.weights(x) * bending.angles(x)
     return _to_vertices(problem, bending, -bending.elements.data["length"] * angles)
 

@@ -11,7 +11,7 @@ from typing import Any
 def import_h5py() -> Any:
     """h5py, with HDF5's file locks off: they fail on some cluster file systems.
 
-    Nothing is lost with them: files are written under a name nobody else opens, and have
+    Nothing is lost with them: files are written under a name that no other process opens, and have
     their final name only when complete. ``HDF5_USE_FILE_LOCKING`` set by the user stands.
     """
     os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")

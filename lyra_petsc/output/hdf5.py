@@ -2,7 +2,7 @@
 
 A file is built in three steps, so that a full disk is met where it does no harm: one rank
 reserves the whole size and lays the file out, then all ranks write their slabs, then it is
-synced and takes its name, for which nobody need wait. (An HDF5 file that cannot grow while
+synced and renamed in the background. (An HDF5 file that cannot grow while
 it is closed takes the process down with it.) As datasets are contiguous and have their
 places then, the slabs need no HDF5: its collective open alone takes longer than writing a
 state of moderate size. On one machine all ranks write at once, as processes may; on several

@@ -30,7 +30,7 @@ from lyra_petsc.stepping.simulation import Simulation, StepReport
 Array = NDArray[np.float64]
 
 MOST_CHANGES = 12
-"""Changes of a resumed scene that are told one by one."""
+"""Changes of a resumed scene that are listed one by one."""
 
 CHEAP = 100.0
 """Time since the last checkpoint, over the time that took (with a state, if one was due), from which on
@@ -319,7 +319,7 @@ class Recorder:
         assert failure is not None
         system, n = simulation.problem.system, simulation.problem.points.n_vertices
         stuck = failure.stuck.of_vertices(n)
-        before = {"velocity": system.v[:n]}  # the equations of the failed step say nothing of it
+        before = {"velocity": system.v[:n]}  # the equations of the failed step do not hold it
         failing = {"velocity": stuck.velocity, "residual": stuck.residual}
         # a number that is not finite has no place in space
         position = np.where(np.isfinite(stuck.position), stuck.position, system.x[:n])

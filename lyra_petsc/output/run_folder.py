@@ -365,7 +365,7 @@ class FolderLock:
             return False
 
     def release(self) -> None:
-        """Remove the file, then let go."""
+        """Remove the file, then release the lock."""
         with suppress(OSError):  # the folder itself may be gone
             if self._stands():
                 self.path.unlink()
@@ -384,5 +384,5 @@ def in_use(folder: Path) -> bool:
     except OSError:
         return True
     finally:
-        os.close(descriptor)  # lets go at once
+        os.close(descriptor)  # releases the lock at once
     return False

@@ -22,7 +22,7 @@ _TYPES: dict[str, tuple[type, ...]] = {"null": (), "number": (int, float), "stri
 
 @dataclass(frozen=True)
 class Rule:
-    """What the keys of a block have to obey, and what the scene's author is told otherwise.
+    """A condition on the keys of a block, and the message where it is violated.
 
     Attributes
     ----------

@@ -814,7 +814,7 @@ def _named(value: Any) -> Any:
 
 
 class Scene(Block):
-    """Everything a run is told.
+    """The whole input of a run.
 
     Attributes
     ----------

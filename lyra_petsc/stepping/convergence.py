@@ -18,7 +18,7 @@ FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
 SLOWEST = 0.5
-"""Fraction of the increment before above which an increment says nothing of the next ones."""
+"""Fraction of the increment before above which increments are not extrapolated."""
 
 RECENT = 0.1
 """Weight of the last Newton iteration in the mean of linear iterations that judges the linear solver."""

@@ -1,4 +1,4 @@
-"""Where the linear solve of a semi-implicit step sets out: a polynomial in time through past velocities."""
+"""Initial guess of the linear solve of a semi-implicit step: a polynomial in time through past velocities."""
 
 from __future__ import annotations
 

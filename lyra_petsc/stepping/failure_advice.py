@@ -1,6 +1,6 @@
 """What may be the cause of a failed solve, and which key of the scene or option to change.
 
-Rules, most telling first; each looks at a diagnosis and names what to change, or says nothing.
+Rules, the most specific first; each looks at a diagnosis and names what to change, or returns None.
 """
 
 from __future__ import annotations

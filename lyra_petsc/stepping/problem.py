@@ -91,7 +91,7 @@ class Problem:
     tags: Array | None
 
     def release(self) -> None:
-        """Let go of the whole mesh; from here on no rank holds a global array."""
+        """Free the whole mesh; from here on no rank holds a global array."""
         self.mesh = None
         _give_back_freed()
 
@@ -232,7 +232,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     system.x[rows] = data["position"]
     layout.update_ghosts(system.x)
     surface = Surface(system.x.copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil)
-    # handles set out from the undisturbed shape
+    # handles start from the undisturbed shape
     system.begin(0.0)
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)

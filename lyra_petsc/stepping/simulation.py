@@ -338,7 +338,7 @@ class Simulation:
         for name, value in memory["budget"].items():
             if name != "more":
                 setattr(self.budget, name, float(value))
-        # what a changed scene lets begin before now sets out from here; else all has begun already
+        # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)
         system.rest_at(self.time)
         self.ledger.measure()

@@ -74,7 +74,7 @@ class StageEquations:
     load_factor : float
         Factor on all loads (1 in a motion).
     unbalanced, given_loads : (n_owned, 3) or None
-        Static: force [N] of the start shape, let go of with the load factor; loads in place of the present.
+        Static: force [N] of the start shape, reduced as the load factor grows; loads in place of the present.
     """
 
     def __init__(
@@ -137,7 +137,7 @@ class StageEquations:
         return self.state.v
 
     def begin(self, time: float) -> None:
-        """Let everything that starts to act by ``time`` [s] set out from the present positions."""
+        """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
         self.reference.until(time, self.x)
 
     def rest_at(self, time: float) -> None:

@@ -135,7 +135,7 @@ class ToleranceControl(StepControl):
         planned = self.factor * self.step
         allowed = math.inf if ratio == 0.0 else dt * SAFETY * ratio ** (-1.0 / order)
         stands = ratio <= 1.0 or dt <= self.smallest * (1.0 + SLACK)
-        # a step cut short to land somewhere says nothing against the longer one planned
+        # a step shortened to end at an output time is no reason against the longer one planned
         most = max(GROW * dt, planned) if stands else 0.9 * dt
         self.factor = max(min(max(allowed, SHRINK * dt), most, self.step), self.smallest) / self.step
         return stands

@@ -322,7 +322,7 @@ class Stepper:
         guess = u.getArray().reshape(self._shape)
         first_guess(self._equations, guess)
         if not self._iterates:
-            # the linear solve sets out from there; its tolerance stays relative to the whole
+            # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations
             ahead = self._extrapolation.to(equations.t1, equations.t0, equations.v[: len(guess)])
             equations.prescribe(ahead)

@@ -18,7 +18,7 @@ class HingeTriangles(NamedTuple):
     corners : (T, 3) int32
         As their hinges run around them: the first triangle's along the edge, the second's against it.
     sides : (E + 1, 2) int32
-        Side on which each hinge has its first and its second triangle; the last row is nobody's.
+        Side on which each hinge has its first and its second triangle; the last row is padding.
     hinges : (T, 3) int32
         Of the side opposite to each corner: twice its hinge, plus 1 in the second triangle; 2 E: none.
     """

@@ -137,7 +137,7 @@ class Window:
 
     @classmethod
     def of(cls, handle: Handle) -> Window:
-        """The window of a scene's handle; one that starts before t = 0 sets out at 0."""
+        """The window of a scene's handle; one that starts before t = 0 starts at 0."""
         return cls(max(handle.start, 0.0), handle.until, handle.fade)
 
     def holds(self, t0: float, t1: float) -> bool:

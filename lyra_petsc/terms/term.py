@@ -58,7 +58,7 @@ class Step:
         Positions [m] whose geometry stays as it is during the step.
     reference : callable
         Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time: where handles that
-        begin then set out from.
+        begin then start from.
     """
 
     start: float

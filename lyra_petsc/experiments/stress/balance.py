@@ -102,7 +102,7 @@ class Accountant:
     Parameters
     ----------
     simulation : Simulation
-        Before its first step; `look` must see every state from which a step sets out.
+        Before its first step; `look` must see every state from which a step starts.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -129,7 +129,7 @@ class Accountant:
         self._energy = energy(self._shell, system.x)
 
     def balance(self, report: StepReport) -> Balance:
-        """The balance of the step just accepted, which set out from the state looked at last."""
+        """The balance of the step just accepted, which started from the state looked at last."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
         x0, v0, x1, v1 = self._x, self._v, system.x, system.v

@@ -44,7 +44,7 @@ class Record:
     busy : list of float
         CPU time of each step [s], of the rank that took most.
     last : (V, 3) array or None
-        Positions [m] after the last step, on rank 0; None if none were gathered, or they are let go of.
+        Positions [m] after the last step, on rank 0; None if none were gathered, or they are freed.
     triangles : (F, 3) array or None
         On rank 0.
     """

@@ -186,7 +186,7 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
         raise
     finally:
         record.notes = list(simulation.notes)
-    # gathered to be drawn: once in a case, which other cases then let go of
+    # gathered to be drawn: once in a case, and freed by later cases
     record.last = _drawn(trial)
 
 

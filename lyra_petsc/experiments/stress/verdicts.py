@@ -12,7 +12,7 @@ from lyra_petsc.show.report.numbers import short
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 RESOLVED = 0.1
-"""Part of the forces that move a sheet, or of how far they do, that may be left before it means nothing."""
+"""Part of the forces that move a sheet, or of how far they do, below which the rest is negligible."""
 
 MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
 """Newton iterations a step of a stiff sheet may take, in the median and at worst."""
@@ -120,7 +120,7 @@ def momentum(record: Record) -> Verdict:
 
 
 def softening(record: Record) -> Verdict:
-    """A triangle compressed beyond where the model softens was told of."""
+    """A triangle compressed beyond where the model softens was reported."""
     smallest = record.stretches[0]
     if not smallest < SOFTENS_BELOW:
         return Verdict(True, f"no triangle below {SOFTENS_BELOW:.3f} of its length")

@@ -169,7 +169,7 @@ def badness(outcome: Outcome) -> tuple[float, ...]:
 
 
 def release_shapes(outcomes: Sequence[Outcome]) -> None:
-    """Let go of the shapes that the page will not show, since worse cases are there."""
+    """Free the shapes that the page will not show, since there are worse cases."""
     for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
         outcome.record.last = outcome.record.triangles = None
 

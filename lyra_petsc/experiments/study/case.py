@@ -1,4 +1,4 @@
-"""What a case is told and what comes of it; both are files, so that studies resume and launch processes."""
+"""Input and result of a case; both are files, so that studies resume and launch processes."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ class Lock:
                     key="--out",
                 ) from None
             except OSError:
-                pass  # a file system without locks: one is told so by nobody, and most have them
+                pass  # the file system has no locks
             if choice.force:
                 clear(path)
             (path / CASES).mkdir(exist_ok=True)
@@ -171,7 +171,7 @@ class Lock:
         return self._file.fileno()
 
     def release(self) -> None:
-        """Let go of the folder; not collective."""
+        """Release the lock of the folder; not collective."""
         if self._file is not None:
             self._file.close()
             self._file = None

@@ -103,7 +103,7 @@ def _what(plan: Plan, rows: Sequence[Row], facts: Mapping[str, Any]) -> list[str
         f"Scene: {facts['scene']}" + (f" ({plan.base.title})" if plan.base.title else ""),
         f"{len(rows)} combinations of {varied}; {len(rows) - len(done)} failed",
         f"Each was timed {times}, one at a time, on {facts['ranks']} MPI rank(s) of "
-        f"{facts['machine']}; after a step that warms up, median and range are told",
+        f"{facts['machine']}; after a warm-up step; median and range",
     ]
     meshes = dict.fromkeys((row.result.vertices, row.result.triangles) for row in done)
     found.append("Mesh: " + "; ".join(f"{v} vertices, {t} triangles" for v, t in meshes))

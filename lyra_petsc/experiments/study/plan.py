@@ -213,7 +213,7 @@ def _refuse_fixed(axis: Axis) -> None:
 
 
 def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
-    """Each value must be possible by itself; what clashes in combination is told in its row."""
+    """Each value must be possible by itself; conflicts in combination are reported in the row."""
     seen: dict[tuple[str, ...], Value] = {}
     for value in axis.values:
         found = overrides(base, [axis], [value])

@@ -1,4 +1,4 @@
-"""What errors are told of: ``--quantities``."""
+"""Quantities whose errors are measured: ``--quantities``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = ("position", "energy", "probes")
 
 @dataclass(frozen=True)
 class Quantity:
-    """One error that is told of each combination.
+    """One error that is measured of each combination.
 
     Attributes
     ----------

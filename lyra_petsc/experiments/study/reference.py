@@ -24,7 +24,7 @@ Physics = tuple[tuple[str, Value], ...]
 """The settings that make a scene another one, in the axes' order."""
 
 NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
-"""Keys in which the scene of a run to compare with may differ without a word."""
+"""Keys in which the scene of a run to compare with may differ without a note."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def _differences(plan: Plan, folder: Path) -> Sequence[str]:
     try:
         other = load_scene(folder / "scene.yaml")
     except InputError:
-        return ["the reference run's scene cannot be read, so nobody knows whether it is the same"]
+        return ["the reference run's scene cannot be read, so it is unknown whether it is the same"]
     keys = [
         name
         for name in type(plan.base).model_fields

@@ -34,7 +34,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     job : Job
     watch : callable
     warm : bool
-        Take one untimed step first, so that compiling and loading of kernels are charged to nobody.
+        Take one untimed step first, so that no case is charged with compiling and loading kernels.
 
     Returns
     -------

@@ -21,7 +21,7 @@ PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other"
 
 
 def order_axes(plan: Plan) -> list[str]:
-    """Keys of the axes along which orders are told."""
+    """Keys of the axes along which orders are reported."""
     return [axis.key for axis in plan.axes if axis.refines]
 
 

@@ -144,7 +144,7 @@ def film_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Calla
             messages.seek(0)
             lines = messages.read().decode(errors="replace").splitlines()
             # the cause stands behind the last colon of the first line
-            cause = lines[0].rpartition(": ")[2] if lines else "ffmpeg stopped without a word"
+            cause = lines[0].rpartition(": ")[2] if lines else "ffmpeg stopped without a message"
             return OutputError(f"{path}: cannot be written: {cause}")
 
         try:

@@ -73,7 +73,7 @@ class LivePage:
     def show(self, folder: Path) -> None:
         """Serve the page of a run whose first state has been written."""
         if self._process is not None and self._process.stdin is not None:
-            with suppress(OSError):  # `failed` is told
+            with suppress(OSError):  # `failed` reports it
                 self._process.stdin.write(f"{folder.absolute()}\n")
                 self._process.stdin.flush()
 
