@@ -42,6 +42,8 @@ OF_ONE_PROCESS = frozenset(
 
 def is_launched(environment: Mapping[str, str]) -> bool:
     """Whether this process was started by mpirun, mpiexec or srun."""
+    if environment.get("OMPI_MCA_ess") == "singleton":  # below a process that no launcher has started
+        return False
     if any(name in environment for name in LAUNCHER_VARIABLES):
         return True
     # only inside srun: a batch script has the first of these, too

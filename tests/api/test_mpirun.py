@@ -15,6 +15,7 @@ LEFT_BY_MPI_INIT = {
     "OMPI_MCA_orte_ess_num_procs": "1",
     "OMPI_MCA_pmix": "^s1,s2,cray,isolated",
     "ORTE_SCHIZO_DETECTION": "ORTE",
+    "PMIX_RANK": "0",
 }
 """Of Open MPI 4, in a process that no launcher has started."""
 
