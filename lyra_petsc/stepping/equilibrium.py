@@ -114,7 +114,7 @@ class Equilibrium:
             if force > WORSE * last:
                 self._integrator.pseudo *= SHRINK
             last = force
-            system.given_loads = relaxation.following(system.loads_now) if self._follows else None
+            system.given_loads = relaxation.following(system.loads_now.copy()) if self._follows else None
             attempt = self._stepper.attempt(before, factor)
             system.given_loads = None
             solves += 1

@@ -29,6 +29,7 @@ from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.integrators.integrator import Follower, Integrator, Stage
+from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
@@ -69,6 +70,8 @@ class StageEquations:
         stand at its stage.
     dt, t0, t1 : float
         Length, start and end of the step [s].
+    objective : Objective
+        The function whose gradient F is.
     followers : list of Follower
         Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
     load_factor : float
@@ -103,8 +106,8 @@ class StageEquations:
         internal = partial(self._sum, sheet)  # moving targets change the forces at one and the same place
         self._internal = internal if self._moving else Remembered(internal)
         once = integrator.lagged_loads
-        self._damping = Damping(discretisation, self.elastic, moves=integrator.moves, once=once)
-        last = (self._internal, self._damping.product) if once else ()
+        self.damping = Damping(discretisation, self.elastic, moves=integrator.moves, once=once)
+        last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
         self.state = State(discretisation)
         n_local = self.points.n_local
@@ -112,8 +115,8 @@ class StageEquations:
         self._xh, self.history = self.x, self.v[: self.points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
-        self._objectives: list[tuple[Array, tuple[float, float]]] = []
-        self.dt = self.t0 = self.t1 = self.moving_energy_before = self._size = 0.0
+        self.objective = Objective(self)
+        self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
         self.followers: list[Follower] = [integrator]
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
@@ -179,13 +182,13 @@ class StageEquations:
         x = self._frozen_positions(at)
         self.frozen = {}  # there is no room for both
         self.frozen = self._frozen_at(at, x)
-        self._objectives, self._size = [], float(np.abs(self.x).max(initial=0.0))
+        self.objective.begin_step()
         if self.integrator.moves or self.given_loads is None:
             self._load(x)
         else:
             self._force[:n] = self.given_loads
-        if self._damping.acts:
-            self._damping.freeze(x, self.frozen)
+        if self.damping.acts:
+            self.damping.freeze(x, self.frozen)
 
     def _frozen_at(self, at: float, x: Array) -> dict[Term, Any]:
         step = Step(self.t0, self.t1, at, x, self.reference.at)
@@ -237,8 +240,8 @@ class StageEquations:
 
     @property
     def loads_now(self) -> Array:
-        """The loads in force (n_owned, 3) [N]."""
-        return self._force[: self.points.n_owned].copy()
+        """The loads in force (n_owned, 3) [N]; overwritten by the next step."""
+        return self._force[: self.points.n_owned]
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
@@ -261,7 +264,7 @@ class StageEquations:
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
         n, given, free = self.points.n_owned, self.integrator.given, self.prescribed.free
-        self._evaluate_at(v)  # what the step's forces are taken at afterwards
+        self.evaluate_at(v)  # what the step's forces are taken at afterwards
         before, rate_before = self.x[:n].copy(), self.v[:n].copy()
         moved, rate = self.integrator.end(before, rate_before, v, self.dt)
         self.integrator.accepted(before, rate_before, free, self.dt)
@@ -286,7 +289,7 @@ class StageEquations:
         n = self.points.n_owned
         self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.frozen
         self.new_iterate(None)
-        self._objectives = []
+        self.objective.forget()
         self.stage = Stage(1.0 / self.dt, self.dt, self.dt)
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
@@ -301,13 +304,13 @@ class StageEquations:
         moved = None if v is None else self._xh[:n] + self.stage.reach * v
         self.stage, self.history, self._xh, stage_velocity, self.frozen = self._kept
         self.prescribed.release_vertices()
-        self._objectives = []
+        self.objective.forget()
         self.new_iterate(None)
         if moved is not None:
             rows = slice(self.points.n_vertices, n)
             self.x[rows] = moved[rows]
             self.state.update_ghosts()
-        self._evaluate_at(stage_velocity)
+        self.evaluate_at(stage_velocity)
 
     # -- terms -------------------------------------------------------------------------------------
 
@@ -329,11 +332,6 @@ class StageEquations:
         self.frozen |= {term: term.freeze(step) for term in (*self._moving, *self._constraints)}
         return self.moving_energy() - before
 
-    @cached_property
-    def _stiffnesses(self) -> dict[Term, Array]:
-        fixed = [term for term in self.elastic if not term.registration.neighbours]
-        return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}
-
     @property
     def limits_step(self) -> bool:
         """Whether terms limit how far a Newton iteration may go."""
@@ -341,7 +339,7 @@ class StageEquations:
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        x = self._evaluate_at(v)[0]
+        x = self.evaluate_at(v)[0]
         ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
         self.points.update_ghosts(ahead)
         fraction = min(term.largest_step(x, ahead, self.frozen[term]) for term in self._limiting)
@@ -365,7 +363,7 @@ class StageEquations:
         self.__dict__.pop("_vertex_rows", None)
         self.prescribed.fit()
 
-    def _evaluate_at(self, v: Array) -> tuple[Array, Array]:
+    def evaluate_at(self, v: Array) -> tuple[Array, Array]:
         """Positions and velocities (n_local, 3) of the stage, ghosts up to date; collective."""
         self._vs[: self.points.n_owned] = v
         self.points.update_ghosts(self._vs)
@@ -386,8 +384,8 @@ class StageEquations:
         if self._constraints:
             parts["springs"] = self._sum(self._constraints, x)
         parts["loads"] = -self._force[:n]
-        if self._damping.acts:
-            parts["damping"] = self._damping.product(vs)
+        if self.damping.acts:
+            parts["damping"] = self.damping.product(vs)
         if self.viscous and not self.integrator.lagged_loads:
             parts["wind"] = self._sum(self.viscous, vs)
         self._last_parts = parts
@@ -401,7 +399,7 @@ class StageEquations:
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
-        parts = self._parts(*self._evaluate_at(v), vdot).values()
+        parts = self._parts(*self.evaluate_at(v), vdot).values()
         reduce(lambda total, part: np.add(total, part, out=out), parts)
         at, velocity = self.prescribed.at, self.prescribed.velocity
         self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
@@ -419,18 +417,18 @@ class StageEquations:
         if v is None:
             self._iterates = None, None
         else:
-            self._iterates = self._iterates[1], self._evaluate_at(v)[0].copy()
+            self._iterates = self._iterates[1], self.evaluate_at(v)[0].copy()
 
     def forget_rows(self) -> None:
         """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
-        self._damping.let_go()
+        self.damping.let_go()
 
     def jacobian(self, v: Array, blend: float, values: Array) -> None:
         """Let block rows (n_blocks, 3, 3) be σ M + c K + D + ∇∇P, prescribed unknowns decoupled.
 
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
-        x, vs = self._evaluate_at(v)
+        x, vs = self.evaluate_at(v)
         rows, before = self.discretisation.rows, self._iterates[0]
         if before is not None and len(before) != len(x):
             before = None  # an iterate with other ghosts
@@ -440,8 +438,8 @@ class StageEquations:
             remembered.forget()
         inertia, reach = self.stage.sigma * self.mass, self.stage.reach
         blocks = self.prescribed.blocks
-        if blend < 1.0 or not self._damping.with_stiffness_into(x, reach, inertia, values, blocks):
-            self._damping.into(values, inertia)
+        if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
+            self.damping.into(values, inertia)
             for term in self.elastic:
                 rows.add_stiffness(term, x, self.frozen[term], blend, reach, values, before)
         if not lagged:
@@ -449,40 +447,3 @@ class StageEquations:
                 wind.add_hessian(vs, self.frozen[wind], rows.pattern.offsets, values)
         if len(self.prescribed.rows):
             rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
-
-    def objective(self, v: Array) -> tuple[float, float]:
-        """The function whose gradient F is, and what its round-off is relative to [W].
-
-        Collective. The latter is the size of its summands, and for each elastic energy the root of itself
-        times the energy at which strains are of order one: small strains are small differences of large
-        coordinates.
-        """
-        if self._objectives:
-            # a line search ends, and a first guess begins, where it was asked for already
-            same = np.array([int(np.array_equal(v, at)) for at, _ in self._objectives])
-            self.points.comm.Allreduce(MPI.IN_PLACE, same, MPI.MIN)
-            if same.any():
-                return self._objectives[int(same.argmax())][1]
-        result = self._objective(v)
-        self._objectives = [*self._objectives[-1:], (v.copy(), result)]
-        return result
-
-    def _objective(self, v: Array) -> tuple[float, float]:
-        n, sigma, rate = self.points.n_owned, self.stage.sigma, 1.0 / self.stage.reach
-        x, vs = self._evaluate_at(v)
-        change = v - self.history
-        parts, square = [0.5 * sigma * float(np.sum(self.mass[:, None] * change * change))], 0.0
-        for term in self.elastic:
-            each = term.energies(x, self.frozen[term])
-            parts.append(rate * float(each.sum()))
-            stiffness = self._stiffnesses.get(term)
-            if stiffness is None:
-                stiffness = term.force_scale(1.0)[: term.n_owned]
-            square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
-        parts.append(-rate * float(np.vdot(self._force[:n], x[:n] - self.x[:n])))
-        if self._damping.acts:
-            parts.append(0.5 * float(np.vdot(v, self._damping.product(vs))))
-        if not self.integrator.lagged_loads:
-            parts += [float(wind.potentials(vs, self.frozen[wind]).sum()) for wind in self.viscous]
-        value, size, square = self.points.summed(sum(parts), sum(abs(part) for part in parts), square)
-        return float(value), float(size) + float(np.sqrt(square))

@@ -19,7 +19,7 @@ MATERIAL = {
 def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
-        damping, blocks = system._damping, system.discretisation.rows
+        damping, blocks = system.damping, system.discretisation.rows
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
         damping.freeze(x, system.frozen)
         expected, found = blocks.zeros(), blocks.zeros()
@@ -42,23 +42,23 @@ def test_two_factors_are_no_multiple() -> None:
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
-        system._damping.freeze(system.x, system.frozen)
+        system.damping.freeze(system.x, system.frozen)
         values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
-        assert not system._damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
 
 
 def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
         v = np.cos(5.0 * system.x)
-        system._damping.freeze(system.x, system.frozen)
-        once = system._damping.product(v)
-        np.testing.assert_array_equal(system._damping.product(v), once)
-        assert not system._damping.product(0.0 * v).any()
-        np.testing.assert_allclose(system._damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
-        system._damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.frozen)
-        assert np.abs(system._damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
+        system.damping.freeze(system.x, system.frozen)
+        once = system.damping.product(v)
+        np.testing.assert_array_equal(system.damping.product(v), once)
+        assert not system.damping.product(0.0 * v).any()
+        np.testing.assert_allclose(system.damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
+        system.damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.frozen)
+        assert np.abs(system.damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
 
 
 @pytest.mark.parallel
@@ -75,7 +75,7 @@ def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None
         for _ in range(3):
             simulation.step(0.01)
         matrix = simulation.stepper.linear.operator.rows.copy()
-        damping, v = system._damping, np.cos(3.0 * system.x)
+        damping, v = system.damping, np.cos(3.0 * system.x)
         found = damping.product(v)
         assert (damping._values is None) == (damping._multiple is not None)
         assert damping._multiple is not None or comm.size > 1
@@ -97,7 +97,7 @@ def test_rows_that_become_another_matrix_are_let_go() -> None:
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
-        damping, rows, none = system._damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
+        damping, rows, none = system.damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
         damping.freeze(system.x, system.frozen)
         assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)
         once = damping.product(v := np.cos(3.0 * system.x))

@@ -1,0 +1,79 @@
+"""The function whose gradient the residual of a step is, and its round-off: what line searches compare."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.term import Term
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.stage_equations import StageEquations
+
+Array = NDArray[np.float64]
+
+
+class Objective:
+    """Called with velocities v (n_owned, 3) of the stage; collective.
+
+    The last two values are kept: a line search ends, and a first guess begins, where one was computed before.
+    """
+
+    def __init__(self, equations: StageEquations) -> None:
+        self._equations = equations
+        self._kept: list[tuple[Array, tuple[float, float]]] = []
+        self._size = 0.0
+
+    def begin_step(self) -> None:
+        """Take the coordinates' size from the state that the step starts from."""
+        self.forget()
+        self._size = float(np.abs(self._equations.x).max(initial=0.0))
+
+    def forget(self) -> None:
+        """Drop kept values, as the equations are others now."""
+        self._kept = []
+
+    def __call__(self, v: Array) -> tuple[float, float]:
+        """The function, and what its round-off is relative to [W]; collective.
+
+        The latter is the size of its summands, and for each elastic energy the root of itself times the
+        energy at which strains are of order one: small strains are small differences of large coordinates.
+        """
+        if self._kept:
+            same = np.array([int(np.array_equal(v, at)) for at, _ in self._kept])
+            self._equations.points.comm.Allreduce(MPI.IN_PLACE, same, MPI.MIN)
+            if same.any():
+                return self._kept[int(same.argmax())][1]
+        result = self._computed(v)
+        self._kept = [*self._kept[-1:], (v.copy(), result)]
+        return result
+
+    def _computed(self, v: Array) -> tuple[float, float]:
+        of = self._equations
+        n, sigma, rate = of.points.n_owned, of.stage.sigma, 1.0 / of.stage.reach
+        x, vs = of.evaluate_at(v)
+        change = v - of.history
+        parts, square = [0.5 * sigma * float(np.sum(of.mass[:, None] * change * change))], 0.0
+        for term in of.elastic:
+            each = term.energies(x, of.frozen[term])
+            parts.append(rate * float(each.sum()))
+            stiffness = self._stiffnesses.get(term)
+            if stiffness is None:
+                stiffness = term.force_scale(1.0)[: term.n_owned]
+            square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
+        parts.append(-rate * float(np.vdot(of.loads_now, x[:n] - of.x[:n])))
+        if of.damping.acts:
+            parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))
+        if not of.integrator.lagged_loads:
+            parts += [float(wind.potentials(vs, of.frozen[wind]).sum()) for wind in of.viscous]
+        value, size, square = of.points.summed(sum(parts), sum(abs(part) for part in parts), square)
+        return float(value), float(size) + float(np.sqrt(square))
+
+    @cached_property
+    def _stiffnesses(self) -> dict[Term, Array]:
+        fixed = [term for term in self._equations.elastic if not term.registration.neighbours]
+        return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}
