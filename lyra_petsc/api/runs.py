@@ -30,6 +30,7 @@ def run(
     *,
     force: bool = False,
     resume: bool = False,
+    trust_mesh: bool = False,
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
 ) -> Run:
@@ -47,6 +48,8 @@ def run(
         Replace the results in ``out``.
     resume : bool
         Go on from the newest checkpoint.
+    trust_mesh : bool
+        Give gmsh this scene's scripts (.geo) whatever they say.
     on_step : callable, optional
         Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
     comm : MPI.Comm, optional
@@ -64,7 +67,7 @@ def run(
         The run could not go on; what was written stands.
     """
     comm = MPI.COMM_WORLD if comm is None else comm
-    loaded = on_root(comm, lambda: load(scene))
+    loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
     assert loaded is not None
     refuse_mixed_options(loaded)
     choice = choose(comm, loaded.source.stem if loaded.source else "scene", out, force=force, resume=resume)

@@ -13,7 +13,9 @@ from lyra_petsc.scene.schema import Scene
 SceneLike: TypeAlias = Scene | str | Path | Mapping[str, Any]
 
 
-def load(source: SceneLike | None = None, changes: Mapping[str, Any] | None = None) -> Scene:
+def load(
+    source: SceneLike | None = None, changes: Mapping[str, Any] | None = None, *, trust_mesh: bool = False
+) -> Scene:
     """A checked scene.
 
     Parameters
@@ -22,6 +24,9 @@ def load(source: SceneLike | None = None, changes: Mapping[str, Any] | None = No
         A scene file, or its keys as nested dictionaries; without it the default scene, a flag.
     changes : mapping of ``key.path`` to value, optional
         As in ``{"time.end": 2.0, "handles[0].until": 1.0}``; None removes a key.
+    trust_mesh : bool
+        Give gmsh this scene's scripts (.geo) whatever they say; else those that do more than describe a mesh
+        are refused.
 
     Returns
     -------
@@ -34,6 +39,8 @@ def load(source: SceneLike | None = None, changes: Mapping[str, Any] | None = No
         On anything that cannot be used, naming file and key.
     """
     if isinstance(source, Mapping):
-        return scene_of(source, changes)
-    scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
-    return scene.changed(changes) if changes else scene
+        scene = scene_of(source, changes)
+    else:
+        scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
+        scene = scene.changed(changes) if changes else scene
+    return scene.trusting_meshes() if trust_mesh else scene

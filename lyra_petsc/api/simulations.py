@@ -78,6 +78,8 @@ class Simulation:
     scene : Scene, path or mapping
     comm : MPI.Comm, optional
         COMM_WORLD unless given.
+    trust_mesh : bool
+        Give gmsh this scene's scripts (.geo) whatever they say.
 
     Attributes
     ----------
@@ -96,9 +98,9 @@ class Simulation:
         On all ranks, if the scene cannot be simulated.
     """
 
-    def __init__(self, scene: SceneLike, comm: MPI.Comm | None = None) -> None:
+    def __init__(self, scene: SceneLike, comm: MPI.Comm | None = None, *, trust_mesh: bool = False) -> None:
         self.comm: MPI.Comm = MPI.COMM_WORLD if comm is None else comm
-        loaded = on_root(self.comm, lambda: load(scene))
+        loaded = on_root(self.comm, lambda: load(scene, trust_mesh=trust_mesh))
         assert loaded is not None
         self.scene: Scene = loaded
         refuse_mixed_options(loaded)

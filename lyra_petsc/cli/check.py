@@ -14,10 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from lyra_petsc.cli.run import read_scene
+from lyra_petsc.mesh.gmsh_fence import in_words, standing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.json_schema import schema_text
+from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.simulation import Simulation
 
@@ -27,7 +29,7 @@ LISTED_RANKS = 16
 """Ranks shown one by one; of more, only the extremes."""
 
 
-def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
+def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_mesh: bool = False) -> None:
     """Validate a scene, set it up as a run would, and print the plan on rank 0; collective.
 
     Raises
@@ -36,7 +38,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str]) -> None:
         As ``run`` would.
     """
     path = path or default_scene()
-    scene = read_scene(comm, path, settings)
+    scene = read_scene(comm, path, settings, trust_mesh=trust_mesh)
     simulation = Simulation(comm, scene, Phases())
     Recorder(simulation)
     problem = simulation.problem
@@ -98,6 +100,7 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
         ("steps", plan_of_steps),
         ("linear solver", f"{simulation.stepper.preset}: {_solver_options(simulation)}"),
         ("partitioner", problem.partitioner),
+        *_fences(scene),
     ):
         plan.add_row(name, value)
     console.print(plan)
@@ -106,6 +109,13 @@ def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
     console.print(f"load imbalance {owned.max() / owned.mean():.3f} (most owned vertices over mean)")
     for note in simulation.notes:
         console.print(f"note: {note}")
+
+
+def _fences(scene: Scene) -> list[tuple[str, str]]:
+    """What stands around gmsh, where the scene has scripts for it."""
+    if not any(source.file and source.file.suffix.lower() == ".geo" for source in scene.mesh):
+        return []
+    return [("gmsh's fences", in_words(standing(), trusted=scene.trusts_meshes))]
 
 
 def _count(ratio: float) -> float:

@@ -15,6 +15,7 @@ from typing import Any
 
 from lyra_petsc import __version__
 from lyra_petsc.cli.installation_checks import Installation, misfits
+from lyra_petsc.mesh.gmsh_fence import in_words, standing
 
 EXTERNAL = (
     "ptscotch",
@@ -57,6 +58,8 @@ def info(comm: Any) -> str:
     ]
     for name, describe in PARTS.items():
         lines.append((name, _described(name, describe, facts)))
+    if comm.rank == 0:
+        lines.append(("gmsh's fences", in_words(standing())))
     facts.mpi_libraries = loaded_mpi_libraries()
     ranks = ", ".join(f"{count} on {host}" for host, count in facts.ranks_per_host.items())
     lines.append(("ranks", ranks))

@@ -28,5 +28,10 @@ scene = click.argument("scene", required=False, type=click.Path(path_type=Path))
 settings = click.option(
     "--set", "settings", multiple=True, metavar="KEY.PATH=VALUE", help="Change the scene; may be repeated."
 )
+trust_mesh = click.option(
+    "--trust-mesh",
+    is_flag=True,
+    help="Give gmsh the scripts (.geo) of SCENE whatever they say; only what you trust.",
+)
 results = click.argument("run", type=click.Path(path_type=Path))
 out = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from lyra_petsc.show.view.live import LivePage
 
 
-def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str]) -> Scene:
+def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str], *, trust_mesh: bool = False) -> Scene:
     """The checked scene on all ranks; read on rank 0."""
     scene = on_root(comm, lambda: load_scene(path, settings))
     assert scene is not None
-    return scene
+    return scene.trusting_meshes() if trust_mesh else scene
 
 
 def run(
@@ -42,6 +42,7 @@ def run(
     out: Path | None,
     force: bool,
     resume: bool,
+    trust_mesh: bool = False,
     served: Served | None = None,
 ) -> None:
     """Simulate a scene, which a page shows if ``served`` says where; collective.
@@ -63,7 +64,7 @@ def run(
         scene = out / "scene.yaml"
     path = scene or default_scene()
     choice = choose(comm, path.stem, out, force=force, resume=resume)
-    loaded = read_scene(comm, path, settings)
+    loaded = read_scene(comm, path, settings, trust_mesh=trust_mesh)
     simulate(comm, loaded, choice, TerminalProgress(comm, served), stop.signal_number, phases)
 
 

@@ -14,7 +14,7 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings
+from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings, trust_mesh
 from lyra_petsc.cli.render import render
 from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
@@ -74,6 +74,7 @@ def verbs(ctx: click.Context) -> None:
 @out
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
 @click.option("--resume", is_flag=True, help="Go on from the newest checkpoint.")
+@trust_mesh
 @click.option("--live", is_flag=True, help="Show it in the browser while it goes on.")
 @where_served
 @click.pass_obj
@@ -90,9 +91,10 @@ def run(
 @helped
 @scene
 @settings
+@trust_mesh
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scene files, for editors.")
 @click.pass_obj
-def check(comm: Any, scene: Path | None, settings: tuple[str, ...], schema: bool) -> None:
+def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool) -> None:
     """Check SCENE and print what a run would do; runs nothing."""
     from lyra_petsc.cli.check import check as check_scene
     from lyra_petsc.cli.check import print_schema
@@ -100,7 +102,7 @@ def check(comm: Any, scene: Path | None, settings: tuple[str, ...], schema: bool
     if schema:
         print_schema(comm)
     else:
-        check_scene(comm, scene, settings)
+        check_scene(comm, scene, settings, trust_mesh=trust_mesh)
 
 
 @verbs.command(context_settings=SETTINGS)

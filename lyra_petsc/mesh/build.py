@@ -19,7 +19,9 @@ from lyra_petsc.mesh.validate import check_shape, check_topology
 from lyra_petsc.scene.schema import MeshSource, Rotation
 
 
-def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> Mesh:
+def build_mesh(
+    sources: Sequence[MeshSource], *, file: object | None = None, trust_scripts: bool = False
+) -> Mesh:
     """Read, transform, check and join the mesh sources of a scene.
 
     Vertices are numbered consecutively over the sources, in file order within each. Groups: a named
@@ -35,6 +37,8 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
     sources : sequence of MeshSource
     file : optional
         The scene file, for messages about keys.
+    trust_scripts : bool
+        Give gmsh its scripts as they are, whatever they say.
 
     Raises
     ------
@@ -52,7 +56,7 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
         if source.grid is not None:
             check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
-            sheet = _read(source)
+            sheet = _read(source, trust_scripts)
             piece = _prepare(sheet, source, key, file)
         except MemoryError:
             raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
@@ -72,7 +76,7 @@ def build_mesh(sources: Sequence[MeshSource], *, file: object | None = None) -> 
     return mesh
 
 
-def _read(source: MeshSource) -> Sheet:
+def _read(source: MeshSource, trust_scripts: bool) -> Sheet:
     if source.grid is not None:
         return grid_sheet(source.grid)
     assert source.file is not None
@@ -80,7 +84,7 @@ def _read(source: MeshSource) -> Sheet:
     if suffix == ".geo":
         from lyra_petsc.mesh.geo_file import mesh_geo
 
-        return mesh_geo(source.file, source.size)
+        return mesh_geo(source.file, source.size, trusted=trust_scripts)
     if suffix == ".msh":
         from lyra_petsc.mesh.msh_file import read_msh
 

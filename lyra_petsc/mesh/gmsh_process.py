@@ -1,7 +1,9 @@
-"""A process of its own for gmsh: ``python -m lyra_petsc.mesh.gmsh_process JOB`` meshes one script.
+"""A process of its own for gmsh, which meshes one script: ``python -m … JOB OUTCOME MESH``.
 
 A script may loop for ever, ask for more triangles than there is memory, or end the process it runs in.
-Here that ends this process and not the simulation; ``geo_file`` starts it and reads the outcome.
+Here that ends this process and not the simulation; ``geo_file`` starts it and reads the outcome. Before it
+sees the script it gives up what gmsh does not need (`gmsh_fence`): so it opens no file to write, and what it
+tells goes to files that were open before.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import contextlib
 import ctypes
 import json
 import math
+import os
 import resource
 import signal
 import sys
@@ -17,45 +20,69 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from lyra_petsc.mesh.gmsh_fence import raise_fence
 
 _EQUILATERAL = math.sqrt(3) / 4
 _SHARE_OF_BOX = 0.25
 """What a surface fills of its bounding box at least, for the estimate of its triangles."""
+
+_SYSTEM = (
+    *("/usr", "/lib", "/lib64", "/opt", "/etc/ld.so.cache", "/etc/localtime", "/dev/null", "/dev/urandom"),
+    *("/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/stat", "/sys/devices/system"),
+)
+"""What libraries may read when they are in use."""
 
 
 class Refused(Exception):
     """The script cannot be used; the message is for the user."""
 
 
-def main(job_file: Path) -> None:
-    """Do the job described by a JSON file, and write ``outcome.json`` beside it.
+def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
+    """Do a job.
 
-    The job holds ``script``, ``size`` (or null), ``mesh`` (the file to write), ``script_seconds``,
-    ``mesh_seconds`` (CPU time), ``memory`` [B] and ``most_triangles``.
+    Parameters
+    ----------
+    job : dict
+        ``script``, ``folder`` (what may be read; null: all), ``size`` (or null), ``algorithm`` (or null),
+        ``script_seconds``, ``mesh_seconds`` (CPU time), ``memory`` [B] and ``most_triangles``.
+    outcome : int
+        Descriptor of a file that gets a line of JSON for each stage.
+    mesh : int
+        Descriptor of the file that gets the mesh (`_write_mesh`).
     """
-    job = json.loads(job_file.read_text())
-    outcome = job_file.with_name("outcome.json")
 
-    def tell(**words: str) -> None:
-        outcome.write_text(json.dumps(words))
+    def tell(**words: Any) -> None:
+        os.write(outcome, json.dumps(words).encode() + b"\n")
 
     _confine(job["memory"])
     tell(stage="script")
     _allow_seconds(job["script_seconds"])
     try:
-        with _session() as gmsh:
-            _run_script(gmsh, job["script"], job["size"])
+        with _session() as gmsh, open(mesh, "wb", closefd=False) as file:
+            readable = [
+                *_SYSTEM,
+                sys.prefix,
+                sys.base_prefix,
+                os.path.dirname(gmsh.__file__ or ""),
+                job["folder"],
+            ]
+            tell(fence=raise_fence(None if job["folder"] is None else readable))
+            _run_script(gmsh, job)
             tell(stage="mesh")
             _allow_seconds(job["mesh_seconds"])
             _mesh(gmsh, job)
-            gmsh.write(job["mesh"])
+            _write_mesh(gmsh, file)
     except Refused as error:
         tell(refused=str(error))
     except MemoryError:
         tell(stage="memory")
     else:
         tell(stage="done")
+    os._exit(0)  # gmsh has nothing to put away that outlives the process
 
 
 def _confine(memory: int) -> None:
@@ -95,18 +122,14 @@ def _session() -> Iterator[ModuleType]:
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.option.setNumber("General.Verbosity", 1)  # errors only
     gmsh.option.setNumber("General.AbortOnError", 0)
-    try:
-        yield gmsh
-    finally:
-        gmsh.logger.stop()
-        gmsh.finalize()
-
-
-def _run_script(gmsh: ModuleType, script: str, size: float | None) -> None:
     gmsh.logger.start()
-    _set_size(gmsh, size)
-    with _errors_told(gmsh, script):
-        gmsh.merge(script)
+    yield gmsh
+
+
+def _run_script(gmsh: ModuleType, job: dict[str, Any]) -> None:
+    _set_size(gmsh, job["size"])
+    with _errors_told(gmsh, job["script"]):
+        gmsh.merge(job["script"])
 
 
 def _mesh(gmsh: ModuleType, job: dict[str, Any]) -> None:
@@ -124,8 +147,44 @@ def _mesh(gmsh: ModuleType, job: dict[str, Any]) -> None:
             if size is None:
                 _refuse_many(_estimate(gmsh, None), "triangles", None, most)
             gmsh.model.mesh.generate(2)
-    for option, value in {"SaveAll": 1, "MshFileVersion": 4.1, "Binary": 1, "SaveParametric": 0}.items():
-        gmsh.option.setNumber(f"Mesh.{option}", value)
+
+
+def _write_mesh(gmsh: ModuleType, file: BinaryIO) -> None:
+    """Write nodes, elements up to surfaces and groups, as gmsh orders them in a file, as numpy arrays.
+
+    First a JSON text: ``names`` as rows (dimension, tag, name) of physical groups, and ``blocks`` as rows
+    (element type, entity, tags of its groups). Then the tags (n,) and points (n, 3) of the nodes, and the
+    corners (m, corners) of each block's elements.
+    """
+    model = gmsh.model
+    entities = sorted(model.getEntities())
+    tags, points, blocks, corners = [], [], [], []
+    for entity in entities:
+        found, coordinates, _ = model.mesh.getNodes(*entity)
+        tags.append(np.asarray(found, dtype=np.int64))
+        points.append(np.asarray(coordinates, dtype=np.float64).reshape(-1, 3))
+        groups = [abs(int(tag)) for tag in model.getPhysicalGroupsForEntity(*entity)]
+        kinds, _, nodes = model.mesh.getElements(*entity)
+        for kind, of_kind in zip(kinds, nodes, strict=True):
+            _, _, _, each, _, primary = model.mesh.getElementProperties(int(kind))
+            blocks.append((int(kind), int(entity[1]), groups))
+            corners.append(np.asarray(of_kind, dtype=np.int64).reshape(-1, each)[:, :primary])
+    names = [(*map(int, group), _group_name(gmsh, *group)) for group in model.getPhysicalGroups()]
+    head = json.dumps({"names": [name for name in names if name[2]], "blocks": blocks}).encode()
+    all_tags = np.concatenate([np.empty(0, np.int64), *tags])
+    all_points = np.concatenate([np.empty((0, 3)), *points])
+    for array in (np.frombuffer(head, np.uint8), all_tags, all_points, *corners):
+        np.save(file, array)
+    file.flush()
+
+
+def _group_name(gmsh: ModuleType, dimension: int, tag: int) -> str:
+    """Name of a physical group, whatever its encoding: gmsh's own Python raises for what is not UTF-8."""
+    name, error = ctypes.c_char_p(), ctypes.c_int()
+    gmsh.lib.gmshModelGetPhysicalName(
+        ctypes.c_int(dimension), ctypes.c_int(tag), ctypes.byref(name), ctypes.byref(error)
+    )
+    return (name.value or b"").decode("utf-8", errors="replace")
 
 
 def _set_size(gmsh: ModuleType, size: float | None) -> None:
@@ -204,9 +263,10 @@ def _complaint(gmsh: ModuleType, script: str) -> str:
     for line in lines:
         if line.startswith("Error"):
             words = " ".join(line.split(":", 1)[1].split())
-            return words.replace(f"'{script}', ", "").removesuffix(" ()")
+            folder = os.path.dirname(script)  # of copies: the user knows the files by other names
+            return words.replace(f"'{script}', ", "").replace(f"{folder}/", "").removesuffix(" ()")
     return ""
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(json.loads(Path(sys.argv[1]).read_text()), int(sys.argv[2]), int(sys.argv[3]))

@@ -83,8 +83,10 @@ def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:
         On anything that cannot be used, naming the key.
     """
     if scene._given is None:
-        return _changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
-    return _changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+        other = _changed(parse_yaml(dump_scene(scene), file=None), changes, scene.source, Path.cwd())
+    else:
+        other = _changed(scene._given, changes, scene.source, scene._directory or Path.cwd())
+    return other.trusting_meshes() if scene.trusts_meshes else other
 
 
 def _changed(

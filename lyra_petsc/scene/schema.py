@@ -886,11 +886,23 @@ class Scene(Block):
     _source: Path | None = PrivateAttr(default=None)
     _given: dict[str, Any] | None = PrivateAttr(default=None)
     _directory: Path | None = PrivateAttr(default=None)
+    _trusts_meshes: bool = PrivateAttr(default=False)
 
     @property
     def source(self) -> Path | None:
         """The file this scene was read from, for messages; no part of its value."""
         return self._source
+
+    @property
+    def trusts_meshes(self) -> bool:
+        """Whether gmsh is given this scene's scripts whatever they say; the caller's word, no part of it."""
+        return self._trusts_meshes
+
+    def trusting_meshes(self) -> Scene:
+        """The same scene, whose mesh scripts the caller trusts."""
+        trusting = self.model_copy()
+        trusting._trusts_meshes = True
+        return trusting
 
     def changed(self, changes: Mapping[str, Any]) -> Scene:
         """Another scene with some keys changed, as in ``{"time.end": 2.0, "handles[0].until": 1.0}``.

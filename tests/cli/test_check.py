@@ -36,6 +36,31 @@ def test_plan(tmp_path: Path, ranks: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
 
 
+SQUARE = """
+Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
+Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+"""
+
+
+def test_a_mesh_script_of_others_is_read_by_a_list_of_statements_unless_trusted(tmp_path: Path) -> None:
+    mesh = MEMBRANE.replace("{grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}", "{file: m.geo}")
+    (tmp_path / "scene.yaml").write_text(mesh)
+    (tmp_path / "m.geo").write_text(SQUARE + 'Merge "x.msh";\n')
+    (tmp_path / "x.msh").write_text('a = GetEnv("HOME");\nSystemCall "touch mark";\n')
+    refused = lyra(["check", "scene.yaml"], tmp_path)
+    assert refused.code == 2, refused.err
+    assert "x.msh: line 1: 'GetEnv' reads what the scene does not name" in refused.err
+    (tmp_path / "x.msh").write_text('a = GetEnv("HOME");\n')
+    trusted = lyra(["check", "scene.yaml", "--trust-mesh"], tmp_path)
+    assert trusted.code == 0, trusted.err
+    assert "scripts are trusted, whatever they say;" in trusted.out
+    (tmp_path / "m.geo").write_text(SQUARE)
+    plain = lyra(["check", "scene.yaml"], tmp_path)
+    assert "scripts are read by a list of statements;" in plain.out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.geo", "scene.yaml", "x.msh"]
+
+
 def test_titles_are_text_and_any_number_of_steps_is_told(tmp_path: Path) -> None:
     (tmp_path / "plain.yaml").write_text(
         'title: "[/red] :smile: \\e[31m"\n' + MEMBRANE.replace("0.01", "1e-15")

@@ -120,7 +120,8 @@ def test_surfaces_that_face_each_other_are_oriented_alike(script: Path) -> None:
         ("Point(1) = {0, 0, 0};\n", "no triangles"),
         ("// nothing\n", "no triangles"),
         ("   \n", "empty"),
-        ("caf\xe9 = {;\n", "gmsh: "),
+        ("caf\xe9 = {;\n", "line 1: 'é'"),
+        ("a = {;\n", "gmsh: line 1: syntax error"),
     ],
 )
 def test_refused(script: Path, text: str, message: str) -> None:

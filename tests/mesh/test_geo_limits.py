@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,6 +13,9 @@ from mesh_sources import mesh_of
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh import geo_file as geo
+from lyra_petsc.mesh import gmsh_fence
+from lyra_petsc.mesh.geo_script import check_script
+from lyra_petsc.mesh.gmsh_fence import standing
 
 SQUARE = """
 Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
@@ -49,7 +55,8 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         ('Printf("text") > "mark";', "'Printf' writes files"),
         ('Printf("%g", 1)\n>> "mark";', "'Printf' writes files"),
         ('General.LogFileName = "mark";', "'LogFileName'"),
-        ('Field[1] = Structured; Field[1].FileName = "/etc/passwd";', "'FileName' reads"),
+        ('Field[1] = Structured; Field[1].FileName = "/etc/passwd";', "'Structured' reads"),
+        ('Field[1] = MathEval; Field[1].FileName = "/etc/passwd";', "'FileName' reads"),
         ('a = GetEnv("HOME");', "'GetEnv' reads"),
         ('ShapeFromFile("part.step");', "'ShapeFromFile' reads"),
         ("Exit;", "'Exit'"),
@@ -61,17 +68,36 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         ('Merge "part.gz";', "'Merge' of 'part.gz'"),
         ('Include StrCat("a", ".geo");', "name in quotes"),
         ('name = "part.geo"; Include name;', "name in quotes"),
-        # where gmsh skips and jumps it takes quotes and comments otherwise than they look
-        ('If (0)\n" EndIf SystemCall "touch mark"; "\nEndIf', "line 6: 'SystemCall' stands in a quoted text"),
-        ('If (0) E" EndIf SystemCall "touch mark"; //"\nEndIf', "line 5: 'SystemCall'"),
-        ('If (0) E// EndIf SystemCall\n"touch mark";\nEndIf', "line 5: 'SystemCall' stands in a comment"),
-        ('If (0) E// EndIf Save\n"mark.msh";\nEndIf', "line 5: 'Save' stands in a comment"),
-        ('If (0) E// EndIf Printf("a") > "mark";\nEndIf', "line 5: 'Printf' stands in a comment"),
-        (
-            'For i In {0:1} /*\nSystemCall "touch mark";\n*/ EndFor',
-            "line 6: 'SystemCall' stands in a comment",
-        ),
-        ('Macro f /*\nSystemCall "touch mark";\n*/\nReturn\nCall f;', "line 6: 'SystemCall'"),
+        # words that are on no list, and names that gmsh would find in a text
+        ('PoolAcid "touch mark";', "line 5: 'PoolAcid' is no statement that is known here"),
+        ('x = 1; x "touch mark";', "line 5: 'x' is no statement"),
+        ('SystemCall = 1; SystemCall "touch mark";', "'SystemCall' starts other programs"),
+        ('S2N["SystemCall"] "touch mark";', "'S2N' makes a command of a text"),
+        ('StringToName["SystemCall"] "touch mark";', "'StringToName' makes a command"),
+        ('Call Foo; Macro Foo SystemCall StrCat("touch", " mark"); Return', "'SystemCall'"),
+        ('Macro("f", "SystemCall \'touch mark\';");', "'Macro' must be followed by a name"),
+        ('SetString("Solver.Executable0", "touch");', "'SetString'"),
+        ('General.ErrorFileName = "mark";', "'ErrorFileName'"),
+        ("General.SaveOptions = 1;", "'SaveOptions' is no option"),
+        ('Geometry.DoubleClickedPointCommand = "touch mark";', "'DoubleClickedPointCommand' is no option"),
+        ('PostProcessing.GraphPointCommand = "touch mark";', "'PostProcessing'"),
+        ('DefineConstant[ a = {1, GmshOption "Solver.Executable0"} ];', "'GmshOption'"),
+        ('DefineConstant[ a = {1, Macro "touch"} ];', "'Macro' must be followed by a name"),
+        ('a = FileExists("/etc/passwd");', "'FileExists' reads"),
+        ('Merge "script.GEO.py";', "'Merge' of 'script.GEO.py'"),
+        ('name = "mark"; Printf("a") > name;', "'Printf' writes files"),
+        ('Printf("a"\nIf (1)\n) > "mark";\nEndIf', "'Printf' writes files"),
+        ('View[0].FileName = "mark";', "'FileName' reads"),
+        ('Save View[0] "mark";', "'Save' writes files"),
+        ("a = 1 @ 2;", "'@' has no meaning"),
+        ('a = "touch', "a text in quotes does not end"),
+        # where gmsh skips and jumps it takes quotes otherwise than they look
+        ('If (0)\n" EndIf SystemCall "touch mark"; "\nEndIf', "line 6: 'EndIf' stands in a quoted text"),
+        ('If (0) E" EndIf SystemCall "touch mark"; //"\nEndIf', "line 5: 'EndIf' stands in a quoted text"),
+        ('If (0) E// EndIf SystemCall\n"touch mark";\nEndIf', "line 5: 'E'"),
+        ("If (0)\nx1EndIf2Save = 1;\nEndIf", "line 6: 'x1EndIf2Save'"),
+        ("For i In {0:1}\na = \"\nSave 'mark.msh';\n\";\nEndFor", "line 6: a quoted text of several lines"),
+        (f"For i In {{0:1}}\n{'a = 1; ' * 800}\nEndFor", "line 6: 5600 characters"),
         (f'a = "{"a" * 1100}"; //', "a text of 1102 characters"),
         ("// \0 hidden", "no text file"),
     ],
@@ -88,7 +114,7 @@ def test_what_is_included_is_checked_alike_and_told(tmp_path: Path) -> None:
     assert meshed(tmp_path, 'Merge "parts/part.geo";\n').startswith("line 2: 'SystemCall'")
     part.write_text('Include "part.geo";\nPhysical Curve("west") = {4};\n')
     script = tmp_path / "script.geo"
-    assert [path.name for path in geo.check_script(script)] == ["script.geo", "part.geo"]
+    assert [path.name for path in check_script(script).files] == ["script.geo", "part.geo"]
     part.write_text('Physical Curve("west") = {4}; Physical Surface("sheet") = {1};\n')
     mesh = mesh_of(script)
     assert set(mesh.groups) == {"west", "sheet"}
@@ -115,6 +141,9 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path: Path) -> None:
         '/* Include "none.geo"; */ Printf("System: %g", 2 > 1);\n',
         "If (1) // Save the mesh\nPhysical Curve(1) = {1};\nEndIf // Print\n",
         "For i In {1:4} // Merge them\nPhysical Curve(i) = {i};\nEndFor\n",
+        'For i In {0:1} /*\nSystemCall "touch mark";\n*/\nEndFor\n',
+        'Macro f /*\nSystemCall "touch mark";\n*/\na = 1;\nReturn\nCall f;\n',
+        "If (0) a = 1; // EndIf SystemCall\nEndIf\n",
         'Savings = 1; Printer = Savings; Printf("%g", Printer);\n',
     ],
 )
@@ -122,6 +151,170 @@ def test_words_that_only_look_like_commands_are_allowed(tmp_path: Path, text: st
     script = tmp_path / "script.geo"
     script.write_text(SQUARE + text + 'Physical Surface("Save it") = {1};\n')
     assert "Save it" in mesh_of(script).groups
+    assert [path.name for path in tmp_path.iterdir()] == ["script.geo"]
+
+
+# -- files that are not what they are called ---------------------------------------------------------
+
+CALL = 'SystemCall "touch mark";\n'
+MSH = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("x.msh", CALL, "x.msh: line 1: 'SystemCall'"),
+        ("X.MSH", CALL, "X.MSH: line 1: 'SystemCall'"),
+        ("x.Msh", MSH + CALL, "x.Msh: line 1: '$'"),  # an ending that gmsh does not know: a script to it
+        ("x.msh", "\n\n" + CALL, "line 3: 'SystemCall'"),
+        ("x.msh", "\xef\xbb\xbf" + CALL, "line 1: 'SystemCall'"),
+        ("x.msh", "\n" + MSH + CALL, "line 2: '$'"),
+        ("x.msh", "// $MeshFormat\n" + CALL, "line 2: 'SystemCall'"),
+        ("x.msh", "$MeshFormats\n" + CALL, "line 1: '$'"),
+        ("x.msh", "ISO-10303-21;\n" + CALL, "line 1: 'ISO'"),
+        ("x.step", CALL, "x.step: line 1: 'SystemCall'"),
+        ("x.Step", "ISO-10303-21;\n" + CALL, "line 1: 'ISO'"),
+        ("x.iges", CALL, "x.iges: line 1: 'SystemCall'"),
+        ("x.brep", CALL, "x.brep: line 1: 'SystemCall'"),
+        ("x.BREP", "DBRep_DrawableShape\n" + CALL, "line 1: 'DBRep_DrawableShape'"),
+        ("x.stl", CALL, "x.stl: line 1: 'SystemCall'"),
+        ("x.Stl", "solid\n" + CALL, "line 1: 'solid'"),
+        ("x.pos", 'View "a" {\nSP(0,0,0){1};\n};\n' + CALL, "line 4: 'SystemCall'"),
+        ("x.GEO", CALL, "x.GEO: line 1: 'SystemCall'"),
+        ("x.msh", "\x1f\x8b\x08\x00 zipped", "line 1: is no text file"),
+    ],
+)
+def test_what_is_merged_is_recognised_by_its_content(
+    tmp_path: Path, name: str, content: str, words: str
+) -> None:
+    (tmp_path / name).write_text(content, encoding="latin-1")
+    script = tmp_path / "script.geo"
+    script.write_text(f'{SQUARE}Merge "{name}";\n')
+    with pytest.raises(InputError) as caught:
+        mesh_of(script)
+    assert words in str(caught.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["script.geo", name])
+
+
+def test_what_is_included_is_a_script_whatever_it_begins_with(tmp_path: Path) -> None:
+    (tmp_path / "x.geo").write_text(MSH + CALL)
+    assert "line 1: '$'" in meshed(tmp_path, 'Include "x.geo";\n')
+    assert "line 1: '$'" in meshed(tmp_path, 'Merge "x.geo"; Include "x.geo";\n')
+    (tmp_path / "x.msh.opt").write_text(CALL)
+    (tmp_path / "x.msh").write_text(MSH + "$Nodes\n1\n1 0 0 0\n$EndNodes\n$Elements\n0\n$EndElements\n")
+    assert "line 1: 'SystemCall'" in meshed(tmp_path, 'Merge "x.msh";\n')
+    (tmp_path / "x.msh.opt").unlink()
+    (tmp_path / "script.geo").write_text(SQUARE + 'Merge "x.msh";\nPhysical Surface("sheet") = {1};\n')
+    assert "sheet" in mesh_of(tmp_path / "script.geo").groups
+
+
+def test_a_trusted_script_may_say_what_it_likes_within_what_the_kernel_lets_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.geo"
+    script.write_text(f'{SQUARE}a = Str("x");\nPrintf("note") > "mark";\nSystemCall "touch called";\n')
+    with pytest.raises(InputError, match="writes files"):
+        mesh_of(script)
+    sheet = geo.mesh_geo(script, 0.3, trusted=True) if "seccomp" not in standing() else None
+    if sheet is None:
+        with suppress(InputError):  # gmsh complains of what it cannot write
+            geo.mesh_geo(script, 0.3, trusted=True)
+        assert [path.name for path in tmp_path.iterdir()] == ["script.geo"]
+    script.write_text(f'{SQUARE}a = GetEnv("HOME");\n')
+    assert len(geo.mesh_geo(script, 0.3, trusted=True).triangles) > 10
+
+
+# -- what the kernel holds back ----------------------------------------------------------------------
+
+ATTEMPTS = """
+import os, socket, subprocess, sys, threading
+from lyra_petsc.mesh.gmsh_fence import raise_fence
+written = open("before", "w")
+stands = raise_fence([os.getcwd(), "/usr", sys.prefix])
+def outcome(work):
+    try:
+        return work()
+    except OSError:
+        return "held"
+thread = threading.Thread(target=lambda: print("thread"))
+thread.start()
+thread.join()
+for name, work in {
+    "exec": lambda: os.execv("/bin/true", ["true"]), "fork": os.fork, "socket": socket.socket,
+    "spawn": lambda: subprocess.run(["/bin/true"]), "write": lambda: open("mark", "w"),
+    "append": lambda: open("before", "a"), "remove": lambda: os.unlink("before"),
+    "mkdir": lambda: os.mkdir("m"),
+    "rename": lambda: os.rename("before", "after"), "truncate": lambda: os.truncate("before", 0),
+    "link": lambda: os.symlink("before", "after"), "hard link": lambda: os.link("before", "after"),
+    "mode": lambda: os.chmod("before", 0o777), "kill": lambda: os.kill(os.getppid(), 0),
+    "memory": lambda: os.memfd_create("x"),
+}.items():
+    print(name, outcome(work))
+print("system", os.system("touch mark") != 0)
+print("outside", outcome(lambda: open("/etc/passwd")) == "held", "Landlock" in stands)
+written.write("still open")
+"""
+
+
+@pytest.mark.skipif("seccomp" not in standing(), reason="the kernel has no seccomp for us")
+def test_the_kernel_holds_back_what_gmsh_does_not_need(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    told = subprocess.run(
+        [sys.executable, "-c", ATTEMPTS],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    *attempts, system, outside = told.stdout.splitlines()
+    assert attempts.pop(0) == "thread", told.stderr
+    assert len(attempts) == 15
+    assert [line for line in attempts if not line.endswith(" held")] == []
+    assert system == "system True"
+    assert outside in ("outside True True", "outside False False")
+    assert (tmp_path / "before").read_text() == "still open"
+    assert [path.name for path in tmp_path.iterdir()] == ["before"]
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+def test_the_filter_of_each_machine_judges_calls_by_their_arguments(machine: str) -> None:
+    program, calls = gmsh_fence.filter_program(machine, pid=7), gmsh_fence._CALLS[machine]
+
+    def judged(number: int, *arguments: int, audit: int = gmsh_fence._AUDIT[machine]) -> int:
+        """The filter as the kernel runs it."""
+        words = {0: number, 4: audit, **{16 + 8 * i: value for i, value in enumerate(arguments)}}
+        at = value = 0
+        while True:
+            code, then, otherwise, k = program[at]
+            at += 1
+            if code == gmsh_fence.LOAD:
+                value = words[k]
+            elif code == gmsh_fence.RETURN:
+                return k
+            else:
+                holds = {
+                    gmsh_fence.EQUAL: value == k,
+                    gmsh_fence.ANY_BIT: value & k,
+                    gmsh_fence.AT_LEAST: value >= k,
+                }
+                at += then if holds[code] else otherwise
+
+    allowed, refused, unknown = gmsh_fence.RET_ALLOW, gmsh_fence.RET_ERRNO | 1, gmsh_fence.RET_ERRNO | 38
+    assert judged(calls["execve"], 0, audit=1) == gmsh_fence.RET_KILL_PROCESS
+    assert judged(calls["clone3"]) == judged(calls["openat2"]) == unknown
+    assert {judged(calls[name]) for name in ("execve", "execveat", "socket", "unlinkat", "mkdirat")} == {
+        refused
+    }
+    assert {judged(calls[name]) for name in ("renameat2", "truncate", "ftruncate", "ptrace")} == {refused}
+    assert judged(calls["clone"], 0x3D0F00) == allowed  # a thread
+    assert judged(calls["clone"], 0x4111) == refused  # posix_spawn
+    assert judged(calls["openat"], 0, 0, os.O_RDONLY | os.O_CLOEXEC) == allowed
+    for flags in (os.O_WRONLY, os.O_RDWR, os.O_CREAT, os.O_TRUNC):
+        assert judged(calls["openat"], 0, 0, flags) == refused
+    assert judged(calls["tgkill"], 7, 7) == allowed
+    assert judged(calls["kill"], 0) == judged(calls["kill"], 2**32 - 1) == refused
+    read, mmap = {"x86_64": (0, 9), "aarch64": (63, 222)}[machine]
+    assert judged(read) == judged(mmap) == allowed
+    assert len(set(calls.values())) == len(calls)
 
 
 @pytest.mark.parametrize(
