@@ -106,9 +106,8 @@ class _RunLoop:
     ) -> None:
         self._simulation, self._recorder, self._folder = simulation, recorder, folder
         self._callbacks, self._comm = callbacks, simulation.comm
-        self._totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
         self._versions = versions()
-        self._notes_shown = 0
+        self._notes_shown = simulation.earlier_notes
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
         if resumed:
@@ -126,8 +125,6 @@ class _RunLoop:
             simulation.stepper.monitor()
             while not simulation.finished:
                 report = simulation.step()
-                for name in self._totals:
-                    self._totals[name] += getattr(report, name)
                 with simulation.phases("output"):
                     recorder.record(report)
                 self._show_notes()
@@ -202,7 +199,7 @@ class _RunLoop:
             "estimated_error": simulation.estimated_error if simulation.local_error else None,
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
-            **self._totals,
+            **simulation.totals,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
             "notes": simulation.notes,

@@ -9,6 +9,7 @@ singular Hessian shows in the line search: a step that had to be cut asks for mo
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 FIRST = 0.05
 RAISE = 8.0
@@ -66,6 +67,18 @@ class Blend:
             raised = self._between(self.value, self._enough)
         self.value = min(1.0, raised)
         return True
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold to go on alike."""
+        return {"blend": self.value, "too_little": self._too_little, "enough": self._enough}
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory; an older one has but the value."""
+        if not self._adaptive:
+            return
+        self.value = float(memory.get("blend", self.value))
+        self._too_little = float(memory.get("too_little", self._too_little))
+        self._enough = float(memory.get("enough", self._enough))
 
     @staticmethod
     def _between(low: float, high: float) -> float:

@@ -24,11 +24,10 @@ class Compression:
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._told = False
         self.smallest = self.largest = 1.0
 
-    def look(self, when: str) -> str | None:
-        """Measure the present state, ``when`` in words; what there is to tell, the first time there is."""
+    def look(self, when: str, *, told: bool) -> str | None:
+        """Measure the present state, ``when`` in words; what there is to tell, unless it is told already."""
         membrane, comm = self._problem.membrane, self._problem.points.comm
         n = membrane.n_owned
         stretches = principal_stretches(
@@ -40,9 +39,8 @@ class Compression:
         ends = np.array([local[0], -local[1]])
         comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
         self.smallest, self.largest = float(ends[0]), float(-ends[1])
-        if self._told or not self.smallest < SOFTENS_BELOW:
+        if told or not self.smallest < SOFTENS_BELOW:
             return None
-        self._told = True
         mine = n > 0 and local[0] == self.smallest
         index = int(membrane.elements.index[np.argmin(stretches[:, 0])]) if mine else np.iinfo(np.int64).max
         triangle = comm.allreduce(index, MPI.MIN)

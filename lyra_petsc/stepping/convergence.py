@@ -51,6 +51,8 @@ class Convergence:
         Estimated remaining correction of any coordinate [m].
     too_slow : bool
         Whether the solve was given up since its linear iterations passed the limit.
+    usual : float
+        Mean of recent linear iterations per Newton iteration, which the limit is for.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class Convergence:
     ) -> None:
         self._equations, self._tolerances, self._spacing, self._floor = equations, tolerances, spacing, floor
         self._linear_limit = linear_limit
-        self._usual = 0.0
+        self.usual = 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -83,14 +85,14 @@ class Convergence:
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
             self._moved_by(increment * self._equations.stage.reach)
-            self._usual += RECENT * (spent - self._spent - self._usual)
+            self.usual += RECENT * (spent - self._spent - self.usual)
         stalls = iteration > 0 and STALLED * before < residual <= self._floor
         self._stalled = self._stalled + 1 if stalls else 0
         if self._stalled > 1 or residual == 0.0:
             self.at_roundoff = residual > 0.0
             return int(Reason.CONVERGED_FNORM_ABS)
         self._spent = spent
-        if self._usual > self._linear_limit:
+        if self.usual > self._linear_limit:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol, _ = snes.getTolerances()

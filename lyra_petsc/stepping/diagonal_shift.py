@@ -6,6 +6,8 @@ and resemble the matrix less (Manteuffel, Math. Comp. 34, 1980, 473-497).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from petsc4py import PETSc
 
 from lyra_petsc.linear.pivots import is_incomplete
@@ -40,6 +42,14 @@ class DiagonalShift:
     def value(self) -> float:
         """Fraction by which diagonal blocks are to be larger; 0 where nothing is factored incompletely."""
         return self._value if self._acts and is_incomplete(self._ksp.getPC()) else 0.0
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold to go on alike."""
+        return {"shift": self._value}
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory."""
+        self._value = float(memory.get("shift", self._value))
 
     def begin(self) -> None:
         """A new step: a little less than in the last one."""

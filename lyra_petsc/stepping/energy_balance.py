@@ -6,7 +6,9 @@ bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is conve
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -61,7 +63,9 @@ class Ledger:
         self.budget = Budget()
         self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
         self._moving = 0.0
-        self._pull: Array | float = 0.0
+        self._pull: Array | None = None
+        if not system.integrator.moves:
+            self._pull = self._external(system.forces_now())
         self.measure()
 
     @property
@@ -96,20 +100,9 @@ class Ledger:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
-        parts, self._at = system.forces_at_stage(), system.prescribed.at
-        self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
-        external = -parts.pop("loads")
-        system.prescribed.put(external, external.take(self._at) + self._reactions)
-        for load in system.loads:
-            if load.registration.energy:  # it has a potential, and does no work from outside
-                weight = np.zeros((system.points.n_local, 3))
-                load.add_force(system.x, 0.0, 0.0, weight)
-                external -= system.load_factor * weight[: len(external)]
-        if "wind" in parts:
-            external -= parts["wind"]
-        if "springs" in parts:
-            external -= parts["springs"]
-        if not system.integrator.moves:  # the way to an equilibrium has no stage in its middle
+        parts = system.forces_at_stage()
+        external = self._external(parts)
+        if self._pull is not None:  # the way to an equilibrium has no stage in its middle
             external, self._pull = 0.5 * (external + self._pull), external
         # targets that move with a handle let it work on the sheet
         turned = system.moving_energy_before - self._moving + system.turn_targets_to_end()
@@ -122,6 +115,36 @@ class Ledger:
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
         return self.measure()
+
+    def _external(self, parts: Mapping[str, Array]) -> Array:
+        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F."""
+        system = self._system
+        self._at = system.prescribed.at
+        self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
+        external = -parts["loads"]
+        system.prescribed.put(external, external.take(self._at) + self._reactions)
+        for load in system.loads:
+            if load.registration.energy:  # it has a potential, and does no work from outside
+                weight = np.zeros((system.points.n_local, 3))
+                load.add_force(system.x, 0.0, 0.0, weight)
+                external -= system.load_factor * weight[: len(external)]
+        for name in ("wind", "springs"):
+            if name in parts:
+                external -= parts[name]
+        return external
+
+    def memory(self) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Arrays (n_owned, 3) and numbers to go on with after a restart."""
+        return ({} if self._pull is None else {"pull": self._pull}), asdict(self.budget)
+
+    def restore(self, arrays: Mapping[str, Array], budget: Mapping[str, Any]) -> None:
+        """Go on with a memory: works are its, energies those of the present state."""
+        for name, value in budget.items():
+            if name != "more":
+                setattr(self.budget, name, float(value))
+        if self._pull is not None:  # an older checkpoint holds none
+            self._pull = arrays.get("pull", self._pull)
+        self.measure()
 
     @property
     def column_names(self) -> list[str]:

@@ -11,6 +11,7 @@ Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from mpi4py import MPI
@@ -87,7 +88,7 @@ class Equilibrium:
         force, _ = system.out_of_balance()
         self._scale = self._norm(force)
         if self._scale > floor:
-            system.unbalanced = force
+            system.unbalanced = -force
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""
@@ -141,6 +142,15 @@ class Equilibrium:
             words=attempt.words or words,
             stuck=stuck,
         )
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold to go on alike."""
+        return {"scale": self._scale, "in_vain": self._in_vain}
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory; an older one is empty."""
+        self._scale = float(memory.get("scale", self._scale))
+        self._in_vain = int(memory.get("in_vain", self._in_vain))
 
     @property
     def in_vain(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from mpi4py import MPI
@@ -37,11 +38,13 @@ class Extrapolation:
 
     def to(self, t1: float, t0: float, v: Array) -> Array:
         """Velocities (n, 3) [m/s] to expect at t1 [s], of ``v`` at t0."""
-        if not self._times or t0 > self._times[-1]:  # else the step is repeated
-            self._learn(t0, v)
+        self.learn(t0, v)
         return self._expected(t1, min(self._degree, len(self._times) - 1))
 
-    def _learn(self, t0: float, v: Array) -> None:
+    def learn(self, t0: float, v: Array) -> None:
+        """Take the velocities at t0 [s], unless they are known; collective."""
+        if self._times and t0 <= self._times[-1]:
+            return
         degrees = range(len(self._times))
         if degrees:
             wrong = [(v - self._expected(t0, degree)).ravel() for degree in degrees]
@@ -50,6 +53,23 @@ class Extrapolation:
             self._degree = int(errors.argmin())
         self._times = [*self._times[-MOST:], t0]
         self._values = [*self._values[-MOST:], v.copy()]
+
+    def memory(self) -> tuple[dict[str, Array], dict[str, float]]:
+        """Arrays (n, 3) and numbers to go on with after a restart; the newest velocities are the state's."""
+        past = list(zip(self._times[:-1], self._values[:-1], strict=True))
+        arrays = {f"past_{number}": value for number, (_, value) in enumerate(past)}
+        return arrays, {f"past_{number}": time for number, (time, _) in enumerate(past)} | {
+            "degree": self._degree
+        }
+
+    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float], t0: float, v: Array) -> None:
+        """Go on with a memory from velocities v (n, 3) [m/s] at t0 [s]; an older one is empty."""
+        names = sorted(name for name in numbers if name.startswith("past_") and name in arrays)
+        if not names:
+            return
+        self._times = [*(float(numbers[name]) for name in names), t0]
+        self._values = [*(np.array(arrays[name]) for name in names), v.copy()]
+        self._degree = int(numbers["degree"])
 
     def _expected(self, t1: float, degree: int) -> Array:
         times, values = self._times[-degree - 1 :], self._values[-degree - 1 :]

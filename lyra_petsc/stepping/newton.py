@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -137,6 +139,24 @@ class Newton:
     def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
         """For ``SNES.setConvergenceTest``."""
         return self.convergence.test(snes, iteration, norms[2], self.linear_iterations)
+
+    def memory(self) -> dict[str, float]:
+        """What a checkpoint must hold for the next steps to be solved as they would be."""
+        return {
+            "convex": self._began_convex,
+            "tolerance": self.forcing.tolerance,
+            "usual": self.convergence.usual,
+            **self._blend.memory(),
+            **self._linear.shift.memory(),
+        }
+
+    def restore(self, memory: Mapping[str, float]) -> None:
+        """Go on with a memory; an older one has less."""
+        self._began_convex = bool(memory.get("convex", self._began_convex))
+        self.forcing.tolerance = float(memory.get("tolerance", self.forcing.tolerance))
+        self.convergence.usual = float(memory.get("usual", self.convergence.usual))
+        self._blend.restore(memory)
+        self._linear.shift.restore(memory)
 
     @property
     def linear_iterations(self) -> int:

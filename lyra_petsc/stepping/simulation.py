@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -84,10 +84,14 @@ class Simulation:
     time : float
         [s]
     step_number : int
+    totals : dict of str to int
+        Newton and linear iterations, and rejected attempts, of all steps.
     failure : Failure or None
         Why the last step could not be taken.
     notes : list of str
         What the user should know: mesh repairs, changed linear solver, …
+    earlier_notes : int
+        How many of them are of the run that a checkpoint is of.
 
     Raises
     ------
@@ -108,7 +112,7 @@ class Simulation:
 
     def _set_up(self, scene: Scene) -> None:
         self.problem: Problem = build_problem(self.comm, scene, self.phases)
-        self.notes = list(self.problem.outline.notes)
+        self.notes, self.earlier_notes = list(self.problem.outline.notes), 0
         outline, system = self.problem.outline, self.problem.system
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
@@ -130,14 +134,15 @@ class Simulation:
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
         self.compression = Compression(self.problem)
-        self._told_of_error = self._told_of_roundoff = False
+        self._told: set[str] = set()
+        self.totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
-        self.ledger = Ledger(system)
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
+        self.ledger = Ledger(system)
 
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
@@ -197,10 +202,12 @@ class Simulation:
         self.step_number += 1
         with self.phases("balance"):
             self.ledger.record(x_before[:n])
-            note = self.compression.look(f"step {self.step_number} ({self._now()})")
+            when, told = f"step {self.step_number} ({self._now()})", "compression" in self._told
+            note = self.compression.look(when, told=told)
         if note:
+            self._told.add("compression")
             self.notes.append(note)
-        if attempt.at_roundoff and not self._told_of_roundoff:
+        if attempt.at_roundoff and "roundoff" not in self._told:
             self._tell_of_roundoff(attempt.residual)
         for term in system.elastic:
             if term.registration.state:
@@ -209,6 +216,8 @@ class Simulation:
         self.stepper.monitor()
         seconds = clock.perf_counter() - started
         took = newton, linear, rejected, attempt.residual, seconds
+        for name, number in zip(self.totals, took, strict=False):
+            self.totals[name] += int(number)
         stretch = self.compression.smallest, self.compression.largest
         return StepReport(self.step_number, self.time, dt, *took, *stretch, attempt.left)
 
@@ -217,7 +226,7 @@ class Simulation:
         loads = float(np.sum(self.problem.system.loads_now**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
-            self._told_of_roundoff = True
+            self._told.add("roundoff")
             self.notes.append(
                 f"step {self.step_number} ({self._now()}) ended at round-off: double precision leaves a "
                 f"residual of {residual:.2g} N at this stiffness, {residual / driving:.1g} of the loads"
@@ -240,8 +249,8 @@ class Simulation:
         if stands:
             self.local_error.accepted(v_before, dt)
             self.estimated_error += error
-            if error > share and not self._told_of_error:
-                self._told_of_error = True
+            if error > share and "error" not in self._told:
+                self._told.add("error")
                 self.notes.append(
                     f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
                     f"the smallest Δt = {dt:.3g} s (-ts_adapt_dt_min)"
@@ -302,12 +311,15 @@ class Simulation:
         return {
             "time": self.time,
             "step": self.step_number,
-            "budget": asdict(self.budget),
+            "budget": self.ledger.memory()[1],
+            "totals": dict(self.totals),
+            "notes": list(self.notes),
+            "told": sorted(self._told),
             **self.control.memory(),
             "estimated_error": self.estimated_error,
             "integrator": self._numbers(),
-            "blend": self.stepper.blend,
-            "preset": self.stepper.preset,
+            **self.stepper.memory(self.time)[1],
+            **({"equilibrium": self._seek.memory()} if isinstance(self._seek, Equilibrium) else {}),
             "late_starts": sorted(self.problem.system.reference.late),
         }
 
@@ -318,6 +330,7 @@ class Simulation:
     def arrays(self) -> dict[str, Array]:
         """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
         arrays = dict(self.problem.system.integrator.memory()[0])
+        arrays |= self.ledger.memory()[0] | self.stepper.memory(self.time)[0]
         if self.local_error is not None:
             arrays |= self.local_error.memory()[0]
         return arrays
@@ -335,14 +348,13 @@ class Simulation:
         system = self.problem.system
         system.state.update_ghosts()
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
-        for name, value in memory["budget"].items():
-            if name != "more":
-                setattr(self.budget, name, float(value))
         # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)
         system.rest_at(self.time)
-        self.ledger.measure()
+        self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)
+        if isinstance(self._seek, Equilibrium):
+            self._seek.restore(memory.get("equilibrium", {}))
         self.estimated_error = float(memory["estimated_error"])
         system.integrator.restore(arrays, memory["integrator"])
         if self.local_error is not None:
@@ -351,10 +363,12 @@ class Simulation:
             names = term.registration.state
             if names:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
-        while memory["preset"] in self.stepper.presets[1:]:
-            self.stepper.next_preset()
-        self.stepper.blend = float(memory["blend"])
-        self.stepper.start(self.time, self.step_number)
+        self.stepper.restore(arrays, memory, self.time, self.step_number)
+        self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
+        self._told |= set(memory.get("told", ()))
+        earlier = [str(note) for note in memory.get("notes", ())]
+        self.earlier_notes = len(earlier)
+        self.notes[:] = [*earlier, *(note for note in self.notes if note not in earlier)]
 
     def destroy(self) -> None:
         """Free all PETSc and MPI objects, take back the scene's PETSc options; collective."""

@@ -77,7 +77,8 @@ class StageEquations:
     load_factor : float
         Factor on all loads (1 in a motion).
     unbalanced, given_loads : (n_owned, 3) or None
-        Static: force [N] of the start shape, reduced as the load factor grows; loads in place of the present.
+        Static: force [N] that holds the start shape, reduced as the load factor grows; loads in place of the
+        present ones.
     """
 
     def __init__(
@@ -245,8 +246,12 @@ class StageEquations:
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
-        parts = self._parts(self.x, self.v, np.zeros_like(self.history))
+        parts = self.forces_now()
         return np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
+
+    def forces_now(self) -> dict[str, Array]:
+        """The parts of F at the start of the step, each (n_owned, 3) [N]; nothing is accelerated."""
+        return self._parts(self.x, self.v, np.zeros_like(self.history))
 
     @property
     def stage_velocity(self) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -288,14 +289,26 @@ class Stepper:
             return None, "the velocities are not finite"
         return velocity, ""
 
-    @property
-    def blend(self) -> float:
-        """Fraction of regularisation in the last Newton iteration."""
-        return self._blend.value
+    def memory(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Arrays (n_owned, 3) and numbers with which the steps after ``time`` [s] go on alike; collective."""
+        arrays: dict[str, Array] = {}
+        numbers: dict[str, Any] = {"preset": self.preset, **self._newton.memory()}
+        if not self._iterates:
+            self._extrapolation.learn(time, self._equations.v[: self._shape[0]])
+            arrays, numbers["extrapolation"] = self._extrapolation.memory()
+        return arrays, numbers
 
-    @blend.setter
-    def blend(self, value: float) -> None:
-        self._blend.value = value
+    def restore(
+        self, arrays: Mapping[str, Array], numbers: Mapping[str, Any], time: float, step: int
+    ) -> None:
+        """Go on with a memory from the state at ``time`` [s], after ``step`` steps; collective."""
+        while numbers["preset"] in self.presets[1:]:
+            self.next_preset()
+        self._newton.restore(numbers)
+        if not self._iterates:
+            v = self._equations.v[: self._shape[0]]
+            self._extrapolation.restore(arrays, numbers.get("extrapolation", {}), time, v)
+        self.start(time, step)
 
     @property
     def linear_solver_slow(self) -> bool:
