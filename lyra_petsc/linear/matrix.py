@@ -157,8 +157,13 @@ class AssembledMatrix:
         if self.kind == "aij":
             inside, outside = np.repeat(3 * inside, 3), np.repeat(3 * outside, 3)
         self.mat.setPreallocationNNZ((inside, outside) if comm.size > 1 else inside)
-        # all rows are owned ones, and a block's values stand column by column
-        for option, value in (("SYMMETRIC", True), ("NO_OFF_PROC_ENTRIES", True), ("ROW_ORIENTED", False)):
+        for option, value in (
+            ("SYMMETRIC", True),
+            ("NO_OFF_PROC_ENTRIES", True),  # all rows are owned ones
+            ("ROW_ORIENTED", False),  # a block's values stand column by column
+            # set by the preallocation but on ranks without rows; the assembly is collective only without it
+            ("NEW_NONZERO_ALLOCATION_ERR", True),
+        ):
             self.mat.setOption(getattr(PETSc.Mat.Option, option), value)
         _set_vec_type(self.mat)
         self.mat.setUp()

@@ -67,6 +67,12 @@ PRESETS: dict[str, dict[str, Value]] = {
     },
 }
 
+BETWEEN_RANKS: dict[str, dict[str, Value]] = {
+    # sweeps are Jacobi's between ranks: undamped they diverge where each has but a few vertices
+    "gamg": {"mg_levels_ksp_richardson_scale": 0.5},
+}
+"""What a preset needs besides on more than one rank."""
+
 CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
 """Krylov methods that only multiply by their operator, and can monitor the true residual."""
 
@@ -156,7 +162,7 @@ def _factor_cost(n_vertices: int) -> float:
 def options_of(name: str, ranks: int) -> dict[str, Value]:
     """The options of a preset; ``user`` adds what goes with the ``-pc_type`` that was chosen."""
     if name != "user":
-        return PRESETS[name]
+        return PRESETS[name] | (BETWEEN_RANKS.get(name, {}) if ranks > 1 else {})
     chosen = PETSc.Options().getString("pc_type", "")
     if chosen in ("lu", "cholesky") and not is_set("mat_type"):
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
@@ -164,7 +170,7 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
         return PRESETS["multigrid"]
     for preset in ("block-jacobi", "gamg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
-            return PRESETS[preset]
+            return options_of(preset, ranks)
     return {"ksp_type": "cg"}
 
 

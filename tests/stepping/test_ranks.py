@@ -9,6 +9,8 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
 
+from lyra_petsc.linear.presets import BETWEEN_RANKS, PRESETS
+from lyra_petsc.mesh import distribute
 from lyra_petsc.stepping.energy_balance import Ledger
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -95,3 +97,19 @@ def test_start_noise_does_not_depend_on_the_ranks_and_spares_held_vertices(comm:
     held = np.isin(np.arange(len(flat)), [0, 1]) | (np.abs(flat[:, 1] - 2.0) < 0.01)
     assert np.abs(shift[held]).max() == 0.0
     assert np.std(shift[~held, 2]) == pytest.approx(0.01, rel=0.3)
+
+
+@pytest.mark.parametrize("preset", [name for name in PRESETS if name not in ("cholesky", "ilu")])
+def test_ranks_without_vertices(comm: MPI.Comm, preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Simulation(TINY, MPI.COMM_SELF) as direct:
+        expected = direct.run(0.01, 3)
+    partition = distribute.partition
+
+    def all_to_the_last(comm: MPI.Comm, graph: Any, n: int) -> tuple[Any, str]:
+        owners, name = partition(comm, graph, n)
+        return (None if owners is None else np.full(n, comm.size - 1)), name
+
+    monkeypatch.setattr(distribute, "partition", all_to_the_last)
+    options = PRESETS[preset] | BETWEEN_RANKS.get(preset, {})
+    with Simulation(TINY, comm, {name: str(value) for name, value in options.items()}) as simulation:
+        np.testing.assert_allclose(simulation.run(0.01, 3), expected, rtol=0.0, atol=1e-8)
