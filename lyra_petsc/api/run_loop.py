@@ -11,7 +11,7 @@ from typing import Any
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from lyra_petsc.errors import Interrupted, LyraError, OutputError, SolverError
+from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.h5py_loader import import_ahead
 from lyra_petsc.output.recorder import Recorder
@@ -111,10 +111,18 @@ class _RunLoop:
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
         if resumed:
-            earlier = on_root(self._comm, lambda: read_summary(folder / "summary.json")) or {}
+            earlier = self._earlier()
             changes = [{"key": c.key, "old": c.old, "new": c.new} for c in recorder.changes]
             start = {"step": simulation.step_number, "time": simulation.time, "ranks": self._comm.size}
             self._resumed = [*earlier.get("resumed", []), start | {"changes": changes}]
+
+    def _earlier(self) -> dict[str, Any]:
+        """The summary of the run that goes on; nothing in it is needed for that."""
+        try:
+            return on_root(self._comm, lambda: read_summary(self._folder / "summary.json")) or {}
+        except InputError as error:
+            self._simulation.notes.append(f"{error}; what it told of earlier resumptions is lost")
+            return {}
 
     def run(self, stop: StopAsked) -> None:
         simulation, recorder, callbacks = self._simulation, self._recorder, self._callbacks

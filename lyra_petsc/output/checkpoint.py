@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,14 +17,16 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, cannot_write, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
+from lyra_petsc.output.stored import check_sum, open_stored, text_of
 from lyra_petsc.parallel import on_root
 
-FORMAT = 1
+FORMAT = 2
+
+FIRST_FORMAT = 1
+"""That of older versions, where only the arrays have check sums."""
 
 Scalars = dict[str, Any]
 
@@ -83,8 +87,15 @@ def checkpoint_file(
     if edge_order is not None:
         slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
     sums = {name: _sum(slab, order.comm) for name, slab in slabs.items()}
+    text = json.dumps(dict(scalars))
+    arrays_told = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
     attributes: dict[str, dict[str, int | float | str]] = {
-        "/": {"format": FORMAT, "n_vertices": order.n_global, "scalars": json.dumps(dict(scalars))},
+        "/": {
+            "format": FORMAT,
+            "n_vertices": order.n_global,
+            "scalars": text,
+            "digest": _digest(FORMAT, order.n_global, text, arrays_told),
+        },
         **{name: {"sum": str(value)} for name, value in sums.items()},
     }
     return NewFile(folder / NEXT, slabs, attributes, publish=lambda: _rotate(folder))
@@ -142,26 +153,45 @@ def read_checkpoint(
 
 
 def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:
-    try:
-        with import_h5py().File(file, "r") as content:
-            version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
-            scalars = json.loads(content.attrs["scalars"])
-            sums = {
-                f"{kind}/{name}": int(data.attrs["sum"])
-                for kind in ("vertices", "edges")
-                for name, data in content.get(kind, {}).items()
-            }
-    except HDF5_ERRORS as error:
-        raise InputError(f"checkpoint is damaged: {reason(error)}", file=file) from error
-    if version != FORMAT:
-        raise InputError(f"checkpoint has format {version}, this version reads {FORMAT}", file=file)
+    with open_stored(file) as content:
+        version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
+        if version not in (FIRST_FORMAT, FORMAT):
+            raise InputError(
+                f"checkpoint has format {version}, this version reads {FIRST_FORMAT} and {FORMAT}", file=file
+            )
+        text = text_of(content, "scalars")
+        scalars = json.loads(text)
+        found = {
+            f"{kind}/{name}": (data.dtype.str, data.shape[1:], int(text_of(data, "sum")))
+            for kind in ("vertices", "edges")
+            for name, data in content.get(kind, {}).items()
+        }
+        told = text_of(content, "digest") if version != FIRST_FORMAT else None
+    if told is not None and told != _digest(version, n_vertices, text, found):
+        raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
+    if not _plausible(scalars) or any(np.dtype(kind).itemsize != 8 for kind, _, _ in found.values()):
+        raise InputError("checkpoint is damaged: it holds what no run writes", file=file)
     if n_vertices != order.n_global:
         raise InputError(
             f"checkpoint has {n_vertices} vertices, the scene's mesh {order.n_global}: "
             "resume with the scene it was written by",
             file=file,
         )
-    return scalars, sums
+    return scalars, {name: total for name, (_, _, total) in found.items()}
+
+
+def _plausible(scalars: Any) -> bool:
+    """Whether scalars are a run's; those of older versions have no check sum."""
+    if not isinstance(scalars, dict):
+        return False
+    step, time = scalars.get("step"), scalars.get("time")
+    return isinstance(step, int) and step >= 0 and isinstance(time, float | int) and 0.0 <= time < math.inf
+
+
+def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tuple[Any, ...]]) -> str:
+    """Check sum of all that a checkpoint holds: of the scalars' text, and of the arrays by their own sums."""
+    told = [version, n_vertices, scalars, sorted((name, *map(str, facts)) for name, facts in arrays.items())]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
 def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
@@ -177,7 +207,6 @@ def _sum(slab: NDArray[Any], comm: MPI.Comm) -> int:
     """Sum of all 64-bit words of a distributed array, modulo 2⁶⁴: the same on any number of ranks."""
     if slab.dtype.itemsize != 8:
         raise ValueError("checkpoints hold float64 and int64")
-    words = np.ascontiguousarray(slab).reshape(-1).view(np.uint64)
     total = np.empty(1, np.uint64)
-    comm.Allreduce(np.array([words.sum(dtype=np.uint64)]), total, MPI.SUM)
+    comm.Allreduce(np.array([check_sum(slab)], np.uint64), total, MPI.SUM)
     return int(total[0])

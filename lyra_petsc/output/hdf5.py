@@ -29,6 +29,7 @@ from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, on_each, ra
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.ordering import row_type
+from lyra_petsc.output.stored import open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
@@ -170,7 +171,7 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
     problem: LyraError | None = None
     slab: NDArray[Any] = np.empty(0)
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_stored(Path(path)) as file:
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
                 problem = InputError(
@@ -180,8 +181,8 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
                 )
             else:
                 slab = stored[order.start : order.start + order.n_slab]
-    except HDF5_ERRORS as error:
-        problem = InputError(f"{dataset} cannot be read: {reason(error)}", file=path)
+    except InputError as error:
+        problem = error
     raise_together(order.comm, problem)
     return slab
 
@@ -240,10 +241,16 @@ def lay_out(
             if path not in owners:
                 owners[path] = (h5py.h5g.open if path in file else h5py.h5g.create)(file, path.encode())
             for key, value in values.items():
-                kind = np.dtype(h5py.string_dtype() if isinstance(value, str) else type(value))
-                stored, memory = h5py.h5t.py_create(kind, logical=True), h5py.h5t.py_create(kind)
+                # text of variable length would stand in a heap without check sums
+                held = value.encode() if isinstance(value, str) else value
+                kind = (
+                    h5py.string_dtype("utf-8", max(1, len(held)))
+                    if isinstance(held, bytes)
+                    else np.dtype(type(held))
+                )
+                stored = h5py.h5t.py_create(kind, logical=True)
                 attribute = h5py.h5a.create(owners[path], key.encode(), stored, scalar)
-                attribute.write(np.array(value, dtype=kind), memory)
+                attribute.write(np.array(held, dtype=kind), stored)
     finally:
         file.close()
     with open(part, "r+b") as raw:
@@ -263,6 +270,8 @@ def _properties() -> tuple[Any, Any, Any, Any]:
     links.set_create_intermediate_group(True)
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    # older forms of groups and headers have no check sums, and damaged ones take HDF5 down with them
+    access.set_libver_bounds(h5py.h5f.LIBVER_V18, h5py.h5f.LIBVER_V18)
     return early, links, access, h5py.h5s.create(h5py.h5s.SCALAR)
 
 

@@ -8,13 +8,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
-from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.parallel import on_root
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 HISTORY_COLUMNS = (
     "step",

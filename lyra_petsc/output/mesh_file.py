@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.stored import SUM, check_sum
+from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 
@@ -59,6 +59,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
             names[f"groups/{number}"] = {"name": name}
             parts = _parts(group)
             datasets |= {f"groups/{number}/{part}": rows for part, rows in parts.items() if len(rows)}
+        names |= {name: {SUM: str(check_sum(rows))} for name, rows in datasets.items()}
         write_collective([NewFile(Path(folder) / MESH_FILE, datasets, names)], MPI.COMM_SELF)
 
     on_root(comm, work)
@@ -98,10 +99,10 @@ def check_same_mesh(
         if mesh is None:
             raise ValueError("rank 0 needs the mesh")
         try:
-            difference = _difference(file, mesh, set(groups))
-        except HDF5_ERRORS as error:
+            difference = _difference(StoredMesh(file.parent), mesh, set(groups))
+        except InputError as error:
             raise InputError(
-                f"cannot be read ({reason(error)}), so nothing shows that the mesh is still the same: "
+                f"{error.message}, so nothing shows that the mesh is still the same: "
                 "put it back, or run without --resume",
                 file=file,
             ) from error
@@ -131,27 +132,29 @@ def _parts(group: Group) -> dict[str, NDArray[np.int64]]:
     return {part: getattr(group, part) for part in PARTS}
 
 
-def _difference(file: Path, mesh: Mesh, used: set[str]) -> str:
+def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
     """What sets a mesh apart from the one in the file, in words; empty if nothing does."""
-    ours = _arrays(mesh)
-    with import_h5py().File(file, "r") as stored:
-        counts = len(stored["mesh/rest"]), len(stored["mesh/triangles"])
-        if counts != (mesh.n_vertices, mesh.n_triangles):
-            ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
-            return f"it has {ours_too}, not {counts[0]} and {counts[1]}"
-        rows = np.flatnonzero((stored["mesh/triangles"][()] != mesh.triangles).any(axis=1))
-        if len(rows):
-            return f"triangle {rows[0]} has other vertices ({len(rows)} such triangles)"
-        slack = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
-        for name, words in (("mesh/rest", "at rest"), ("start", "at the start")):
-            if name in stored and (place := _apart(stored[name][()], ours[name], slack)):
-                return f"vertex {place[0]} stands {place[1]:.3g} m off {words}"
-        material = "mesh/uv" if "mesh/uv" in ours else "mesh/corner_uv"
-        if material not in stored or _apart(stored[material][()], ours[material], slack):
-            return "other material coordinates"
-        for group in stored.get("groups", {}).values():
-            name = group.attrs["name"]
-            if name in used and name in mesh.groups and not _same_group(group, mesh.groups[name]):
+    counts = len(stored.rest), len(stored.triangles)
+    if counts != (mesh.n_vertices, mesh.n_triangles):
+        ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"
+        return f"it has {ours_too}, not {counts[0]} and {counts[1]}"
+    rows = np.flatnonzero((stored.triangles != mesh.triangles).any(axis=1))
+    if len(rows):
+        return f"triangle {rows[0]} has other vertices ({len(rows)} such triangles)"
+    slack = ROUNDING * float(np.abs(mesh.rest).max(initial=0.0) + np.abs(mesh.positions).max(initial=0.0))
+    for theirs, ours, words in (
+        (stored.rest, mesh.rest, "at rest"),
+        (stored.start, mesh.positions, "at the start"),
+    ):
+        if theirs is not None and (place := _apart(theirs, ours, slack)):
+            return f"vertex {place[0]} stands {place[1]:.3g} m off {words}"
+    uv = vertex_uv(mesh)
+    if (uv is None) != (stored.uv is None) or _apart(stored.corner_uv, mesh.triangle_uv, slack):
+        return "other material coordinates"
+    for name, group in stored.groups.items():
+        if name in used and name in mesh.groups:
+            pairs = zip(_parts(group).values(), _parts(mesh.groups[name]).values(), strict=True)
+            if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
                 return f"group {name!r} has other members"
     return ""
 
@@ -161,10 +164,3 @@ def _apart(stored: NDArray[Any], ours: NDArray[Any], slack: float) -> tuple[int,
     distance = np.abs(stored - ours).reshape(len(ours), -1).max(axis=1)
     row = int(np.argmax(distance))
     return (row, float(distance[row])) if distance[row] > slack else None
-
-
-def _same_group(stored: Any, ours: Group) -> bool:
-    return all(
-        np.array_equal(stored[part][()] if part in stored else np.empty((0, *rows.shape[1:]), int), rows)
-        for part, rows in _parts(ours).items()
-    )

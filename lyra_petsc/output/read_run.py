@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.output.stored import read_stored
+from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
 
@@ -34,6 +37,9 @@ ENERGIES = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_en
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"})
 """Columns of whole numbers."""
+
+COLUMNS = {"velocity": (3,), "green_strain": (3,), "stress": (3,)}
+"""Shape of a row of the fields that are no plain numbers."""
 
 
 class Run:
@@ -87,8 +93,7 @@ class Run:
             self.__dict__.pop(name, None)
         states, mesh = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
         if mesh != self._stamp[1]:  # replaced by another run
-            for name in ("_mesh", "triangles", "rest"):
-                self.__dict__.pop(name, None)
+            self.__dict__.pop("mesh", None)
         if (states, mesh) == self._stamp:
             return False
         self._look()
@@ -108,44 +113,37 @@ class Run:
     # -- mesh ----------------------------------------------------------------------------------------
 
     @cached_property
-    def _mesh(self) -> dict[str, NDArray[Any]]:
-        """Texture coordinates, by the names they have in the file."""
-        path = self.folder / MESH_FILE
-        try:
-            with import_h5py().File(path, "r") as file:
-                mesh = file["mesh"]
-                given = bool(mesh.attrs.get("vt", 0))
-                return {name: mesh[name][()] for name in ("uv", "corner_uv") if given and name in mesh}
-        except HDF5_ERRORS as error:
-            raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+    def mesh(self) -> StoredMesh:
+        """What ``mesh.h5`` holds."""
+        return StoredMesh(self.folder)
 
-    @cached_property
+    @property
     def triangles(self) -> NDArray[np.int64]:
         """(F, 3) vertices of each triangle, both in the order of the mesh file."""
-        return read_array(self.folder, (MESH_FILE, "mesh/triangles"))
+        return self.mesh.triangles
 
-    @cached_property
+    @property
     def rest(self) -> Array:
         """(V, 3) rest shape [m]."""
-        return read_array(self.folder, (MESH_FILE, "mesh/rest"))
+        return self.mesh.rest
 
     @property
     def uv(self) -> Array | None:
         """(V, 2) texture coordinates (``vt``) [m]; None if the mesh has none, or has seams."""
-        return self._mesh.get("uv")
+        return self.mesh.uv if self.mesh.textured else None
 
     @property
     def corner_uv(self) -> Array | None:
         """(F, 3, 2) texture coordinates (``vt``) [m] of the triangles' corners; None without ``vt``."""
-        uv = self.uv
-        return self._mesh.get("corner_uv") if uv is None else uv[self.triangles]
+        return self.mesh.corner_uv if self.mesh.textured else None
 
     # -- states --------------------------------------------------------------------------------------
 
     @property
     def positions(self) -> StateArrays:
         """(V, 3) [m] for each state."""
-        return StateArrays(self.folder, "positions", [state.position for state in self._states])
+        places = [state.position for state in self._states]
+        return StateArrays(self.folder, "positions", places, (len(self.rest), 3))
 
     @property
     def velocities(self) -> StateArrays:
@@ -165,12 +163,16 @@ class Run:
             raise InputError(
                 f"no field {name!r}, {what}; a scene's output.fields names them", file=self.folder
             )
-        return StateArrays(self.folder, name, [state.fields[name] for state in self._states])
+        places = [state.fields[name] for state in self._states]
+        rows = self.rest if self.field_on(name) == "vertex" else self.triangles
+        return StateArrays(self.folder, name, places, (len(rows), *COLUMNS.get(name, ())))
 
     def field_units(self, name: str) -> str:
         """Unit of a field, as in ``N/m``; ``1`` for plain numbers."""
         from lyra_petsc.scene.schema import FIELD_UNITS
 
+        if name not in {"position", *FIELD_UNITS}:
+            raise InputError(f"is damaged: no run writes a field {name!r}", file=self.folder / XDMF_FILE)
         return "m" if name == "position" else FIELD_UNITS[name]
 
     def field_on(self, name: str) -> str:
@@ -222,7 +224,7 @@ class Run:
 
     @cached_property
     def _history(self) -> Columns:
-        return read_table(self.folder / "history.csv")
+        return read_history(self.folder)
 
     def _table(self, name: str) -> Columns:
         path = self.folder / name
@@ -295,7 +297,7 @@ def announced_states(folder: Path) -> list[StoredState]:
         raise InputError(_absent(folder), file=folder) from None
     except OSError as error:
         raise InputError(f"cannot be read: {reason(error)}", file=path) from None
-    except (ParseError, ValueError, AttributeError, UnicodeDecodeError):
+    except (ParseError, ValueError, LookupError, AttributeError, RecursionError):
         raise InputError("is damaged, or was not written by a run", file=path) from None
     if not states:
         raise InputError("no state is written yet", file=folder)
@@ -317,8 +319,11 @@ def _state(grid: Element) -> StoredState:
     if time is None or geometry is None:
         raise ValueError
     fields = {a.attrib["Name"]: a for a in grid.iterfind("Attribute") if a.get("Name") != "rest"}
+    seconds = float(time.attrib["Value"])
+    if not math.isfinite(seconds):
+        raise ValueError
     return StoredState(
-        float(time.attrib["Value"]),
+        seconds,
         _place(geometry),
         {name: _place(field) for name, field in fields.items()},
         {name: "triangle" if field.get("Center") == "Cell" else "vertex" for name, field in fields.items()},
@@ -344,10 +349,12 @@ class StateArrays(Sequence[NDArray[Any]]):
     name : str
     places : sequence of (str, str)
         File and dataset of each state.
+    shape : tuple of int
+        Of the array of one state.
     """
 
-    def __init__(self, folder: Path, name: str, places: Sequence[Place]) -> None:
-        self._folder, self._name, self._places = folder, name, places
+    def __init__(self, folder: Path, name: str, places: Sequence[Place], shape: tuple[int, ...]) -> None:
+        self._folder, self._name, self._places, self._shape = folder, name, places, shape
 
     def __len__(self) -> int:
         return len(self._places)
@@ -369,8 +376,9 @@ class StateArrays(Sequence[NDArray[Any]]):
             If its file is gone or damaged.
         """
         if isinstance(index, slice):
-            return StateArrays(self._folder, self._name, self._places[index])
-        return read_array(self._folder, self._places[index])
+            return StateArrays(self._folder, self._name, self._places[index], self._shape)
+        file, dataset = self._places[index]
+        return read_stored(self._folder / file, dataset, self._shape)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         if not self._places:
@@ -381,50 +389,51 @@ class StateArrays(Sequence[NDArray[Any]]):
         return f"<{self._name} of {len(self)} states in {self._folder}>"
 
 
-def read_array(folder: Path, place: Place) -> NDArray[Any]:
-    """A whole dataset.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    file, dataset = place
-    try:
-        with import_h5py().File(folder / file, "r") as opened:
-            array: NDArray[Any] = opened[dataset][()]
-    except HDF5_ERRORS as error:
-        why = reason(error) if (folder / file).exists() else "no such file"
-        raise InputError(f"{dataset.lstrip('/')} cannot be read: {why}", file=folder / file) from None
-    return array
+def read_history(folder: Path) -> Columns:
+    """The columns of history.csv; raises as `read_table`."""
+    return read_table(folder / "history.csv", HISTORY_COLUMNS)
 
 
-def read_table(path: Path) -> Columns:
+def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
     """The columns of a table, without a last row that is not whole yet.
 
+    Parameters
+    ----------
+    path : Path
+    needed : sequence of str
+        Columns that it must have.
+
     Raises
     ------
     InputError
-        If it is missing or damaged.
+        If it is missing or damaged, or has no row.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"cannot be read: {reason(error)}", file=path) from None
     except UnicodeDecodeError:
-        raise InputError("is damaged", file=path) from None
-    header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
-    if not header or any(len(row) != len(header) for row in rows):
-        raise InputError("is damaged", file=path)
+        raise InputError("is damaged: it is no text", file=path) from None
     try:
-        return {
+        header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
+        if not header or any(len(row) != len(header) for row in rows):
+            raise ValueError("rows of different lengths")
+        if lacking := [name for name in needed if name not in header]:
+            raise ValueError(f"no column {lacking[0]}")
+        columns = {
             name: np.array([row[i] for row in rows], dtype="U64").astype(
                 np.int64 if name in COUNTS else float
             )
             for i, name in enumerate(header)
         }
-    except ValueError:
-        raise InputError("is damaged", file=path) from None
+    except (ValueError, OverflowError, csv.Error) as error:
+        raise InputError(f"is damaged: {reason(error)}", file=path) from None
+    if not rows:
+        raise InputError("holds no row yet, or is damaged: only its header is there", file=path)
+    bad = [name for name, values in columns.items() if name in needed and not np.isfinite(values).all()]
+    if bad:
+        raise InputError(f"is damaged: {bad[0]} holds numbers that are not finite", file=path)
+    return columns
 
 
 def as_frame(columns: Columns) -> Any:

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
@@ -103,19 +104,17 @@ class Recorder:
         """
         simulation = self._simulation
         problem, scene = simulation.problem, simulation.scene
-        system, layout = problem.system, problem.points
         check_same_mesh(folder, problem.mesh, _groups(scene), self._comm)
         checkpoint = read_checkpoint(folder, self._vertices, self._edges)
         on_root(self._comm, lambda: self._check_kind(folder, checkpoint))
-        memory = checkpoint.scalars
-        arrays = {
-            name: layout.joined(values, checkpoint.edges.get(name))
-            for name, values in checkpoint.arrays.items()
-        }
-        for number, start in enumerate(memory["late_starts"]):
-            system.reference.resume(float(start), arrays[f"start_{number}"])
-        system.state.set(arrays["position"], arrays["velocity"])
-        simulation.resume(memory, arrays)
+        try:
+            self._put(checkpoint)
+        except (LookupError, TypeError, ValueError) as error:
+            raise InputError(
+                f"checkpoint is damaged, or was written by another version ({reason(error)}): "
+                "run without --resume",
+                file=checkpoint.file,
+            ) from error
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
         self._note_changes(folder / "scene.yaml")
@@ -124,7 +123,21 @@ class Recorder:
         if kept != last:
             simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
-        self._last_state = int(memory["last_state"])
+        self._last_state = int(checkpoint.scalars["last_state"])
+
+    def _put(self, checkpoint: Checkpoint) -> None:
+        """Put a checkpoint into the simulation."""
+        simulation, memory = self._simulation, checkpoint.scalars
+        system, layout = simulation.problem.system, simulation.problem.points
+        arrays = {
+            name: layout.joined(values, checkpoint.edges.get(name))
+            for name, values in checkpoint.arrays.items()
+        }
+        for number, start in enumerate(memory["late_starts"]):
+            system.reference.resume(float(start), arrays[f"start_{number}"])
+        system.state.set(arrays["position"], arrays["velocity"])
+        simulation.resume(memory, arrays)
+        int(memory["last_state"])
 
     def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
         """Refuse what cannot go on from the checkpoint (rank 0)."""

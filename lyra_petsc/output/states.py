@@ -19,6 +19,7 @@ from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.stored import text_of
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
 from lyra_petsc.parallel import on_root
@@ -73,7 +74,7 @@ class StateWriter:
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
         if vtkhdf:
-            on_root(self._comm, lambda: write_cells(self.folder, MESH_FILE))
+            on_root(self._comm, lambda: write_cells(self.folder))
         if resume_after is not None:
             self._next = on_root(self._comm, lambda: self._truncate(resume_after)) or 0
 
@@ -182,7 +183,7 @@ def read_state(path: Path) -> WrittenState | None:
             number = int(match[1]) if match else 0
             group = file[group_name(number)]
             fields = tuple(
-                StoredField(name, str(data.attrs["on"]), data.shape, data.dtype.name)
+                StoredField(name, text_of(data, "on"), data.shape, data.dtype.name)
                 for name, data in group.items()
                 if name != "position"
             )

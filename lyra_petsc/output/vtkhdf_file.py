@@ -21,6 +21,7 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_bytes
 from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
@@ -42,17 +43,17 @@ def cells(triangles: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     }
 
 
-def write_cells(folder: Path, mesh_file: str) -> None:
+def write_cells(folder: Path) -> None:
     """Write ``cells.h5`` from the mesh of the folder, once. Call on one rank.
 
     Raises
     ------
+    InputError
+        If the mesh cannot be read.
     OutputError
     """
-    path = folder / CELLS_FILE
+    path, triangles = folder / CELLS_FILE, StoredMesh(folder).triangles
     try:
-        with import_h5py().File(folder / mesh_file, "r") as stored:
-            triangles = stored["mesh/triangles"][()]
         with _in_memory() as file:
             for name, array in cells(triangles).items():
                 file[name] = array

@@ -83,7 +83,7 @@ def test_slabs_become_one_array(comm, shared_tmp, way, n):
     assert found["states/000000/owner"].dtype == np.int32
     with h5py.File(path, "r") as file:
         assert dict(file["states/000000"].attrs) == {"time": 0.1, "step": 3}
-        assert file["states/000000/x"].attrs["unit"] == "m"
+        assert file["states/000000/x"].attrs["unit"] == b"m"
     comm.Barrier()
     assert [entry.name for entry in shared_tmp.iterdir()] == ["a.h5"]
 

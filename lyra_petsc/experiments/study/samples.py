@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.measures import bounding_diagonal
-from lyra_petsc.output.agreement import HDF5_ERRORS, raise_together, reason
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.agreement import raise_together
 from lyra_petsc.output.read_run import Columns, read_table
 from lyra_petsc.output.states import read_state, state_files
-from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.output.stored import open_stored
+from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.parallel import on_root
 
 Array = NDArray[np.float64]
@@ -110,15 +110,15 @@ class Samples:
         problem: LyraError | None = None
         rows: Array = np.empty((0, 3))
         try:
-            with import_h5py().File(self.folder / file, "r") as opened:
+            with open_stored(self.folder / file) as opened:
                 stored = opened[dataset]
                 if wanted is None:
                     start, stop = slab(comm, self.n_vertices)
                     rows = stored[start:stop]
                 else:
                     rows = _picked(stored, wanted)
-        except HDF5_ERRORS as error:
-            problem = InputError(f"positions cannot be read: {reason(error)}", file=self.folder / file)
+        except InputError as error:
+            problem = error
         raise_together(comm, problem)
         return rows
 
@@ -156,14 +156,8 @@ def read_surface(folder: Path) -> Surface:
     InputError
         If ``mesh.h5`` is missing or damaged.
     """
-    path = folder / MESH_FILE
-    try:
-        with import_h5py().File(path, "r") as file:
-            mesh = file["mesh"]
-            rest, triangles = mesh["rest"][:], mesh["triangles"][:]
-            uv = mesh["corner_uv"][:] if "corner_uv" in mesh else mesh["uv"][:][triangles]
-    except HDF5_ERRORS as error:
-        raise InputError(f"the mesh cannot be read: {reason(error)}", file=path) from None
+    mesh = StoredMesh(folder)
+    rest, triangles, uv = mesh.rest, mesh.triangles, mesh.corner_uv
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     thirds = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 6.0
     areas = np.bincount(triangles.ravel(), np.repeat(thirds, 3), len(rest)).astype(np.float64)

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.output.read_run import Run, read_array
-from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.output.read_run import Run
 
 Array = NDArray[np.float64]
 
@@ -118,11 +117,7 @@ DERIVED: dict[str, Callable[[Run, str], ColourQuantity]] = {
 
 def material_coordinates(run: Run) -> Array:
     """(F, 3, 2) material coordinates of the triangles' corners [m]: ``vt``, or the flattened rest shape."""
-    try:
-        uv = read_array(run.folder, (MESH_FILE, "mesh/uv"))
-    except InputError:
-        return read_array(run.folder, (MESH_FILE, "mesh/corner_uv"))
-    return np.asarray(uv[run.triangles])
+    return run.mesh.corner_uv
 
 
 def _edges(corners: Array) -> Array:

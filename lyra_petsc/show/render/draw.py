@@ -12,7 +12,6 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.show.render.camera import Fit, upwards
@@ -111,13 +110,11 @@ def extent(run: Run, states: list[int], normals: Array, shown: ColourQuantity | 
     Raises
     ------
     InputError
-        If a state holds numbers that are not finite.
+        If a state is damaged.
     """
     found = np.full(len(normals) + 2, -np.inf)
     for state in states:
         x = run.positions[state]
-        if not np.isfinite(x).all():
-            raise InputError(f"state {state} holds positions that are not finite numbers", file=run.folder)
         low, high = (np.inf, -np.inf) if shown is None else shown.span(state)
         found = np.maximum(found, [*(x @ normals.T).max(axis=0), -low, high])
     return found

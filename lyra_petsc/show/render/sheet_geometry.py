@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.mesh import Group, Mesh
+from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Window
@@ -84,16 +81,6 @@ class HeldVertices:
 
 def _stored_mesh(run: Run) -> Mesh:
     """Start positions and groups, from which the handles are selected."""
-    path = run.folder / MESH_FILE
-    groups: dict[str, Group] = {}
-    none = np.empty(0, dtype=np.int64)
-    try:
-        with import_h5py().File(path, "r") as file:
-            start = file["start"][()]
-            for stored in file["groups"].values() if "groups" in file else ():
-                vertices = stored["vertices"][()] if "vertices" in stored else none
-                groups[str(stored.attrs["name"])] = Group(0, vertices, none, none.reshape(0, 2))
-    except HDF5_ERRORS as error:
-        raise InputError(f"cannot be read: {reason(error)}", file=path) from None
+    start = run.rest if run.mesh.start is None else run.mesh.start
     no_uv, no_rest = np.empty((0, 3, 2)), np.empty(0, dtype=bool)
-    return Mesh(start, start, run.triangles, triangle_uv=no_uv, flat_rest=no_rest, groups=groups)
+    return Mesh(start, start, run.triangles, triangle_uv=no_uv, flat_rest=no_rest, groups=run.mesh.groups)

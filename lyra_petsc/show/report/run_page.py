@@ -179,8 +179,9 @@ def _words(page: Report, facts: Facts) -> None:
     if unused:
         notes.append("PETSc options that nothing used: " + ", ".join(f"-{name}" for name in unused))
     for resumed in facts.summary.get("resumed", []):
-        changes = "; ".join(f"{c['key']}: {c['old']} → {c['new']}" for c in resumed.get("changes", []))
-        words = f"resumed after step {resumed['step']} on {resumed['ranks']} ranks"
+        listed = resumed.get("changes", [])
+        changes = "; ".join(f"{c.get('key')}: {c.get('old')} → {c.get('new')}" for c in listed)
+        words = f"resumed after step {resumed.get('step')} on {resumed.get('ranks')} ranks"
         notes.append(f"{words}, with {changes}" if changes else words)
     page.bullets(notes)
     if not notes:

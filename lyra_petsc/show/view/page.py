@@ -16,7 +16,7 @@ from trame.widgets import client, html, plotly, vtk
 from trame.widgets import vuetify3 as v
 
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.output.read_run import Run, read_table
+from lyra_petsc.output.read_run import Run, read_history
 from lyra_petsc.output.run_folder import in_use
 from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.show.view import page_content as content
@@ -216,7 +216,7 @@ class Page:
         self.cloth.look_from(fit.view(np.max([(x @ fit.normals.T).max(axis=0) for x in motion], axis=0)))
 
     def _draw_plots(self) -> None:
-        history = read_table(self._run.folder / "history.csv")
+        history = read_history(self._run.folder)
         self._figures = {
             "energies": content.energies(history, self._unit),
             "iterations": content.iterations(history, self._unit),

@@ -17,7 +17,7 @@ from typing import Any
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.read_run import Run, read_table
+from lyra_petsc.output.read_run import Run, read_history
 from lyra_petsc.show.view.access import Access
 
 LOCAL = "127.0.0.1"
@@ -192,5 +192,5 @@ def find_run(folder: Path) -> Run:
     for needed in ("triangles", "rest", "scene"):
         getattr(run, needed)
     run.positions[0]
-    read_table(run.folder / "history.csv")
+    read_history(run.folder)
     return run

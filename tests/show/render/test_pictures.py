@@ -202,7 +202,7 @@ def test_states_that_are_no_numbers_are_refused(tmp_path, monkeypatch):
     run = written(tmp_path / "run")
     with h5py.File(run / "states-0001.h5", "a") as file:
         file["states/000001/position"][3, 1] = np.nan
-    with pytest.raises(InputError, match="state 1 holds positions that are not finite"):
+    with pytest.raises(InputError, match="position holds numbers that are not finite"):
         drawn(RenderOptions(run, film=tmp_path / "a.mp4", size=SIZE))
     assert not (tmp_path / "a.mp4").exists()
 
