@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.options import SETTINGS, example, helped, results
 
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
@@ -17,7 +17,13 @@ PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 """What pictures need of the extra ``view``."""
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(
+    context_settings=SETTINGS,
+    epilog=example(
+        "lyra-petsc render runs/flag --film flag.mp4 --field speed",
+        "lyra-petsc render runs/flag --at 0.5,1 --handles --wind",
+    ),
+)
 @helped
 @results
 @click.option("--at", metavar="T,T,…", help="Pictures of the states nearest to these times [s].")
