@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.arguments import split
+from lyra_petsc.cli.arguments import help_asked, split
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError
 from lyra_petsc.parallel import take_back_signals
@@ -36,7 +36,7 @@ def run_command_line(argv: Sequence[str]) -> int:
     """Parse and run; the exit code. Starts PETSc with its part of the arguments."""
     if COMPLETION in os.environ:  # the shell asks at a press of the tab key: PETSc is not needed
         verbs.main([], prog_name=PROGRAM)
-    ours, petsc = split(argv[1:])
+    ours, petsc = help_asked(*split(argv[1:]))
     # without a launcher Open MPI starts a daemon, which only a process that spawns others would need
     os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
     try:

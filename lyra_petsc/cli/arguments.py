@@ -45,3 +45,14 @@ def _is_value(option: str, word: str) -> bool:
     if word.startswith("--") or _PETSC.match(word):
         return False
     return not _SCENE.match(word) or option.lstrip("-") in _TAKES_FILE
+
+
+def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]:
+    """Both kinds of arguments, with PETSc's ``-help`` as our ``--help``.
+
+    Beside a scene to run it stays PETSc's, whose objects list their options as they are made.
+    """
+    runs = ours[:1] == ["run"] and any(_SCENE.match(word) for word in ours[1:])
+    if "-help" not in petsc or runs:
+        return ours, petsc
+    return [*ours[:1], "--help"], [word for word in petsc if word != "-help"]

@@ -87,6 +87,11 @@ class Terminal:
         if self._speaks:
             self._console.print(Text(text, style=style) if isinstance(text, str) else text)
 
+    def announce(self, known: int) -> None:
+        """Say how many cases will run, of how many that there are."""
+        of = f" of {known}" if known != self._count else ""
+        self.print(f"{self._count}{of} cases")
+
     def begin(self, case: Case) -> None:
         """A case begins: a line on a terminal, until the case has ended."""
         self._done += 1

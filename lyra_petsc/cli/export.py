@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.options import SETTINGS, example, helped, results
 from lyra_petsc.cli.signals import watched
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc export runs/flag --to gltf"))
 @helped
 @results
 @click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped
+from lyra_petsc.cli.options import SETTINGS, example, helped
 from lyra_petsc.errors import InputError
 
 if TYPE_CHECKING:
     from lyra_petsc.scene.starter import OwnMesh
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc new pennant --mesh pennant.geo"))
 @helped
 @click.argument("name")
 @click.option(

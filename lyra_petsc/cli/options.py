@@ -22,6 +22,14 @@ def _show_help(ctx: click.Context, param: click.Parameter, value: bool) -> None:
 helped = click.option(
     "--help", is_flag=True, is_eager=True, expose_value=False, callback=_show_help, help="Show this and exit."
 )
+
+
+def example(*lines: str) -> str:
+    """What a verb's help ends with: commands to copy."""
+    heading = "Examples:" if len(lines) > 1 else "Example:"
+    return "\n".join(["\b", heading, *(f"  {line}" for line in lines)])
+
+
 SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
 
 scene = click.argument("scene", required=False, type=click.Path(path_type=Path))

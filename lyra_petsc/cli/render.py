@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.options import SETTINGS, example, helped, results
 
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
@@ -17,7 +17,13 @@ PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 """What pictures need of the extra ``view``."""
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(
+    context_settings=SETTINGS,
+    epilog=example(
+        "lyra-petsc render runs/flag --film flag.mp4 --field speed",
+        "lyra-petsc render runs/flag --at 0.5,1 --handles --wind",
+    ),
+)
 @helped
 @results
 @click.option("--at", metavar="T,T,…", help="Pictures of the states nearest to these times [s].")
@@ -29,7 +35,8 @@ PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 @click.option("--fps", type=float, metavar="N", help="Frames a second (one for each state, 10 to 60).")
 @click.option("--speed", type=float, metavar="X", help="Simulated seconds in a second of the film (1).")
 @click.option("--field", metavar="NAME", help="Colour by speed, strain, displacement or a written field.")
-@click.option("--range", metavar="LOW,HIGH", help="Of the colours.")
+@click.option("--range", metavar="LOW,HIGH", help="Of the colours: values, or percentiles as 2%,98%.")
+@click.option("--cells", is_flag=True, help="Each triangle in the colour of its own value, not of means.")
 @click.option("--texture", type=click.Path(path_type=Path), metavar="IMAGE", help="A picture on the sheet.")
 @click.option("--colors", metavar="FRONT,BACK", help="Of the sheet, as firebrick,ivory or #c8402f,#f0e2c8.")
 @click.option("--handles", is_flag=True, help="Show the vertices that are held.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.options import SETTINGS, example, helped, results
 
 if TYPE_CHECKING:
     from lyra_petsc.output.read_run import Run
@@ -18,7 +18,7 @@ PAGE = "report.html"
 PICTURE_SIZE = "960x540"
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc report runs/flag"))
 @helped
 @results
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="The page (RUN/report.html).")

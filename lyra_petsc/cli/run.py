@@ -65,7 +65,7 @@ def run(
     path = scene or default_scene()
     choice = choose(comm, path.stem, out, force=force, resume=resume)
     loaded = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulate(comm, loaded, choice, TerminalProgress(comm, served), stop.signal_number, phases)
+    simulate(comm, loaded, choice, TerminalProgress(comm, served, choice.first), stop.signal_number, phases)
 
 
 class TerminalProgress(ProgressCallbacks):
@@ -76,10 +76,12 @@ class TerminalProgress(ProgressCallbacks):
     comm : MPI.Comm
     served : Served, optional
         Where a page shows it as well.
+    usual : Path, optional
+        The folder that it takes unless that exists.
     """
 
-    def __init__(self, comm: MPI.Comm, served: Served | None = None) -> None:
-        self._comm = comm
+    def __init__(self, comm: MPI.Comm, served: Served | None = None, usual: Path | None = None) -> None:
+        self._comm, self._usual = comm, usual
         self._progress: Progress | None = None
         self._page: LivePage | None = None
         if served is not None and comm.rank == 0:
@@ -105,6 +107,8 @@ class TerminalProgress(ProgressCallbacks):
             plain=_petsc_speaks(),
             unit="s" if simulation.problem.system.integrator.moves else "",
         )
+        if self._usual is not None and folder != self._usual:
+            self.note(f"{self._usual} exists: the results go to {folder} (--force would replace it)")
         if self._page is not None:
             self._page.show(folder)
 

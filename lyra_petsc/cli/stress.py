@@ -136,6 +136,8 @@ def list_cases(comm: MPI.Comm, asked: Asked) -> None:
                 told = case.family
                 click.echo(f"{told}: {FAMILIES.load(told).title}")
             click.echo(f"  {case.name:<{width}}  {case.title}")
+        whole = len(selected((), Level.FULL))
+        click.echo(f"{len(found)} of {whole} cases; --full has all", err=True)
 
 
 class Show(Terminal):
@@ -144,6 +146,7 @@ class Show(Terminal):
     def __init__(self, comm: MPI.Comm, count: int, outcomes: list[Outcome]) -> None:
         super().__init__(comm, count, WIDTH)
         self._outcomes = outcomes
+        self.announce(len(selected((), Level.FULL)))
         self._line(list(HEADINGS), "bold")
 
     def end(self, outcome: Outcome) -> None:  # type: ignore[override]

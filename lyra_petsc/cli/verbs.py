@@ -14,7 +14,7 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, helped, out, scene, settings, trust_mesh
+from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, trust_mesh
 from lyra_petsc.cli.render import render
 from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
@@ -47,7 +47,12 @@ def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
         ctx.exit()
 
 
-@click.group(cls=_Verbs, context_settings=SETTINGS, invoke_without_command=True)
+@click.group(
+    cls=_Verbs,
+    context_settings=SETTINGS,
+    invoke_without_command=True,
+    epilog=example("lyra-petsc new kite", "mpirun -n 2 lyra-petsc run kite.yaml"),
+)
 @helped
 @click.option(
     "--version",
@@ -67,7 +72,13 @@ def verbs(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(
+    context_settings=SETTINGS,
+    epilog=example(
+        "mpirun -n 2 lyra-petsc run configs/flag.yaml --set time.end=1 -ksp_monitor",
+        "lyra-petsc run configs/flag.yaml --resume",
+    ),
+)
 @helped
 @scene
 @settings
@@ -87,7 +98,9 @@ def run(
     run_scene(comm, served=Served.of_live(live, host, port, no_browser), **options)
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(
+    context_settings=SETTINGS, epilog=example("lyra-petsc check configs/flag.yaml --set mesh.size=0.02")
+)
 @helped
 @scene
 @settings
@@ -105,7 +118,9 @@ def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: 
         check_scene(comm, scene, settings, trust_mesh=trust_mesh)
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(
+    context_settings=SETTINGS, epilog=example("lyra-petsc verify --quick", "lyra-petsc verify --list")
+)
 @helped
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option("--quick", is_flag=True, help="Only the coarser resolutions of each case.")
@@ -126,7 +141,10 @@ def verify(
     return verify_cases(comm, names, quick=quick, out=out, force=force)
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(
+    context_settings=SETTINGS,
+    epilog=example("lyra-petsc study configs/swing.yaml --vary integrator=beuler,bdf2 --vary dt=0.02,0.01"),
+)
 @helped
 @scene
 @settings
@@ -160,7 +178,10 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
         study_scene(comm, Asked(**asked))
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(
+    context_settings=SETTINGS,
+    epilog=example("lyra-petsc stress --quick", "mpirun -n 2 lyra-petsc stress configs/drape.yaml --list"),
+)
 @helped
 @scene
 @settings
@@ -184,7 +205,7 @@ def stress(comm: Any, /, listed: bool, **asked: Any) -> int:
     return stress_cases(comm, Asked(**asked))
 
 
-@verbs.command(context_settings=SETTINGS)
+@verbs.command(context_settings=SETTINGS, epilog=example("lyra-petsc info"))
 @helped
 @click.pass_obj
 def info(comm: Any) -> None:

@@ -32,6 +32,7 @@ def verify(comm: MPI.Comm, names: Sequence[str], *, quick: bool, out: Path | Non
     results = Results(comm, out, Verification(), ranks=comm.size, command=again, force=force)
     watch = watched(comm)
     show = Show(comm, len(cases), WIDTH)
+    show.announce(len(CASES.modules))
     note = results.run(cases, lambda case: run_case(comm, case, quick=quick, watch=watch), show)
     table = plain_table(["case", "verdict"], ["run time [s]"])
     for outcome in results.outcomes:
@@ -47,6 +48,7 @@ def list_cases(comm: MPI.Comm) -> None:
         width = max(len(case.name) for case in cases)
         for case in cases:
             click.echo(f"{case.name:<{width}}  {case.title}")
+        click.echo(f"{len(cases)} cases", err=True)
 
 
 class Show(Terminal):

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, helped, results
+from lyra_petsc.cli.options import SETTINGS, example, helped, results
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import raise_together
@@ -89,7 +89,7 @@ class Served:
             open_browser(url)
 
 
-@click.command(context_settings=SETTINGS)
+@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc view runs/flag"))
 @helped
 @results
 @where_served

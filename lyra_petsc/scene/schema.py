@@ -41,6 +41,7 @@ from lyra_petsc.scene.values import (
     PositiveScale,
     Scale,
     Seed,
+    Share,
     StepLength,
     Text,
     Until,
@@ -715,6 +716,8 @@ class Camera(Block):
         Height of the field of view, from 1 to 120.
     zoom : float
         With a fitted distance: how much larger than it fits.
+    frame : float [percent]
+        With a fitted distance: the share of the states that are wholly in the picture (95), from 50 to 100.
     """
 
     rules = (
@@ -732,7 +735,7 @@ class Camera(Block):
                 "has no meaning beside position and target; leave it out",
                 key,
             )
-            for key in ("direction", "zoom")
+            for key in ("direction", "zoom", "frame")
         ),
     )
 
@@ -742,6 +745,7 @@ class Camera(Block):
     up: Axis | None = None
     angle: Angle = 25.0
     zoom: Positive | None = None
+    frame: Share | None = None
 
     @model_validator(mode="after")
     def _has_directions(self) -> Self:

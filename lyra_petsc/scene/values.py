@@ -220,6 +220,7 @@ NonNegative = Annotated[float, _real(">= 0", minimum=0)]
 Fraction = Annotated[float, _real("from 0 to 1", minimum=0, maximum=1)]
 Poisson = Annotated[float, _real("in (-1, 0.5]", exclusiveMinimum=-1, maximum=0.5)]
 Angle = Annotated[float, _real("from 1 to 120 degrees", minimum=1, maximum=120)]
+Share = Annotated[float, _real("from 50 to 100 percent", minimum=50, maximum=100)]
 StepLength = Annotated[
     float | Literal["auto"], Value({"anyOf": [_POSITIVE.schema, {"const": "auto"}]}, _step_length)
 ]

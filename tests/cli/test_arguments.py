@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import click
 import pytest
 
-from lyra_petsc.cli.arguments import split
+from lyra_petsc.cli.arguments import help_asked, split
+from lyra_petsc.cli.verbs import verbs
 
 
 @pytest.mark.parametrize(
@@ -27,3 +29,23 @@ from lyra_petsc.cli.arguments import split
 )
 def test_splits(line: str, ours: str, petsc: str) -> None:
     assert split(line.split()) == (ours.split(), petsc.split())
+
+
+@pytest.mark.parametrize("verb", [None, *verbs.commands])
+def test_help_of_every_verb_shows_an_example_that_can_be_parsed(verb: str | None) -> None:
+    ours, petsc = help_asked(*split([verb, "-help"] if verb else ["-help"]))
+    assert (ours, petsc) == ([verb, "--help"] if verb else ["--help"], [])
+    command = verbs.commands[verb] if verb else verbs
+    text = command.get_help(click.Context(command, info_name="lyra-petsc", max_content_width=300))
+    examples = text.partition("Example")[2].splitlines()[1:]
+    assert examples
+    for line in examples:
+        words = split(line.partition("lyra-petsc ")[2].split())[0]
+        assert words[0] == verb or (verb is None and words[0] in verbs.commands)
+        with verbs.commands[words[0]].make_context(words[0], words[1:]):
+            pass
+
+
+def test_help_beside_a_scene_to_run_is_petscs() -> None:
+    assert help_asked(*split(["run", "a.yaml", "-help"])) == (["run", "a.yaml"], ["-help"])
+    assert help_asked(*split(["render", "runs/a", "-help"])) == (["render", "--help"], [])

@@ -143,7 +143,8 @@ def test_goes_on_with_another_number_of_ranks(
 def test_resume_without_a_folder_takes_the_newest_run_of_the_scene(tmp_path: Path) -> None:
     scene = write_scene(tmp_path)
     done(["run", scene], tmp_path)
-    done(["run", scene, "-ts_max_steps", "2"], tmp_path)
+    again = done(["run", scene, "-ts_max_steps", "2"], tmp_path)
+    assert "note: runs/scene exists: the results go to runs/scene-2" in again.err
     done(["run", scene, "--resume"], tmp_path)
     assert len(history(tmp_path / "runs/scene-2")) == 6
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["scene", "scene-2"]

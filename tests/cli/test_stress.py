@@ -22,6 +22,8 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
     assert left.code == 0, left.err
     words = [line.split()[0].rstrip(":") for line in left.out.splitlines()]
     assert words == [name for f in FAMILIES.all() for name in (f.name, *(case.name for case in f.cases))]
+    count = sum(len(family.cases) for family in FAMILIES.all())
+    assert f"{count} of {count} cases" in left.err
     usual = lyra(["stress", "--list"], tmp_path).out.splitlines()
     quick = lyra(["stress", "--quick", "--list"], tmp_path).out.splitlines()
     assert len(quick) < len(usual) < len(words)

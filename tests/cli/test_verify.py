@@ -18,12 +18,14 @@ def test_list_names_every_case(tmp_path: Path) -> None:
     left = lyra(["verify", "--list"], tmp_path)
     assert left.code == 0, left.err
     assert [line.split()[0] for line in left.out.splitlines()] == list(CASES.modules)
+    assert f"{len(CASES.modules)} cases" in left.err
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_case_passes(tmp_path: Path, ranks: int) -> None:
     left = lyra(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, ranks)
     assert left.code == 0, left.err + left.out
+    assert f"2 of {len(CASES.modules)} cases\n" in left.out
     assert "2 of 2 cases passed" in left.out
     assert "order 1.00, as expected 1" in left.out
     assert "exact [m]" in left.out

@@ -107,23 +107,19 @@ def _without_line(row: Row) -> str:
 
 def _error(row: Row, quantity: str) -> str:
     if quantity in row.unresolved:
-        return f"error below {percent(row.at_most(quantity))}"
-    words = f"error {percent(row.errors[quantity])}"
-    largest = row.shown("position_max")
+        words = f"error below {percent(row.at_most(quantity))}"
+    else:
+        words = f"error {percent(row.errors[quantity])}"
+    largest = row.at_most("position_max")
     if quantity == "position_l2" and math.isfinite(largest):
         words += f", at most {percent(largest)} anywhere"
     return words
 
 
-def choose_recommended(rows: Sequence[Row], advice: Sequence[Advice], quantity: str) -> Row | None:
-    """The setting to name: the fastest for 1 %, else the most accurate that ran."""
+def choose_recommended(advice: Sequence[Advice]) -> Row | None:
+    """Mark the setting that the diagram's star names: the fastest for 1 %; none if no setting keeps that."""
     for one in advice:
         if one.row is not None and math.isclose(one.target, DEFAULT_TARGET):
             one.row.recommended = True
             return one.row
-    able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
-    if not able:
-        return None
-    best = min(able, key=lambda row: (row.at_most(quantity), row.run))
-    best.recommended = True
-    return best
+    return None

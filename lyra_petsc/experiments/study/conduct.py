@@ -72,7 +72,7 @@ def conduct(comm: MPI.Comm, work: Work, command: str) -> Outcome:
         mine = [row for row in rows if physics_of(row.combination) == physics]
         mark_front(mine, main)
         outcome.advice[physics] = advise(mine, main, main_axis(plan.axes))
-        choose_recommended(mine, outcome.advice[physics], main)
+        choose_recommended(outcome.advice[physics])
     orders = observed_orders(rows, plan.axes, [quantity.name for quantity in plan.quantities])
     facts: dict[str, Any] = {
         "scene": plan.request.scene,

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.exact.motion import Motion
-from lyra_petsc.experiments.study.quantities import Quantity
+from lyra_petsc.experiments.study.quantities import MEAN_SQUARE, Quantity
 from lyra_petsc.experiments.study.samples import Samples, Surface, read_surface, scatter
 from lyra_petsc.experiments.study.transfer import make_transfer
 from lyra_petsc.parallel import on_root
@@ -19,6 +19,9 @@ from lyra_petsc.parallel import on_root
 Array = NDArray[np.float64]
 Errors = dict[str, float]
 """By the name of the quantity; relative, see ``quantities``. NaN where nothing can be told."""
+
+History = dict[str, Array]
+"""Errors at each sample after the start, by the name of the quantity."""
 
 Rows = Callable[[int], Array]
 """Positions (n, 3) [m] of this rank's points at a sample."""
@@ -44,7 +47,7 @@ def against_motion(comm: MPI.Comm, run: Party, motion: Motion, quantities: Seque
     samples = run.samples
     start = samples.rows(comm, 0)
     areas = _areas(comm, on_root(comm, lambda: read_surface(samples.folder), share=False))
-    found: Errors = {}
+    found: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
         found |= _positions(
             comm,
@@ -62,17 +65,24 @@ def against_motion(comm: MPI.Comm, run: Party, motion: Motion, quantities: Seque
             path = samples.probes[quantity.probe]
             expected = [motion.positions(path[:1], t)[0] for t in samples.times]
             found[quantity.name] = _path(path, np.array(expected), samples.size)
-    return {quantity.name: found.get(quantity.name, math.nan) for quantity in quantities}
+    return overall(_of(quantities, found))
 
 
 def against_run(comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]) -> Errors:
-    """Errors of a run against another; collective.
+    """Errors of a run against another, over all samples; collective."""
+    return overall(history_against_run(comm, run, reference, quantities))
+
+
+def history_against_run(
+    comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]
+) -> History:
+    """Errors of a run against another at each sample; collective.
 
     On different meshes the finer solution is interpolated at the rest places of the coarser one's
     vertices.
     """
     mine, other = run.samples, reference.samples
-    found: Errors = {}
+    found: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
         found |= _between(comm, run, reference)
     found["energy"] = _energy(mine.energies, other.energies, other.exchanged)
@@ -80,10 +90,26 @@ def against_run(comm: MPI.Comm, run: Party, reference: Party, quantities: Sequen
         name = quantity.probe
         if name is not None and name in mine.probes and name in other.probes:
             found[quantity.name] = _path(mine.probes[name], other.probes[name], other.size)
-    return {quantity.name: found.get(quantity.name, math.nan) for quantity in quantities}
+    return _of(quantities, found)
 
 
-def _between(comm: MPI.Comm, run: Party, reference: Party) -> Errors:
+def overall(history: History) -> Errors:
+    """The error over all samples: the root mean square of the L2 norms, of all others the largest."""
+    return {name: _overall(name, values) for name, values in history.items()}
+
+
+def _overall(name: str, values: Array) -> float:
+    if len(values) == 0:
+        return math.nan
+    return math.sqrt(float(np.mean(values**2))) if name == MEAN_SQUARE else float(values.max())
+
+
+def _of(quantities: Sequence[Quantity], found: History) -> History:
+    """The quantities in their order; empty where nothing can be told."""
+    return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
+
+
+def _between(comm: MPI.Comm, run: Party, reference: Party) -> History:
     coarse, fine = run, reference
     if run.samples.n_vertices > reference.samples.n_vertices:
         coarse, fine = reference, run
@@ -106,26 +132,24 @@ def _areas(comm: MPI.Comm, surface: Surface | None) -> Array:
 
 def _positions(
     comm: MPI.Comm, samples: Samples, here: Rows, there: Rows, areas: Array, size: float
-) -> Errors:
-    """Largest and area-weighted L2 error over space and over the samples after the start."""
+) -> History:
+    """Largest and area-weighted L2 error over space, at each sample after the start."""
     whole = comm.allreduce(float(areas.sum()))
-    largest, squares = 0.0, []
-    for sample in range(1, len(samples.times)):
-        distance = np.linalg.norm(here(sample) - there(sample), axis=1)
-        largest = max(largest, comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX))
-        squares.append(comm.allreduce(float(areas @ distance**2)) / whole)
-    return {
-        "position_max": largest / size,
-        "position_l2": math.sqrt(math.fsum(squares) / len(squares)) / size if squares else math.nan,
-    }
+    count = len(samples.times) - 1
+    largest, squares = np.empty(count), np.empty(count)
+    for i in range(count):
+        distance = np.linalg.norm(here(i + 1) - there(i + 1), axis=1)
+        largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
+        squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
+    return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}
 
 
-def _energy(mine: Array, other: Array, exchanged: float) -> float:
-    """Largest error of the total energy over the largest energy exchanged."""
+def _energy(mine: Array, other: Array, exchanged: float) -> Array:
+    """Error of the total energy over the largest energy exchanged."""
     if not exchanged > 0.0:
-        return math.nan
-    return float(np.abs(mine.sum(axis=1) - other.sum(axis=1)).max()) / exchanged
+        return np.empty(0)
+    return np.asarray(np.abs(mine.sum(axis=1) - other.sum(axis=1)) / exchanged)
 
 
-def _path(mine: Array, other: Array, size: float) -> float:
-    return float(np.linalg.norm(mine - other, axis=1).max()) / size
+def _path(mine: Array, other: Array, size: float) -> Array:
+    return np.asarray(np.linalg.norm(mine - other, axis=1) / size)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lyra_petsc.experiments.study.advice import Advice, setting
+from lyra_petsc.experiments.study.advice import DEFAULT_TARGET, Advice, setting
 from lyra_petsc.experiments.study.analysis import Order, Row, extent, families
 from lyra_petsc.experiments.study.axes import Axis
 from lyra_petsc.experiments.study.combination import described
@@ -17,7 +17,7 @@ from lyra_petsc.experiments.study.refine import SAFETY, refines_time
 from lyra_petsc.experiments.study.tables import PHASES
 from lyra_petsc.experiments.study.work import Known
 from lyra_petsc.show.report.document import Drawing, Report
-from lyra_petsc.show.report.numbers import seconds, short
+from lyra_petsc.show.report.numbers import percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
 BELOW = "below what the reference can tell"
@@ -129,7 +129,12 @@ def _tables(report: Report, plan: Plan, rows: Sequence[Row]) -> None:
              result.steps, result.rejected, result.newton_iterations, result.linear_iterations]
         )  # fmt: skip
     front = [row.on_front for row in done]
-    report.table(head, body, caption="Bold: on the Pareto front. ★: recommended.", marked=front)
+    report.table(
+        head,
+        body,
+        caption=f"Bold: on the Pareto front. ★: recommended for {percent(DEFAULT_TARGET)}.",
+        marked=front,
+    )
     if any(row.unresolved for row in rows):
         report.paragraph(
             f"“< x” stands where an error is below {SAFETY:g} times the reference's own and not resolved."
@@ -245,7 +250,9 @@ def _work(
         front=[(row.run, row.shown(name)) for row in rows if row.on_front] if main else (),
         bounds=[(row.run, SAFETY * row.own[name]) for row in hidden],
         recommended=place,
-        recommendation=setting(star) if star is not None else "",
+        recommendation=f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
+        if star is not None
+        else "",
         floor=_floor(known, quantity),
         floor_label=BELOW,
     )

@@ -29,8 +29,11 @@ class Quantity:
     probe: str | None = None
 
 
+MEAN_SQUARE = "position_l2"
+"""Name of the quantity whose samples are combined by their mean square; of all others the largest counts."""
+
 POSITION = (
-    Quantity("position_l2", "L2 error in position / sheet size"),
+    Quantity(MEAN_SQUARE, "L2 error in position / sheet size"),
     Quantity("position_max", "largest error in position / sheet size"),
 )
 """Root mean square over area and sample times; and the largest at any vertex and sample time."""

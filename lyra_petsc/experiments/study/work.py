@@ -19,7 +19,13 @@ from lyra_petsc.experiments.study.analysis import Row, mark_unresolved
 from lyra_petsc.experiments.study.case import RESULT_FILE, Job, Result, fingerprint, read_result
 from lyra_petsc.experiments.study.combination import LEAN, Combination, scene_of
 from lyra_petsc.experiments.study.folder import CASES
-from lyra_petsc.experiments.study.measure import Errors, Party, against_motion, against_run
+from lyra_petsc.experiments.study.measure import (
+    Errors,
+    Party,
+    against_motion,
+    against_run,
+    history_against_run,
+)
 from lyra_petsc.experiments.study.plan import Plan
 from lyra_petsc.experiments.study.reference import Chosen, Physics, physical_overrides, physics_of
 from lyra_petsc.experiments.study.refine import (
@@ -286,7 +292,7 @@ class Work:
                     return {}
             parties = [self._of_level(physics, level) for level in chain.levels]
             differences = [
-                against_run(self.comm, coarse, fine, self.plan.quantities)
+                history_against_run(self.comm, coarse, fine, self.plan.quantities)
                 for fine, coarse in itertools.pairwise(parties)
             ]
             estimates.append(of_chain(differences, chain))

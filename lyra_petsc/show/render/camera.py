@@ -1,9 +1,9 @@
-"""The camera: its direction, and a position from which the whole motion is in the picture."""
+"""The camera: its direction, and a position from which most of the motion is in the picture."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,14 @@ MARGIN = 0.86
 BAR = 0.12
 """Fraction of its height that is left free for the bar of colours."""
 
-ELEVATIONS = (15.0, 35.0)
+FRAMED = 95.0
+"""Percentage of the states that are wholly in the picture, unless the scene says otherwise."""
+
+ELEVATIONS = (15.0, 25.0, 35.0, 50.0)
 AZIMUTHS = 24
+LEAST_SEEN = 0.05
+"""Added to the share of a state's area that is seen: none is worth everything."""
+FIRST_WEIGHT = 3.0
 ASIDE = 25.0
 """Degrees by which the camera turns away from the largest view of the sheet, as folds show from the side."""
 
@@ -67,24 +73,35 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: N
     given = _camera(scene).line_of_sight
     if given is not None:
         return _unit(np.array(given))
-    candidates = np.array(
-        [
-            direction(up, 2.0 * math.pi * i / AZIMUTHS, math.radians(elevation))
-            for i in range(AZIMUTHS)
-            for elevation in ELEVATIONS
-        ]
-    )
-    seen, facing = np.zeros(len(candidates)), np.zeros(len(candidates))
-    for x in shapes:
-        corners = x[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        areas = normals @ candidates.T
-        seen += np.abs(areas).sum(axis=0)
-        facing += areas.sum(axis=0)
-    # where areas are nearly the same: a direction that sees the sheet's front, then one from the front
-    best = int(np.argmax(seen * (1.0 + 0.1 * np.sign(facing) + 0.05 * candidates @ horizon(up)[1])))
-    azimuth = 2.0 * math.pi * (best // len(ELEVATIONS)) / AZIMUTHS + math.radians(ASIDE)
-    return direction(up, azimuth, math.radians(ELEVATIONS[best % len(ELEVATIONS)]))
+    azimuths = 2.0 * math.pi * np.arange(AZIMUTHS) / AZIMUTHS
+    corners = [x[triangles] for x in shapes]
+    normals = [np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in corners]
+    best = azimuths[int(np.argmax(_seen(up, azimuths, normals).max(axis=1)))]
+    aside = best + math.radians(ASIDE) * np.array([1.0, -1.0])
+    seen = _seen(up, aside, normals) * [[1.05], [1.0]]
+    turned, raised = np.unravel_index(int(np.argmax(seen)), seen.shape)
+    return direction(up, float(aside[turned]), math.radians(ELEVATIONS[int(raised)]))
+
+
+def _seen(up: Array, azimuths: Array, normals: Sequence[Array]) -> Array:
+    """(azimuths, elevations) how well states with triangles of such normals (F, 3) are seen.
+
+    A mean of the shares of their areas that they show, in which one state seen from its edge weighs more
+    than many that are seen a little better; the first one, with which films begin, counts as three. Where
+    that is nearly the same: a direction that sees the sheet's front, then one from the front.
+    """
+    elevations = [math.radians(elevation) for elevation in ELEVATIONS]
+    sights = np.array([direction(up, float(a), e) for a in azimuths for e in elevations])
+    squares, facing = np.zeros(len(sights)), np.zeros(len(sights))
+    for number, areas in enumerate(normals):
+        towards = areas @ sights.T
+        whole = max(float(np.linalg.norm(areas, axis=1).sum()), 1e-300)
+        weight = 1.0 if number else FIRST_WEIGHT
+        squares += weight / (LEAST_SEEN + np.abs(towards).sum(axis=0) / whole) ** 2
+        facing += towards.sum(axis=0)
+    mean = 1.0 / np.sqrt(np.maximum(squares, 1e-300))
+    preferred: Array = mean * (1.0 + 0.1 * np.sign(facing) + 0.05 * sights @ horizon(up)[1])
+    return preferred.reshape(len(azimuths), len(elevations))
 
 
 def direction(up: Array, azimuth: float, elevation: float) -> Array:
@@ -102,7 +119,7 @@ def horizon(up: Array) -> tuple[Array, Array]:
 
 
 class Fit:
-    """Finds the nearest camera position from which all points are in the picture.
+    """Finds the nearest camera position from which given points are in the picture.
 
     Four planes through the camera bound the picture, so that of the points only the largest products with the
     normals of these planes are needed.
@@ -135,6 +152,11 @@ class Fit:
             for sign in (1.0, -1.0)
         ]
         self.normals = np.array([*sides, sight, -sight])
+
+    def most(self, reaches: Array) -> Array:
+        """(6,) how far most states reach; ``reaches`` (n, 6) is each one's `view` argument [m]."""
+        framed = FRAMED if self._camera.frame is None else self._camera.frame
+        return np.asarray(np.percentile(reaches, framed, axis=0, method="higher"))
 
     def view(self, reach: Array) -> PerspectiveCamera:
         """The camera.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,51 @@ from lyra_petsc.output.read_run import Run
 
 Array = NDArray[np.float64]
 
-COVERED = 99.5
-"""Percentage of a state's values within its range of colours, so that a few extreme values do not set it."""
+COVERED = 98.0
+"""Percentage of a state's values below the upper end of its colours, and above the lower."""
+MOST_STATES = 80.0
+"""Percentage of the states whose colours reach no further: the start of a motion does not set them."""
+
+PERCENTILES = np.linspace(0.0, 100.0, 401)
+"""Of a state's values, from which ranges are made."""
+
+
+@dataclass(frozen=True)
+class ColourRange:
+    """The range of the colours that was asked for.
+
+    Attributes
+    ----------
+    low, high : float
+        Values, or percentages of all values of the run.
+    percent : bool
+    """
+
+    low: float
+    high: float
+    percent: bool = False
+
+    @classmethod
+    def parse(cls, text: str, key: str = "--range") -> ColourRange:
+        """``0,5`` or ``2%,98%``.
+
+        Raises
+        ------
+        InputError
+        """
+        words = [word.strip() for word in text.split(",")]
+        percent = bool(words) and all(word.endswith("%") for word in words)
+        try:
+            ends = [float(word.removesuffix("%") if percent else word) for word in words]
+        except ValueError:
+            ends = []
+        if len(ends) != 2 or not -np.inf < ends[0] < ends[1] < np.inf:
+            raise InputError(
+                f"must be two numbers, the lower first, as in 0,5 or 2%,98%, not {text!r}", key=key
+            )
+        if percent and not 0.0 <= ends[0] < ends[1] <= 100.0:
+            raise InputError(f"must be from 0% to 100%, not {text!r}", key=key)
+        return cls(ends[0], ends[1], percent)
 
 
 @dataclass(frozen=True)
@@ -31,21 +74,79 @@ class ColourQuantity:
         Whether there is a value for each triangle; else for each vertex.
     signed : bool
         Whether zero belongs in the middle of the colours.
+    averages : bool
+        Whether means of it have a meaning; ranks have none.
     """
 
     label: str
     values: Callable[[int], Array]
     on_triangles: bool = False
     signed: bool = False
+    averages: bool = True
 
-    def span(self, state: int) -> tuple[float, float]:
-        """Lowest and highest value that the colours should show in one state."""
+    def percentiles(self, state: int) -> Array:
+        """(401,) the ``PERCENTILES`` of a state's values; NaN if none is finite."""
         values = self.values(state)
+        finite = values[np.isfinite(values)]
+        found = np.percentile(finite, PERCENTILES) if len(finite) else np.full(len(PERCENTILES), np.nan)
+        return np.asarray(found)
+
+    def limits(self, found: Array, asked: ColourRange | None = None) -> tuple[float, float]:
+        """Values at both ends of the colours.
+
+        Parameters
+        ----------
+        found : (n, 401)
+            The percentiles of some states.
+        asked : ColourRange, optional
+            Without it 98 % of the values on each side, in 80 % of the states.
+        """
+        if asked is not None and not asked.percent:
+            return asked.low, asked.high
+        found = found[np.isfinite(found).all(axis=1)]
+        if len(found) == 0:
+            return colour_limits(np.inf, -np.inf)
+        if asked is not None:
+            low, high = np.percentile(found, [asked.low, asked.high])
+        else:
+            lowest, highest = (np.searchsorted(PERCENTILES, end) for end in (100.0 - COVERED, COVERED))
+            low = np.percentile(found[:, lowest], 100.0 - MOST_STATES, method="lower")
+            high = np.percentile(found[:, highest], MOST_STATES, method="higher")
         if self.signed:
-            largest = float(np.percentile(np.abs(values), COVERED))
-            return -largest, largest
-        low, high = np.percentile(values, [100.0 - COVERED, COVERED])
-        return float(low), float(high)
+            high = max(abs(low), abs(high))
+            low = -high
+        elif abs(low) < 1e-4 * (high - low):
+            low = 0.0
+        return colour_limits(float(low), float(high))
+
+    def on_vertices(self, run: Run) -> ColourQuantity:
+        """The same with values on vertices: the means of their triangles', weighted by rest area.
+
+        Constant strain triangles alternate from one to the next around the field that they stand for; the
+        means follow it. Ranks are no such field.
+        """
+        if not self.on_triangles or not self.averages:
+            return self
+        triangles, rest = run.triangles, run.rest
+        corners = rest[triangles]
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        ends, weights = triangles.ravel(), np.repeat(areas, 3)
+        whole = np.bincount(ends, weights, len(rest))
+        of_triangles = self.values
+
+        def values(state: int) -> Array:
+            summed = np.bincount(ends, weights * np.repeat(of_triangles(state), 3), len(rest))
+            return np.divide(summed, whole, out=np.zeros_like(summed), where=whole > 0.0)
+
+        return replace(self, values=values, on_triangles=False)
+
+
+def colour_limits(low: float, high: float) -> tuple[float, float]:
+    """Range of the colours, which must not be empty."""
+    if low < high:
+        return low, high
+    middle = low if np.isfinite(low) else 0.0
+    return middle, middle + max(1e-12, 1e-6 * abs(middle))
 
 
 def quantity(run: Run, name: str) -> ColourQuantity:
@@ -70,11 +171,13 @@ def quantity(run: Run, name: str) -> ColourQuantity:
     reduce = _largest_principal if principal else _magnitude
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
     on_triangles = run.field_on(name) == "triangle"
-    return ColourQuantity(label, lambda i: reduce(np.asarray(stored[i])), on_triangles, name in _SIGNED)
+    values: Callable[[int], Array] = lambda i: reduce(np.asarray(stored[i]))  # noqa: E731
+    return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NAMES)
 
 
 _PRINCIPAL = {"green_strain", "stress"}
 _SIGNED = {"curvature"}
+_NAMES = {"rank"}
 
 
 def _speed(run: Run, name: str) -> ColourQuantity:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.show.render.camera import Fit, upwards
-from lyra_petsc.show.render.colour_quantities import ColourQuantity, quantity
+from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
 from lyra_petsc.show.render.render_plan import RenderPlan, run_line_of_sight
 from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, wind_arrows
@@ -70,18 +70,18 @@ def _write(files: PictureFiles | None, states: list[int], images: list[list[Imag
 
 
 def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
-    """The drawing with a camera and colours that fit the whole motion; collective."""
-    shown = on_each(comm, lambda: quantity(plan.run, plan.options.field) if plan.options.field else None)
+    """The drawing with a camera and colours that fit most of the motion; collective."""
+    shown = on_each(comm, lambda: _shown(plan))
     sight = on_each(comm, lambda: run_line_of_sight(plan.run, plan.scene))
     axes = Bounds.axes_of(upwards(plan.scene))
     fit = Fit(plan.scene, sight, axes[2], plan.size[0] / plan.size[1], bar=shown is not None)
     normals = np.concatenate([fit.normals, axes, -axes])
     mine = plan.motion[comm.rank :: comm.size]
-    found = on_each(comm, lambda: extent(plan.run, mine, normals, None if plan.limits else shown))
-    comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
-    n = len(fit.normals)
-    reach, bounds = found[:n], Bounds(axes, -found[n + 3 : n + 6], found[n : n + 3])
-    limits = plan.limits or colour_limits(-found[-2], found[-1])
+    reaches, values = on_each(comm, lambda: extent(plan.run, mine, normals, shown))
+    reaches, values = (np.concatenate(comm.allgather(part)) for part in (reaches, values))
+    n, whole = len(fit.normals), reaches.max(axis=0)
+    reach, bounds = fit.most(reaches[:, :n]), Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
+    limits = (0.0, 1.0) if shown is None else shown.limits(values, plan.limits)
     wind = None
     if plan.options.wind and plan.scene.wind is not None:
         wind = np.array(plan.scene.wind.velocity)
@@ -91,8 +91,15 @@ def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
     return on_each(comm, lambda: SceneDrawing(plan, fit.view(reach), bounds, shown, limits, wind))
 
 
-def extent(run: Run, states: list[int], normals: Array, shown: ColourQuantity | None) -> Array:
-    """How far states reach and which values they have, as numbers of which the maximum counts.
+def _shown(plan: RenderPlan) -> ColourQuantity | None:
+    if plan.options.field is None:
+        return None
+    found = quantity(plan.run, plan.options.field)
+    return found if plan.options.cells else found.on_vertices(plan.run)
+
+
+def extent(run: Run, states: list[int], normals: Array, shown: ColourQuantity | None) -> tuple[Array, Array]:
+    """How far states reach and which values they have.
 
     Parameters
     ----------
@@ -103,29 +110,24 @@ def extent(run: Run, states: list[int], normals: Array, shown: ColourQuantity | 
 
     Returns
     -------
-    (n + 2,) float64
-        Largest product of a vertex with each normal [m], minus the lowest value of the quantity, its highest
-        value; minus infinity without states or quantity.
+    reaches : (len(states), n) float64
+        Largest product of a vertex with each normal [m].
+    values : (len(states), 401) float64
+        Percentiles of the quantity; NaN without one.
 
     Raises
     ------
     InputError
         If a state is damaged.
     """
-    found = np.full(len(normals) + 2, -np.inf)
-    for state in states:
+    reaches = np.empty((len(states), len(normals)))
+    values = np.full((len(states), len(PERCENTILES)), np.nan)
+    for row, state in enumerate(states):
         x = run.positions[state]
-        low, high = (np.inf, -np.inf) if shown is None else shown.span(state)
-        found = np.maximum(found, [*(x @ normals.T).max(axis=0), -low, high])
-    return found
-
-
-def colour_limits(low: float, high: float) -> tuple[float, float]:
-    """Range of the colours, which must not be empty."""
-    if low < high:
-        return low, high
-    middle = low if np.isfinite(low) else 0.0
-    return middle, middle + max(1e-12, 1e-6 * abs(middle))
+        reaches[row] = (x @ normals.T).max(axis=0)
+        if shown is not None:
+            values[row] = shown.percentiles(state)
+    return reaches, values
 
 
 class PictureFiles:

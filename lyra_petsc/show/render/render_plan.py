@@ -16,7 +16,7 @@ from lyra_petsc.output.read_run import Run
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.render.camera import line_of_sight, upwards
-from lyra_petsc.show.render.colour_quantities import quantity
+from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.image_files import TILES, check_film, colors_of, read_texture
 from lyra_petsc.show.render.opengl import check_opengl
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
@@ -59,6 +59,7 @@ class RenderOptions:
     speed: float | None = None
     field: str | None = None
     range: str | None = None
+    cells: bool = False
     texture: Path | None = None
     colors: str = COLORS
     handles: bool = False
@@ -104,7 +105,7 @@ class RenderPlan:
     sheet : (Path, tuple of int) or None
         File of the contact sheet and the states it shows.
     texture : (h, w, 3) uint8 or None
-    limits : (float, float) or None
+    limits : ColourRange or None
         Range of the colours that ``--range`` gives.
     """
 
@@ -117,7 +118,7 @@ class RenderPlan:
     film: tuple[Path, FilmTiming] | None
     sheet: tuple[Path, tuple[int, ...]] | None
     texture: NDArray[np.uint8] | None
-    limits: tuple[float, float] | None
+    limits: ColourRange | None
 
     @property
     def states(self) -> list[int]:
@@ -141,7 +142,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
         For whatever cannot be drawn; only the folder of ``--out`` may have been created.
     """
     run = Run(options.run)
-    scene = _scene(run, options.settings)
+    scene = scene_shown(run, options.settings)
     static = scene.time.analysis == "static"
     size = _size(options.size)
     limits = _range(options)
@@ -180,7 +181,14 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     return RenderPlan(options, run, scene, size, colors, pictures, film, sheet, texture, limits)
 
 
-def _scene(run: Run, settings: Sequence[str]) -> Scene:
+def scene_shown(run: Run, settings: Sequence[str]) -> Scene:
+    """The scene of a run, with its camera changed by ``--set``.
+
+    Raises
+    ------
+    InputError
+        For settings of anything else, or that cannot be.
+    """
     for text in settings:
         if not re.match(r"\s*render\b", text):
             raise InputError(f"{text!r}: the run is done, only render.… can be changed", key="--set")
@@ -219,17 +227,12 @@ def _times(text: str | None) -> list[float]:
     return times
 
 
-def _range(options: RenderOptions) -> tuple[float, float] | None:
+def _range(options: RenderOptions) -> ColourRange | None:
     if options.range is None:
         return None
     if options.field is None:
         raise InputError("is the range of what --field shows; name a field, too", key="--range")
-    ends = _numbers(options.range, "--range", "0,5")
-    if len(ends) != 2 or not ends[0] < ends[1]:
-        raise InputError(
-            f"must be two numbers, the lower first, as in 0,5, not {options.range!r}", key="--range"
-        )
-    return ends[0], ends[1]
+    return ColourRange.parse(options.range)
 
 
 def _check_speeds(options: RenderOptions) -> None:

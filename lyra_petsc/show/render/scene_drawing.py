@@ -163,7 +163,7 @@ class SceneDrawing:
         points = np.zeros((len(self._source), 3))
         self._sheet = sheet = self._pyvista.PolyData.from_regular_faces(points, corners)
         light: dict[str, Any] = {"interpolation": "phong", "specular_power": 14.0}
-        light |= {"ambient": 0.2, "diffuse": 0.8, "specular": 0.08}
+        light |= {"ambient": 0.24, "diffuse": 0.8, "specular": 0.08}
         look: dict[str, Any]
         if quantity is not None:
             # brighter, so that colours can be told apart in the shade
@@ -207,7 +207,7 @@ class SceneDrawing:
         level = sight - (sight @ up) * up
         front = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-6 else self._bounds.axes[1]
         right = np.cross(up, front)
-        lights = [(-40.0, 55.0, 0.76), (55.0, 20.0, 0.3), (-10.0, 10.0, 0.2), (10.0, -50.0, 0.22)]
+        lights = [(-35.0, 55.0, 0.68), (50.0, 15.0, 0.28), (0.0, 5.0, 0.36), (10.0, -55.0, 0.3)]
         directions: list[Array] = []
         for azimuth, elevation, intensity in lights:
             a, e = math.radians(azimuth), math.radians(elevation)

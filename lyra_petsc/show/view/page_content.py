@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.output.read_run import Run
-from lyra_petsc.show.render.colour_quantities import DERIVED, quantity
+from lyra_petsc.show.render.colour_quantities import DERIVED, ColourQuantity, ColourRange, quantity
 
 Colours = NDArray[np.uint8]
 Columns = Mapping[str, NDArray[Any]]
@@ -29,6 +29,9 @@ SPEED_FACTORS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 
 RANGE_STATES = 12
 """States from which the range of the colours is taken at first."""
+
+MAPS = ("viridis", "cividis", "plasma", "turbo", "coolwarm", "gray")
+"""Colour maps of matplotlib to choose from."""
 
 MOST_POINTS = 600
 """Points of a plotted line; of a longer history evenly spaced rows are drawn."""
@@ -156,32 +159,51 @@ class Palette:
     run : Run
     name : str
         One of `names`.
+    asked : ColourRange, optional
+        The range of the colours.
+    colour_map : str
+        One of ``MAPS``; empty: what suits the quantity.
+    cells : bool
+        Each triangle has the colour of its own value; else vertices have means.
 
     Raises
     ------
     InputError
-        If the states cannot be read.
+        If a state cannot be read.
     """
 
-    def __init__(self, run: Run, name: str) -> None:
+    def __init__(
+        self,
+        run: Run,
+        name: str,
+        asked: ColourRange | None = None,
+        colour_map: str = "",
+        *,
+        cells: bool = False,
+    ) -> None:
         from matplotlib import colormaps
 
-        self._run, self._name = run, name
-        self._quantity = quantity(run, name)
-        table = colormaps["coolwarm" if self._quantity.signed else "viridis"]
+        self._run, self._name, self._asked, self._cells = run, name, asked, cells
+        self._quantity = self._found()
+        table = colormaps[colour_map or ("coolwarm" if self._quantity.signed else MAPS[0])]
         self._table: Colours = table(np.linspace(0, 1, 256), bytes=True)[:, :3]
-        self._low, self._high = np.inf, -np.inf
-        for state in sample(len(run), RANGE_STATES):
-            self._widen(state)
+        self._percentiles = [self._quantity.percentiles(i) for i in sample(len(run), RANGE_STATES)]
+        self._low, self._high = self._limits()
+
+    def _found(self) -> ColourQuantity:
+        found = quantity(self._run, self._name)
+        return found if self._cells else found.on_vertices(self._run)
+
+    def _limits(self) -> tuple[float, float]:
+        return self._quantity.limits(np.array(self._percentiles), self._asked)
 
     def renew(self) -> None:
-        """Take in the states that the run has written meanwhile; the newest extends the range."""
-        self._quantity = quantity(self._run, self._name)
-        self._widen(len(self._run) - 1)
-
-    def _widen(self, state: int) -> None:
-        low, high = self._quantity.span(state)
-        self._low, self._high = min(self._low, low), max(self._high, high)
+        """Take in the states that the run has written meanwhile; the newest takes part in the range."""
+        self._quantity = self._found()
+        self._percentiles.append(self._quantity.percentiles(len(self._run) - 1))
+        if len(self._percentiles) > 4 * RANGE_STATES:  # every second one but the newest
+            self._percentiles = [*self._percentiles[:-1:2], self._percentiles[-1]]
+        self._low, self._high = self._limits()
 
     def colours(self, state: int) -> tuple[Colours, bool]:
         """(V, 3) or (F, 3) red, green, blue, 0-255; whether they belong to triangles."""

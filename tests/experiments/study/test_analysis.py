@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from lyra_petsc.experiments.study.advice import advise, choose_recommended
@@ -81,9 +82,19 @@ def test_advice_names_the_fastest_and_the_others() -> None:
     assert advice[2].row is None
     assert "nothing that ran is accurate enough" in advice[2].words
     assert "bdf2, Δt 10 ms, error 0.25 %, in 2 s" in advice[2].words
-    star = choose_recommended(rows, advice, "position_max")
+    star = choose_recommended(advice)
     assert star is advice[1].row
     assert star.recommended
+
+
+def test_no_setting_is_starred_where_none_keeps_1_percent() -> None:
+    rows = made_up()
+    for row in rows:
+        row.errors["position_max"] *= 10.0
+    advice = advise(rows, "position_max")
+    assert "nothing that ran is accurate enough" in advice[1].words
+    assert choose_recommended(advice) is None
+    assert not any(row.recommended for row in rows)
 
 
 def test_advice_goes_as_far_as_the_errors_and_no_further() -> None:
@@ -132,6 +143,14 @@ def test_the_largest_error_is_told_beside_the_mean() -> None:
         row.errors["position_l2"] = row.errors["position_max"] / 4.0
     words = advise(rows, "position_l2")[1].words
     assert "For 1 % choose beuler, Δt 40 ms: 250 ms (error 1 %, at most 4 % anywhere)" in words
+    for row in rows:
+        row.own = {"position_l2": 0.0, "position_max": 0.002}
+    words = advise(rows, "position_l2")[1].words
+    assert "at most 4.2 % anywhere" in words, "the reference's own largest error is left out"
+    for row in rows:
+        row.own["position_max"] = 0.03
+        mark_unresolved(row)
+    assert "at most 9 % anywhere" in advise(rows, "position_l2")[1].words
 
 
 def test_failed_rows_are_left_out() -> None:
@@ -155,7 +174,7 @@ def test_richardson_finds_the_error_of_a_converging_sequence(order: int) -> None
 
 def test_richardson_trusts_no_higher_order_than_expected_and_no_divergence() -> None:
     fast = richardson(1.0, 16.0, 2.0, 2)
-    assert fast.error == pytest.approx(1.0 / 3.0)
+    assert fast.error == pytest.approx(16.0 / 4.0 / 3.0)  # what the coarser pair says
     slow = richardson(1.0, 2.0, 2.0, 2)
     assert slow.error == pytest.approx(1.0)
     away = richardson(2.0, 1.0, 2.0, 2)
@@ -168,5 +187,16 @@ def test_errors_in_time_and_space_add_up() -> None:
     both = joined([{"a": Estimate(1.0, 2.0, True)}, {"a": Estimate(0.5, 2.0, False)}])
     assert both["a"].error == 1.5
     assert not both["a"].trusted
-    two = of_chain([{"a": 0.2}], Chain((), 0))
+    two = of_chain([{"a": np.array([0.1, 0.2])}], Chain((), 0))
     assert two["a"].error == 0.2
+
+
+def test_a_largest_error_that_wanders_is_not_understated() -> None:
+    """Two places take turns: between the coarser pair one leads, between the finer the other."""
+    first, second = np.array([0.75, 0.45]), np.array([6.0, 1.2])  # at two samples
+    chain = Chain((), 2)
+    found = of_chain([{"position_max": first}, {"position_max": second}], chain)["position_max"].error
+    slowest = first[1] / (second[1] / first[1] - 1.0)  # the second sample converges slowly
+    assert found >= 1.25 * slowest
+    whole = of_chain([{"position_l2": first}, {"position_l2": second}], chain)["position_l2"].error
+    assert whole < found

@@ -102,3 +102,25 @@ def test_a_lying_sheet_is_seen_from_the_front_and_above():
     sight = line_of_sight(with_camera(None), UP, [corners], np.array([[0, 1, 2], [0, 2, 3]]))
     assert sight[1] < -0.5
     assert sight[2] > 0.5
+
+
+def test_a_sheet_that_lies_at_first_and_hangs_later_is_not_seen_from_its_edge():
+    lying = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    hanging = np.array([[0.0, 1, -1], [1, 1, -1], [1, 1, 0], [0, 1, 0]])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    sight = line_of_sight(with_camera(None), UP, [lying] + 8 * [hanging], triangles)
+    assert sight @ UP > 0.4
+    assert abs(sight[1]) > 0.7
+
+
+@pytest.mark.parametrize(("frame", "reach"), [(None, 1.0), (100.0, 50.0), (50.0, 1.0)])
+def test_a_short_excursion_does_not_set_the_frame(frame, reach):
+    chosen = with_camera({"direction": [0, -1, 0]} | ({"frame": frame} if frame else {}))
+    fit = Fit(chosen, np.array([0.0, -1.0, 0.0]), UP, 1.0)
+    reaches = np.ones((50, 6))
+    reaches[0] = 50.0
+    np.testing.assert_array_equal(fit.most(reaches), np.full(6, reach))
+    few = np.ones((6, 6))
+    few[0] = 2.0
+    if frame is None:  # of few states all are in the picture
+        np.testing.assert_array_equal(fit.most(few), np.full(6, 2.0))

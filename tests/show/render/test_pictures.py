@@ -121,11 +121,19 @@ def test_vertices_on_a_seam_are_drawn_twice():
 
 def test_colours_tell_values_apart_and_come_with_a_bar(ring, tmp_path):
     """Stress grows with the number of the triangle: the first is darkest (viridis), the last brightest."""
-    image = picture(ring, tmp_path, field="stress", range="0,7")
+    image = picture(ring, tmp_path, field="stress", range="0,7", cells=True)
     first, last = image[pixel(1.2, 0.5)], image[pixel(2.2, 2.5)]
     assert last[1] > first[1] + 80.0
     plain = picture(ring, tmp_path)
     assert np.abs(image - plain)[100:, 100:].max() > 60.0, "no bar"
+    means = picture(ring, tmp_path, field="stress", range="0,7")
+
+    def jumps(shown: np.ndarray) -> float:
+        """Largest change of green from pixel to pixel along a line across the triangles of the upper side."""
+        row, first = pixel(0.3, 2.6)
+        return np.abs(np.diff(shown[row, first : pixel(2.7, 2.6)[1], 1])).max()
+
+    assert jumps(means) < 0.6 * jumps(image)
 
 
 def test_handles_and_label_are_drawn_on_request(tmp_path):

@@ -10,8 +10,14 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.show.render.colour_quantities import quantity
-from lyra_petsc.show.render.draw import colour_limits, extent
+from lyra_petsc.show.render.colour_quantities import (
+    PERCENTILES,
+    ColourQuantity,
+    ColourRange,
+    colour_limits,
+    quantity,
+)
+from lyra_petsc.show.render.draw import extent
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 
@@ -61,16 +67,59 @@ def test_what_is_not_there_is_said(run, tmp_path):
         quantity(bare, "speed")
 
 
-def test_the_extent_is_the_same_in_parts(run):
+def test_the_extent_is_that_of_each_state(run):
     normals = np.random.default_rng(0).normal(size=(5, 3))
     shown = quantity(run, "speed")
-    whole = extent(run, [0, 1, 2], normals, shown)
-    parts = [extent(run, states, normals, shown) for states in ([1], [], [0, 2])]
-    np.testing.assert_array_equal(whole, np.max(parts, axis=0))
-    reach = np.max([position(i) @ normals.T for i in range(3)], axis=(0, 1))
-    np.testing.assert_array_equal(whole[:5], reach)
-    spans = [shown.span(i) for i in range(3)]
-    assert (-whole[5], whole[6]) == (min(low for low, _ in spans), max(high for _, high in spans))
+    reaches, values = extent(run, [0, 2], normals, shown)
+    for row, state in enumerate((0, 2)):
+        np.testing.assert_array_equal(reaches[row], (position(state) @ normals.T).max(axis=0))
+        speeds = np.linalg.norm(velocity(state), axis=1)
+        np.testing.assert_allclose(values[row][[0, -1]], [speeds.min(), speeds.max()])
+    empty = extent(run, [], normals, None)
+    assert [part.shape for part in empty] == [(0, 5), (0, len(PERCENTILES))]
+
+
+def ranges(values: list[np.ndarray], asked: str | None = None, signed: bool = False) -> tuple[float, float]:
+    made = ColourQuantity("made up", lambda i: values[i], signed=signed)
+    found = np.array([made.percentiles(i) for i in range(len(values))])
+    return made.limits(found, ColourRange.parse(asked) if asked else None)
+
+
+def test_a_violent_start_does_not_set_the_colours():
+    """A tenth of the states are a hundred times faster; the range is that of the others."""
+    calm = np.linspace(0.0, 1.0, 1001)
+    low, high = ranges([100.0 * calm] * 2 + [calm] * 18)
+    assert (low, high) == pytest.approx((0.02, 0.98))
+    assert ranges([100.0 * calm] * 2 + [calm] * 18, "0%,100%") == pytest.approx((0.0, 100.0))
+    assert ranges([calm] * 3, "10%,60%") == pytest.approx((0.1, 0.6), abs=2e-3)
+    assert ranges([calm - 0.2] * 3, signed=True) == pytest.approx((-0.78, 0.78))
+    assert ranges([calm] * 3, "-3,7") == (-3.0, 7.0)
+    assert ranges([np.full(4, np.nan)]) == (0.0, 1e-12)
+    assert ranges([np.r_[calm, np.nan, np.inf]]) == pytest.approx((0.02, 0.98))
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1", "2,1", "1%,2", "-1%,50%", "0%,101%", "nan,1", "0,inf", "a,b", "1,2,3"]
+)
+def test_a_range_that_is_none_is_refused(text):
+    with pytest.raises(InputError, match="--range: must be"):
+        ColourRange.parse(text)
+
+
+def test_checkers_disappear_in_the_means_of_vertices(run):
+    raw = quantity(run, "stress")
+    smooth = raw.on_vertices(run)
+    assert not smooth.on_triangles
+    rest, triangles = run.rest, run.triangles
+    edges = rest[triangles[:, 1:]] - rest[triangles[:, :1]]
+    areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    for vertex in range(len(rest)):
+        around = (triangles == vertex).any(axis=1)
+        expected = areas[around] @ raw.values(1)[around] / areas[around].sum()
+        assert smooth.values(1)[vertex] == pytest.approx(expected)
+    assert quantity(run, "speed").on_vertices(run).label == "speed [m/s]"
+    ranks = ColourQuantity("rank", lambda i: np.zeros(len(triangles)), on_triangles=True, averages=False)
+    assert ranks.on_vertices(run) is ranks
 
 
 def test_the_range_of_the_colours_is_not_empty():
