@@ -29,6 +29,7 @@ from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, on_each, ra
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.ordering import row_type
+from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
@@ -170,7 +171,7 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
     problem: LyraError | None = None
     slab: NDArray[Any] = np.empty(0)
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_own(path) as file:
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
                 problem = InputError(
@@ -180,6 +181,8 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
                 )
             else:
                 slab = stored[order.start : order.start + order.n_slab]
+    except LyraError as error:
+        problem = error
     except HDF5_ERRORS as error:
         problem = InputError(f"{dataset} cannot be read: {reason(error)}", file=path)
     raise_together(order.comm, problem)

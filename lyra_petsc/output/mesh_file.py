@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 
@@ -134,7 +134,7 @@ def _parts(group: Group) -> dict[str, NDArray[np.int64]]:
 def _difference(file: Path, mesh: Mesh, used: set[str]) -> str:
     """What sets a mesh apart from the one in the file, in words; empty if nothing does."""
     ours = _arrays(mesh)
-    with import_h5py().File(file, "r") as stored:
+    with open_own(file) as stored:
         counts = len(stored["mesh/rest"]), len(stored["mesh/triangles"])
         if counts != (mesh.n_vertices, mesh.n_triangles):
             ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.self_contained import check_file, check_folder, check_name, open_own
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
 
@@ -112,7 +112,7 @@ class Run:
         """Texture coordinates, by the names they have in the file."""
         path = self.folder / MESH_FILE
         try:
-            with import_h5py().File(path, "r") as file:
+            with open_own(path) as file:
                 mesh = file["mesh"]
                 given = bool(mesh.attrs.get("vt", 0))
                 return {name: mesh[name][()] for name in ("uv", "corner_uv") if given and name in mesh}
@@ -288,6 +288,7 @@ def announced_states(folder: Path) -> list[StoredState]:
         If the folder is none of a run, nothing is written yet, or the announcement is damaged.
     """
     path = folder / XDMF_FILE
+    check_folder(folder)
     try:
         root = parse(path).getroot()
         states = [_state(grid) for grid in root.iterfind("./Domain/Grid/Grid")]
@@ -299,6 +300,9 @@ def announced_states(folder: Path) -> list[StoredState]:
         raise InputError("is damaged, or was not written by a run", file=path) from None
     if not states:
         raise InputError("no state is written yet", file=folder)
+    for state in states:
+        for name, _ in (state.position, *state.fields.values()):
+            check_name(name, path)
     return states
 
 
@@ -391,7 +395,7 @@ def read_array(folder: Path, place: Place) -> NDArray[Any]:
     """
     file, dataset = place
     try:
-        with import_h5py().File(folder / file, "r") as opened:
+        with open_own(folder / file) as opened:
             array: NDArray[Any] = opened[dataset][()]
     except HDF5_ERRORS as error:
         why = reason(error) if (folder / file).exists() else "no such file"
@@ -407,6 +411,7 @@ def read_table(path: Path) -> Columns:
     InputError
         If it is missing or damaged.
     """
+    check_file(path)
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

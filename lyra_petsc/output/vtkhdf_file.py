@@ -21,6 +21,7 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_bytes
 from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
@@ -51,7 +52,7 @@ def write_cells(folder: Path, mesh_file: str) -> None:
     """
     path = folder / CELLS_FILE
     try:
-        with import_h5py().File(folder / mesh_file, "r") as stored:
+        with open_own(folder / mesh_file) as stored:
             triangles = stored["mesh/triangles"][()]
         with _in_memory() as file:
             for name, array in cells(triangles).items():

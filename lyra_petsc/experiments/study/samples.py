@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import HDF5_ERRORS, raise_together, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.read_run import Columns, read_table
+from lyra_petsc.output.self_contained import check_folder, open_own
 from lyra_petsc.output.states import read_state, state_files
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
@@ -110,13 +110,15 @@ class Samples:
         problem: LyraError | None = None
         rows: Array = np.empty((0, 3))
         try:
-            with import_h5py().File(self.folder / file, "r") as opened:
+            with open_own(self.folder / file) as opened:
                 stored = opened[dataset]
                 if wanted is None:
                     start, stop = slab(comm, self.n_vertices)
                     rows = stored[start:stop]
                 else:
                     rows = _picked(stored, wanted)
+        except LyraError as error:
+            problem = error
         except HDF5_ERRORS as error:
             problem = InputError(f"positions cannot be read: {reason(error)}", file=self.folder / file)
         raise_together(comm, problem)
@@ -158,7 +160,7 @@ def read_surface(folder: Path) -> Surface:
     """
     path = folder / MESH_FILE
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_own(path) as file:
             mesh = file["mesh"]
             rest, triangles = mesh["rest"][:], mesh["triangles"][:]
             uv = mesh["corner_uv"][:] if "corner_uv" in mesh else mesh["uv"][:][triangles]
@@ -195,6 +197,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
     """As ``read_samples``, on one rank and for it alone."""
     states = []
     if folder.is_dir():
+        check_folder(folder)
         states = [state for path in state_files(folder) if (state := read_state(path)) is not None]
     if not states:
         raise InputError("holds no states of a run", file=folder)

@@ -9,8 +9,8 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Window
 
@@ -88,7 +88,7 @@ def _stored_mesh(run: Run) -> Mesh:
     groups: dict[str, Group] = {}
     none = np.empty(0, dtype=np.int64)
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_own(path) as file:
             start = file["start"][()]
             for stored in file["groups"].values() if "groups" in file else ():
                 vertices = stored["vertices"][()] if "vertices" in stored else none
