@@ -60,6 +60,10 @@ def logged(name: str) -> Callable[[Callable[Arguments, Result]], Callable[Argume
     return decorate
 
 
+def _nobody(text: str) -> None:
+    pass
+
+
 class Phases:
     """Charges every second since construction to exactly one phase.
 
@@ -70,12 +74,16 @@ class Phases:
     ----------
     clock : callable
         Returns seconds; the wall clock unless a test brings its own.
+    tell : callable
+        Called with a line where a phase takes long before the first step; on rank 0.
     """
 
     OTHER = "other"
 
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        self._clock = clock
+    def __init__(
+        self, clock: Callable[[], float] = time.perf_counter, tell: Callable[[str], None] = _nobody
+    ) -> None:
+        self._clock, self.tell = clock, tell
         self._seconds: dict[str, float] = {}
         self._open = [self.OTHER]
         self._start = self._charged_until = clock()

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from rich.console import Console
 from rich.table import Table
 
-from lyra_petsc.cli.run import read_scene
+from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_fence import in_words, standing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
@@ -39,7 +39,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     """
     path = path or default_scene()
     scene = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulation = Simulation(comm, scene, Phases())
+    simulation = Simulation(comm, scene, Phases(tell=say))
     Recorder(simulation)
     problem = simulation.problem
     points, pattern = problem.points, problem.pattern

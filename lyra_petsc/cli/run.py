@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +59,7 @@ def run(
     """
     if served is not None:
         on_root(comm, lambda: served.check("--live"))
-    phases = Phases()
+    phases = Phases(tell=say)
     stop = StopRequest(comm)
     if scene is None and resume and out is not None:
         scene = out / "scene.yaml"
@@ -66,6 +67,12 @@ def run(
     choice = choose(comm, path.stem, out, force=force, resume=resume)
     loaded = read_scene(comm, path, settings, trust_mesh=trust_mesh)
     simulate(comm, loaded, choice, TerminalProgress(comm, served, choice.first), stop.signal_number, phases)
+
+
+def say(text: str) -> None:
+    """Print a line for whoever waits; a run goes on if nobody reads it."""
+    with suppress(OSError):
+        print(text, file=sys.stderr, flush=True)
 
 
 class TerminalProgress(ProgressCallbacks):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,11 @@ from lyra_petsc.scene.schema import MeshSource, Rotation
 
 
 def build_mesh(
-    sources: Sequence[MeshSource], *, file: object | None = None, trust_scripts: bool = False
+    sources: Sequence[MeshSource],
+    *,
+    file: object | None = None,
+    trust_scripts: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Mesh:
     """Read, transform, check and join the mesh sources of a scene.
 
@@ -39,6 +43,8 @@ def build_mesh(
         The scene file, for messages about keys.
     trust_scripts : bool
         Give gmsh its scripts as they are, whatever they say.
+    tell : callable, optional
+        Called with a line now and then while gmsh is at work.
 
     Raises
     ------
@@ -56,7 +62,7 @@ def build_mesh(
         if source.grid is not None:
             check_capacity(n_vertices + grid_vertices(source.grid), file=file, key=f"{key}.grid")
         try:
-            sheet = _read(source, trust_scripts)
+            sheet = _read(source, trust_scripts, tell)
             piece = _prepare(sheet, source, key, file)
         except MemoryError:
             raise InputError("the mesh does not fit into memory", file=source.file or file, key=key) from None
@@ -76,7 +82,7 @@ def build_mesh(
     return mesh
 
 
-def _read(source: MeshSource, trust_scripts: bool) -> Sheet:
+def _read(source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None) -> Sheet:
     if source.grid is not None:
         return grid_sheet(source.grid)
     assert source.file is not None
@@ -84,7 +90,9 @@ def _read(source: MeshSource, trust_scripts: bool) -> Sheet:
     if suffix == ".geo":
         from lyra_petsc.mesh.geo_file import mesh_geo
 
-        return mesh_geo(source.file, source.size, trusted=trust_scripts)
+        return mesh_geo(
+            source.file, source.size, algorithm=source.algorithm, trusted=trust_scripts, tell=tell
+        )
     if suffix == ".msh":
         from lyra_petsc.mesh.msh_file import read_msh
 

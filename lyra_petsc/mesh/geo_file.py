@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,6 +33,14 @@ SCRIPT_SECONDS = 60
 MESH_SECONDS = 3600
 """CPU time gmsh may take to mesh."""
 
+FIRST_WORD = 5.0
+"""Seconds until it is said what gmsh does; then twice as many, and so on, at most `LONGEST_SILENCE`."""
+
+LONGEST_SILENCE = 60.0
+
+ALGORITHMS = {"mesh-adapt": 1, "automatic": 2, "delaunay": 5, "frontal-delaunay": 6}
+"""gmsh's algorithms for triangles, by their names and their numbers there (``Mesh.Algorithm``)."""
+
 _WAIT = 4.0
 """Times the CPU time allowed that we wait for gmsh, on a machine with other work to do."""
 
@@ -38,7 +48,14 @@ _WAIT = 4.0
 _MPI_VARIABLES = ("OMPI_", "PMIX_", "PMI_", "HYDRA_", "MPI_", "SLURM_")
 
 
-def mesh_geo(path: Path, size: float | None = None, *, trusted: bool = False) -> Sheet:
+def mesh_geo(
+    path: Path,
+    size: float | None = None,
+    *,
+    algorithm: str | None = None,
+    trusted: bool = False,
+    tell: Callable[[str], None] | None = None,
+) -> Sheet:
     """Mesh a .geo script in two dimensions.
 
     Parameters
@@ -48,8 +65,13 @@ def mesh_geo(path: Path, size: float | None = None, *, trusted: bool = False) ->
         Element size [m] of the script's own units, in place of every size the script gives. Divisions a
         script fixes (transfinite curves) stay, with a note. Without it, a mesh that the script makes
         itself is used as it is.
+    algorithm : str, optional
+        One of `ALGORITHMS`, in place of the script's. Without it the mesh is what gmsh alone makes of the
+        script.
     trusted : bool
         Give gmsh the script as it is, whatever it says.
+    tell : callable, optional
+        Called with a line now and then while gmsh is at work.
 
     Raises
     ------
@@ -59,16 +81,17 @@ def mesh_geo(path: Path, size: float | None = None, *, trusted: bool = False) ->
         than there is.
     """
     files: list[Path] = []
+    wishes = {"size": size, "algorithm": None if algorithm is None else ALGORITHMS[algorithm]}
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as meshed:
         if trusted:
             read_bytes(path)  # for its errors
-            _run_gmsh(path, path.absolute(), None, size, Path(folder), meshed)
+            _run_gmsh(path, path.absolute(), None, wishes, Path(folder), meshed, tell)
         else:
             checked = check_script(path)
             files = checked.files
             copies = Path(folder) / "script"
             copies.mkdir()
-            _run_gmsh(path, checked.write(copies), copies, size, Path(folder), meshed)
+            _run_gmsh(path, checked.write(copies), copies, wishes, Path(folder), meshed, tell)
         sheet = _read_mesh(path, meshed)
     if len(files) > 1:
         sheet.notes.append(f"the script includes {', '.join(file.name for file in files[1:])}")
@@ -84,14 +107,20 @@ def mesh_geo(path: Path, size: float | None = None, *, trusted: bool = False) ->
 
 
 def _run_gmsh(
-    path: Path, script: Path, readable: Path | None, size: float | None, folder: Path, meshed: BinaryIO
+    path: Path,
+    script: Path,
+    readable: Path | None,
+    wishes: dict[str, Any],
+    folder: Path,
+    meshed: BinaryIO,
+    tell: Callable[[str], None] | None,
 ) -> None:
     """Have the script meshed into ``meshed`` by another process; its failures are ours."""
     memory = available_memory()
     job = {
         "script": str(script),
         "folder": None if readable is None else str(readable),
-        "size": size,
+        **wishes,
         "script_seconds": SCRIPT_SECONDS,
         "mesh_seconds": MESH_SECONDS,
         "memory": memory,
@@ -115,9 +144,7 @@ def _run_gmsh(
             start_new_session=True,  # Ctrl-C is for the run, which ends us in its own time
         )
         try:
-            _, errors = process.communicate(timeout=_WAIT * (SCRIPT_SECONDS + MESH_SECONDS))
-        except subprocess.TimeoutExpired:
-            errors = b""
+            errors = _wait(process, told, lambda text: None if tell is None else tell(f"{path.name}: {text}"))
         finally:
             if process.poll() is None:
                 process.kill()
@@ -130,11 +157,28 @@ def _run_gmsh(
         raise InputError(words, file=path)
 
 
+def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str], None]) -> bytes:
+    """Wait for gmsh's process, with a word now and then; what it wrote to stderr."""
+    began = time.monotonic()
+    pause = FIRST_WORD
+    while time.monotonic() - began < _WAIT * (SCRIPT_SECONDS + MESH_SECONDS):
+        try:
+            return process.communicate(timeout=pause)[1]
+        except subprocess.TimeoutExpired:
+            pause = min(2.0 * pause, LONGEST_SILENCE)
+        outcome = _outcome(told)
+        doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading the script"
+        if "triangles" in outcome:
+            doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
+        tell(f"gmsh {doing}, {time.monotonic() - began:.0f} s so far")
+    return b""
+
+
 def _outcome(told: BinaryIO) -> dict[str, Any]:
     """What gmsh's process has told, the last word of each kind."""
-    told.seek(0)
     outcome: dict[str, Any] = {}
-    for line in told.read().splitlines():
+    # not by seeking: the place in the file is that of gmsh's process, too
+    for line in os.pread(told.fileno(), os.fstat(told.fileno()).st_size, 0).splitlines():
         with suppress(ValueError):
             outcome |= json.loads(line)
     return outcome

@@ -16,7 +16,7 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -74,7 +74,7 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
             _run_script(gmsh, job)
             tell(stage="mesh")
             _allow_seconds(job["mesh_seconds"])
-            _mesh(gmsh, job)
+            _mesh(gmsh, job, lambda count: tell(triangles=round(count)))
             _write_mesh(gmsh, file)
     except Refused as error:
         tell(refused=str(error))
@@ -132,20 +132,24 @@ def _run_script(gmsh: ModuleType, job: dict[str, Any]) -> None:
         gmsh.merge(job["script"])
 
 
-def _mesh(gmsh: ModuleType, job: dict[str, Any]) -> None:
+def _mesh(gmsh: ModuleType, job: dict[str, Any], expect: Callable[[float], None]) -> None:
     script, size, most = job["script"], job["size"], job["most_triangles"]
     _set_size(gmsh, size)  # the script may have set its own
+    if job["algorithm"] is not None:
+        gmsh.option.setNumber("Mesh.Algorithm", job["algorithm"])
     has_mesh = any(len(tags) for tags in gmsh.model.mesh.getElements(2)[1])
     with _errors_told(gmsh, script):
-        if not has_mesh or size is not None:
+        if not has_mesh or size is not None or job["algorithm"] is not None:
             if has_mesh:
                 gmsh.model.mesh.clear()
             if size is not None:
                 _refuse_many(_curve_length(gmsh) / size, "edges", size, most)
                 _refuse_many(_estimate(gmsh, size), "triangles", size, most)
             gmsh.model.mesh.generate(1)
+            count = _estimate(gmsh, size)
             if size is None:
-                _refuse_many(_estimate(gmsh, None), "triangles", None, most)
+                _refuse_many(count, "triangles", None, most)
+            expect(count / _SHARE_OF_BOX)  # of flat sheets that fill their boxes
             gmsh.model.mesh.generate(2)
 
 

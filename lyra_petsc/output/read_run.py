@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.output.self_contained import check_file, check_folder, check_name
 from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.summary import read_summary
@@ -290,6 +291,7 @@ def announced_states(folder: Path) -> list[StoredState]:
         If the folder is none of a run, nothing is written yet, or the announcement is damaged.
     """
     path = folder / XDMF_FILE
+    check_folder(folder)
     try:
         root = parse(path).getroot()
         states = [_state(grid) for grid in root.iterfind("./Domain/Grid/Grid")]
@@ -301,6 +303,9 @@ def announced_states(folder: Path) -> list[StoredState]:
         raise InputError("is damaged, or was not written by a run", file=path) from None
     if not states:
         raise InputError("no state is written yet", file=folder)
+    for state in states:
+        for name, _ in (state.position, *state.fields.values()):
+            check_name(name, path)
     return states
 
 
@@ -408,6 +413,7 @@ def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
     InputError
         If it is missing or damaged, or has no row.
     """
+    check_file(path)
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

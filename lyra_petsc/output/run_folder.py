@@ -14,7 +14,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason
+from lyra_petsc.output.self_contained import check_folder, open_own
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -135,6 +136,10 @@ def _check(choice: FolderChoice, key: str) -> None:
             raise InputError("does not exist, so there is no run to resume", file=path, key="--resume")
         if not checkpoint_files(path):
             raise InputError(NO_CHECKPOINT, file=path, key="--resume")
+        check_folder(path)  # some of its files are written on
+        for file in checkpoint_files(path):
+            with suppress(*HDF5_ERRORS), open_own(file):  # a damaged one has one before it
+                pass
     elif choice.given and not choice.force and path.exists() and os.listdir(path) != [LOCK_FILE]:
         raise InputError(EXISTS, file=path, key=key)
     check_creatable(path, key)

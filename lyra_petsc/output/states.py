@@ -16,9 +16,9 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.background import Background
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.output.stored import text_of
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
@@ -179,7 +179,7 @@ def read_state(path: Path) -> WrittenState | None:
     """What a state file holds, or ``None`` if it cannot be read."""
     match = STATE_FILE.fullmatch(path.name)
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_own(path) as file:
             number = int(match[1]) if match else 0
             group = file[group_name(number)]
             fields = tuple(

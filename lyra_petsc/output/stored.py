@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.self_contained import open_own
 
 SUM = "sum"
 """Attribute of a dataset: its check sum, as text."""
@@ -44,7 +44,7 @@ def open_stored(path: Path) -> Iterator[Any]:
         For whatever goes wrong with it, also within the context.
     """
     try:
-        with import_h5py().File(path, "r") as file:
+        with open_own(path) as file:
             yield file
     except LyraError:
         raise

@@ -125,6 +125,8 @@ class MeshSource(Block):
         A rectangle instead of a file.
     size : float [m] or None
         Element size for a .geo.
+    algorithm : str or None
+        gmsh's algorithm for the triangles of a .geo; without it the script's, or gmsh's own choice.
     transform : Transform
         Where the sheet starts; without ``vt`` its scaling counts for the rest shape, too.
     name : str or None
@@ -138,11 +140,17 @@ class MeshSource(Block):
             "is for .geo files only (others come with their elements)",
             "size",
         ),
+        Rule(
+            when(given("algorithm"), given(file=_file("geo"))),
+            "is for .geo files only (others come with their elements)",
+            "algorithm",
+        ),
     )
 
     file: Annotated[Path, JsonSchema(_file("geo", "msh", "obj"))] | None = None
     grid: Grid | None = None
     size: Positive | None = None
+    algorithm: Literal["automatic", "mesh-adapt", "delaunay", "frontal-delaunay"] | None = None
     transform: Transform = Field(default_factory=Transform)
     name: Name | None = None
 

@@ -124,7 +124,7 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes)
+        mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=phases.tell)
         outline, whole = _whole(scene, mesh)
         return outline
 

@@ -10,6 +10,7 @@ import pytest
 from mesh_sources import mesh_of, rest_areas
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh import geo_file
 from lyra_petsc.mesh.measures import mean_edge_length, triangle_sides
 from lyra_petsc.mesh.topology import boundary_edges
 
@@ -144,6 +145,27 @@ def test_quiet_and_without_traces(script: Path, capfd: pytest.CaptureFixture[str
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)] == before
     if hasattr(gmsh, "isInitialized"):
         assert not gmsh.isInitialized()
+
+
+def test_another_algorithm_only_where_one_is_asked_for(script: Path) -> None:
+    script.write_text(SQUARE + "Mesh.Algorithm = 5;\n")
+    own, same = mesh_of(script, size=0.1), mesh_of(script, size=0.1, algorithm="delaunay")
+    assert np.array_equal(own.triangles, same.triangles)
+    assert np.array_equal(own.positions, same.positions)
+    other = mesh_of(script, size=0.1, algorithm="mesh-adapt")
+    assert not np.array_equal(own.triangles, other.triangles)
+    script.write_text(SQUARE + "Mesh 2;\n")  # a script that meshes by itself
+    assert mesh_of(script).n_triangles <= mesh_of(script, algorithm="mesh-adapt").n_triangles + 4
+
+
+def test_it_is_said_what_gmsh_does_where_it_takes_long(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geo_file, "FIRST_WORD", 0.01)
+    monkeypatch.setattr(geo_file, "LONGEST_SILENCE", 0.1)
+    script.write_text(SQUARE)
+    said: list[str] = []
+    geo_file.mesh_geo(script, 0.006, tell=said.append)
+    assert said[0].startswith("script.geo: gmsh is reading the script, 0 s so far")
+    assert any("gmsh is meshing, roughly 60,000 triangles, " in line for line in said)
 
 
 def test_same_mesh_every_time(script: Path) -> None:

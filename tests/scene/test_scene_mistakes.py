@@ -71,6 +71,8 @@ CASES = [
     (GRID[:-1] + ", transform: {rotate: {axis: [0, 0, 0], degrees: 3}}}",
      "mesh.transform.rotate.axis", "zero vector"),
     (GRID[:-1] + ", size: 0.1}", "mesh.size", ".geo files only"),
+    (GRID[:-1] + ", algorithm: delaunay}", "mesh.algorithm", ".geo files only"),
+    ("mesh: {file: a.geo, algorithm: delauney}", "mesh.algorithm", "'delaunay'"),
     ("material: {cloth: paper, damping: -1}", "material.damping", ">= 0"),
     ("material: {cloth: paper, thicken: 0}", "material.thicken", "> 0"),
     ("wind: {velocity: [1, 0, 0], density: -1}", "wind.density", ">= 0"),

@@ -15,6 +15,7 @@ from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import raise_together
 from lyra_petsc.output.read_run import Columns, read_table
+from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import read_state, state_files
 from lyra_petsc.output.stored import open_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
@@ -189,6 +190,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
     """As ``read_samples``, on one rank and for it alone."""
     states = []
     if folder.is_dir():
+        check_folder(folder)
         states = [state for path in state_files(folder) if (state := read_state(path)) is not None]
     if not states:
         raise InputError("holds no states of a run", file=folder)

@@ -15,6 +15,8 @@ from aiohttp import web
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
+WEB_SOCKET = "/ws"
+
 HEADERS = {
     # nothing is loaded from other hosts; Vue compiles the page's template in the browser
     "Content-Security-Policy": (
@@ -79,12 +81,19 @@ class Access:
 
     async def _answer(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         if request.path == "/paraview/":  # trame's page asks for the web socket's address
-            return web.json_response({"sessionURL": f"ws://{request.host}/ws"})
-        if request.headers.get("Upgrade", "").lower() != "websocket":
+            return web.json_response({"sessionURL": f"ws://{request.host}{WEB_SOCKET}"})
+        opens = request.headers.get("Upgrade", "").lower() == "websocket"
+        if request.path != WEB_SOCKET and not opens:
             return await handler(request)
+        # wslink keeps what it could not open, and can then not end
+        if not web.WebSocketResponse().can_prepare(request).ok:
+            words = f"426: {WEB_SOCKET} is for the page's web socket\n"
+            return web.Response(status=426, text=words, headers={"Upgrade": "websocket"})
         self.watching += 1
         try:
             return await handler(request)
+        except (ValueError, TypeError, KeyError, ConnectionError) as error:
+            raise web.HTTPBadRequest from error  # messages that are none of the page's
         finally:
             self.watching -= 1
 

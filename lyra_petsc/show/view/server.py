@@ -138,7 +138,8 @@ async def serve(
         except OSError as error:
             raise _refusal(host, port, error) from None
     else:
-        await web[0].stop()
+        with suppress(RuntimeError, ConnectionError):  # of a page that was just opening, or has gone
+            await web[0].stop()
         with suppress(asyncio.CancelledError):
             await listening
     return over.result() if over.done() else 0

@@ -1,7 +1,10 @@
 """Who may see the page."""
 
+import asyncio
+import signal
+
 import pytest
-from launch import PATIENCE
+from launch import PATIENCE, finish
 from written_run import written
 
 from lyra_petsc.show.view.access import Access, is_loopback
@@ -45,6 +48,46 @@ def test_the_token_opens_the_page_and_its_cookie_the_rest(serve, tmp_path):
     assert page.get("/ws", Cookie=page.cookie(), **SOCKET)[0] == 101
     assert page.get("/../../../../../../etc/passwd", Cookie=page.cookie())[0] == 404
     assert page.get("/nothing", Cookie=page.cookie())[0] == 404
+
+
+def test_what_opens_no_web_socket_is_answered_and_the_end_is_clean(serve, tmp_path):
+    page = serve(written(tmp_path / "run"))
+    for change in (
+        dict.fromkeys(SOCKET),
+        {"Sec_WebSocket_Key": None},
+        {"Sec_WebSocket_Key": "x"},
+        {"Sec_WebSocket_Version": "1"},
+        {"Connection": "close"},
+    ):
+        headers = {name: value for name, value in (SOCKET | change).items() if value is not None}
+        for method in ("GET", "HEAD", "POST"):
+            assert page.get(f"/ws?token={page.token}", method, **headers)[0] == 426
+    assert page.get(f"/index.html?token={page.token}")[0] == 200
+    page.process.send_signal(signal.SIGINT)
+    left = finish(page.process)
+    assert left.code == 0
+    assert left.err == ""
+
+
+def test_messages_that_are_none_of_the_page_end_their_web_socket_only(serve, tmp_path):
+    import aiohttp
+
+    page = serve(written(tmp_path / "run"))
+
+    async def send() -> None:
+        address = f"http://127.0.0.1:{page.port}/ws?token={page.token}"
+        async with aiohttp.ClientSession() as session:
+            for message in (b"\xff\x00", b"\x81\xa6wslink\xa31.0", b""):
+                async with session.ws_connect(address) as socket:
+                    await socket.send_bytes(message)
+                    assert (await socket.receive(timeout=PATIENCE)).type is not aiohttp.WSMsgType.TEXT
+
+    asyncio.run(send())
+    assert page.get(f"/index.html?token={page.token}")[0] == 200
+    page.process.send_signal(signal.SIGINT)
+    left = finish(page.process)
+    assert left.code == 0
+    assert "Traceback" not in left.err
 
 
 def test_other_names_and_other_sites_are_refused_with_the_token_too(serve, tmp_path):

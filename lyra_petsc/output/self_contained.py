@@ -1,0 +1,123 @@
+"""A run's folder holds all of its results: files that lead out of it are refused.
+
+Whoever gives away a run's folder could else have its reader show, or change, files of theirs: HDF5 follows
+links to other files and takes data from any file, and a link of the file system leads anywhere.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.h5py_loader import import_h5py
+
+ENDINGS = (".h5", ".xdmf", ".vtkhdf", ".csv", ".yaml", ".json", ".txt", ".part")
+"""Of what a run writes and its readers read."""
+
+DEEPEST = 8
+"""Groups within groups: our files have three."""
+
+_REMEDY = "a run's folder must hold all of its results"
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse results that stand elsewhere.
+
+    Raises
+    ------
+    InputError
+        Naming the first one.
+    """
+    try:
+        names = sorted(entry.name for entry in os.scandir(folder) if entry.name.endswith(ENDINGS))
+    except OSError:  # told by whoever reads it
+        return
+    for name in names:
+        check_file(folder / name)
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file that stands outside the folder where it seems to be, or is no file.
+
+    Raises
+    ------
+    InputError
+    """
+    try:
+        target, kind = path.resolve(), path.stat().st_mode
+        inside = target.is_relative_to(path.parent.resolve())
+    except (OSError, ValueError, RuntimeError):  # missing, or a circle of links
+        if path.is_symlink():
+            raise InputError(f"is a link that leads nowhere; {_REMEDY}", file=path) from None
+        return
+    if not inside:
+        raise InputError(f"is a link out of the folder; {_REMEDY}", file=path)
+    if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+        raise InputError("is no plain file", file=path)
+
+
+def check_name(name: str, file: Path) -> None:
+    """Refuse a name in ``file`` that is not that of another file in its folder.
+
+    Raises
+    ------
+    InputError
+    """
+    if name in ("", ".", "..") or "\\" in name or os.path.basename(name) != name or not name.isprintable():
+        raise InputError(f"names {name[:80]!r}, which is no file in its folder; {_REMEDY}", file=file)
+
+
+@contextmanager
+def open_own(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """An HDF5 file of a run's folder, to read, whose data are all its own.
+
+    Yields
+    ------
+    h5py.File
+
+    Raises
+    ------
+    InputError
+        For data of other files, and links to them.
+    OSError and what else h5py raises
+        If it cannot be read.
+    """
+    path = Path(path)
+    check_file(path)
+    with import_h5py().File(path, "r") as file:
+        _check_content(file.id, path)
+        yield file
+
+
+_known: dict[Path, tuple[int, ...]] = {}
+
+
+def _check_content(file: Any, path: Path) -> None:
+    """Look at all links and datasets of a file, once as long as it does not change."""
+    status = path.stat()
+    stamp = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    if _known.get(path) == stamp:
+        return
+    h5py = import_h5py()
+    groups = [("", h5py.h5g.open(file, b"/"), 0)]
+    while groups:
+        above, group, depth = groups.pop()
+        for name in group:
+            where = f"{above}/{name.decode(errors='replace')}"[-80:]
+            if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
+                raise InputError(f"{where!r} is a link to elsewhere; {_REMEDY}", file=path)
+            member = h5py.h5o.open(group, name)
+            if isinstance(member, h5py.h5g.GroupID):
+                if depth == DEEPEST:
+                    raise InputError(f"{where!r}: groups within groups; is no file of a run", file=path)
+                groups.append((where, member, depth + 1))
+            elif isinstance(member, h5py.h5d.DatasetID):
+                plan = member.get_create_plist()
+                if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count() > 0:
+                    raise InputError(f"{where!r} takes its data from other files; {_REMEDY}", file=path)
+    _known[path] = stamp
