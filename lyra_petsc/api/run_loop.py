@@ -163,7 +163,7 @@ class _RunLoop:
         finally:
             callbacks.close()
             recorder.close()
-        self._summarise("done")
+        self._summarise("done" if simulation.at_end else "stopped")
         callbacks.done(simulation, self._folder)
 
     def _show_notes(self) -> None:
@@ -201,7 +201,9 @@ class _RunLoop:
             "partitioner": problem.partitioner,
             "linear_solver": simulation.stepper.preset,
             "petsc_options": PETSc.Options().getAll(),
-            "unused_petsc_options": unused(simulation.stepper.our_options) if outcome == "done" else [],
+            "unused_petsc_options": unused(simulation.stepper.our_options)
+            if outcome in ("done", "stopped")
+            else [],
             "integrator": simulation.scene.time.scheme,
             "time": simulation.time,
             "estimated_error": simulation.estimated_error if simulation.local_error else None,

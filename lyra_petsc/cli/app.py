@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.arguments import help_asked, split
+from lyra_petsc.cli.arguments import help_asked, petsc_cannot_start, split
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.errors import InputError, LyraError, SolverError
 from lyra_petsc.parallel import take_back_signals
@@ -42,8 +42,10 @@ def run_command_line(argv: Sequence[str]) -> int:
     try:
         import petsc4py
 
-        petsc4py.init([argv[0], *petsc])
-        take_back_signals()
+        why = petsc_cannot_start(petsc)
+        if not why:
+            petsc4py.init([argv[0], *petsc])
+            take_back_signals()
         import numpy as np
         from mpi4py import MPI
     except ImportError as error:
@@ -55,6 +57,9 @@ def run_command_line(argv: Sequence[str]) -> int:
         return InputError.exit_code
 
     comm = MPI.COMM_WORLD
+    if why:
+        _say(comm, why)
+        return InputError.exit_code
     reserve = [bytes(RESERVE)]
     # numba would put colour codes on the standard output where it finds colorama
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")

@@ -6,6 +6,8 @@ value, as in every PETSc program. A scene that follows a PETSc flag is still the
 
 from __future__ import annotations
 
+import itertools
+import os
 import re
 from collections.abc import Sequence
 
@@ -56,3 +58,33 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
     if "-help" not in petsc or runs:
         return ours, petsc
     return [*ours[:1], "--help"], [word for word in petsc if word != "-help"]
+
+
+def petsc_cannot_start(words: Sequence[str]) -> str:
+    """Why PETSc would fail or crash while it reads these options and PETSC_OPTIONS; or nothing."""
+    every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
+    for option, value in itertools.pairwise([*every, ""]):
+        name = option.lstrip("-").lower()
+        if name in ("options_file", "options_file_yaml"):
+            try:
+                with open(value, encoding="utf-8") as file:
+                    text = file.read()
+            except (OSError, ValueError) as error:
+                why = getattr(error, "strerror", None) or "it is no text"
+                return f"-{name}: cannot read '{value}': {why}"
+            if name == "options_file":
+                wrong = _wrong_line(text)
+                if wrong:
+                    return f"-{name}: {value}: {wrong}"
+        if name == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
+            return "-fp_trap: ends Python at numbers that overflow, which here make a step fail; leave it out"
+    return ""
+
+
+def _wrong_line(text: str) -> str:
+    """The first line of an options file that PETSc does not understand."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if words and not (words[0][0] in "-!%" or words[0].lower() in ("alias", "mpi")):
+            return f"line {number}: '{words[0]}' is no option; one begins with a dash, a comment with #"
+    return ""

@@ -219,7 +219,7 @@ def closing_table(
         if seconds >= 0.005 or name == "total"
     ]
     states = f"paraview {Path(folder) / 'states.xdmf'}"
-    facts = [("outcome", outcome), ("results", str(folder)), ("open", states)]
+    facts = [("results", str(folder)), ("open", states), ("outcome", outcome)]
     with suppress(OSError):
         if stream.isatty():
             _print_table(rows, facts, stream)

@@ -139,7 +139,11 @@ class TerminalProgress(ProgressCallbacks):
     def done(self, simulation: Simulation, folder: Path) -> None:
         """Print where the time went, and which PETSc options nothing used."""
         simulation.stepper.ts.viewFromOptions("-ts_view")
-        closing_table(self._comm, simulation.phases.seconds(), folder, "done")
+        outcome = "done"
+        if not simulation.at_end:
+            now = f"step {simulation.step_number}, t = {simulation.time:g} of {simulation.control.end:g} s"
+            outcome = f"stopped at {now}, by -ts_max_steps; --resume goes on"
+        closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._page is not None:
             print(f"look again   lyra-petsc view {folder}", flush=True)
         left = unused(simulation.stepper.our_options)

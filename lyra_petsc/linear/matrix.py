@@ -176,16 +176,20 @@ class AssembledMatrix:
                 self._storage = Storage(self.mat, self.kind, pattern, self._stored)
 
     def _set_from_options(self, prefix: str) -> None:
-        asked = PETSc.Options(prefix).getString("mat_type", "")
+        asked = PETSc.Options(prefix).getString("mat_type", self.mat.getType())
         self.mat.setOptionsPrefix(prefix)
+        # asked before PETSc, which crashes at some types
+        fits = asked.removeprefix("seq").removeprefix("mpi") in FILLED
         try:
-            self.mat.setFromOptions()
+            if fits:
+                self.mat.setFromOptions()
         except PETSc.Error:
-            raise InputError(f"PETSc has no matrix type '{asked}'", key=f"-{prefix}mat_type") from None
-        if str(self.mat.getType()).removeprefix("seq").removeprefix("mpi") not in FILLED:
+            fits = False
+        if not fits:
+            self.mat.destroy()
             allowed = ", ".join(FILLED)
             raise InputError(
-                f"'{asked}' cannot be filled by blocks; take {allowed}", key=f"-{prefix}mat_type"
+                f"'{asked}' cannot be filled by blocks here; take {allowed}", key=f"-{prefix}mat_type"
             )
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.linear.hierarchy import Hierarchy
 from lyra_petsc.linear.matrix import BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
@@ -61,7 +62,10 @@ class Multigrid:
 
     def attach(self, ksp: PETSc.KSP) -> None:
         """Give the cycle, which PETSc made when it read the options, its levels; collective."""
-        self._pc = pc = ksp.getPC()
+        pc = ksp.getPC()
+        if pc.getType() != PETSc.PC.Type.PYTHON:
+            raise InputError(f"'{ksp.getType()}' takes no such preconditioner; take another", key="-ksp_type")
+        self._pc = pc
         self._cycle: VCycle = pc.getPythonContext()
         self._cycle.attach(self.hierarchy, self._renew)
         # at the end of a program that destroys nothing PETSc would call Python when that is gone

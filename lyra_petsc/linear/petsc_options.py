@@ -21,6 +21,9 @@ Value = str | int | float | bool | None
 READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidump", "get_total_flops"})
 """What PETSc asks for only while it leaves."""
 
+CHOICES = ("ksp_type", "pc_type", "mat_type", "snes_linesearch_type")
+"""What most errors are about that quote no option's value."""
+
 
 def fill_gaps(options: Mapping[str, Value]) -> list[str]:
     """Set each option that is not set yet; returns the names that were set."""
@@ -55,16 +58,18 @@ def petsc_number(name: str, default: float) -> float:
         raise InputError(f"must be a number, not '{value}'", key=f"-{name}") from None
 
 
-def refused(error: PETSc.Error) -> InputError:
+def refused(error: Exception) -> InputError:
     """What PETSc has against an option."""
     return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
 
 
-def culprits(error: PETSc.Error) -> str:
+def culprits(error: Exception) -> str:
     """The options that an error is about: those whose value it quotes, as it does not tell their names."""
     told = re.split(r"[\s;:,]+", last_words(error))
     options = PETSc.Options().getAll()
     names = [f"-{name}" for name, value in options.items() if value and value.strip() in told]
+    names = names or [f"-{name}" for name in options if name.endswith("python_type")]
+    names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
     return " or ".join(sorted(names)) or "PETSc options"
 
 

@@ -168,6 +168,10 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
     if chosen == PETSc.PC.Type.MG:  # which means our cycle
         return PRESETS["multigrid"]
+    if (
+        chosen == PETSc.PC.Type.FIELDSPLIT
+    ):  # else the shell DM of the SNES is asked for fields, which has none
+        return {"ksp_type": "cg", "pc_fieldsplit_dm_splits": False}
     for preset in ("block-jacobi", "gamg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
             return options_of(preset, ranks)

@@ -52,8 +52,8 @@ def preconditioner_failed(ksp: PETSc.KSP) -> bool:
     return ksp.getConvergedReason() in _PRECONDITIONER
 
 
-def last_words(error: PETSc.Error) -> str:
-    """The innermost message of a PETSc error, in one line."""
+def last_words(error: Exception) -> str:
+    """The innermost message of an error from within PETSc, in one line."""
     lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]
     told = [line for line in lines if line and "() at " not in line and not line.startswith("error code")]
     return "; ".join(told[-2:]) if told else " ".join(str(error).split())

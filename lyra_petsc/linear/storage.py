@@ -177,7 +177,9 @@ class Storage:
         self._mat = mat
         self._rows = pattern.indptr, pattern.columns, stored.begin, stored.below
         self._sizes = 9 * int(stored.inside.sum()), 9 * int(stored.outside.sum())
-        self._split = getattr(library, f"MatMPI{name}GetSeq{name}") if mat.getComm().size > 1 else None
+        self._split = (
+            getattr(library, f"MatMPI{name}GetSeq{name}") if mat.getType().startswith("mpi") else None
+        )
         self._fill = {"aij": _to_aij, "baij": _to_baij}[kind]
 
     def write(self, values: Array) -> None:

@@ -588,6 +588,11 @@ class Time(Block):
             "tolerance",
         ),
         Rule(
+            {"properties": {"tolerance": {"minimum": 1e-12}}},
+            "is at least 1e-12, not {tolerance:g}: double precision reaches no less",
+            "tolerance",
+        ),
+        Rule(
             {"properties": {"tolerance": {"exclusiveMaximum": 1}}},
             "is a fraction of the sheet's size, below 1, not {tolerance:g}",
             "tolerance",

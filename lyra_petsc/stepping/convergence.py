@@ -53,6 +53,8 @@ class Convergence:
         Whether the solve was given up since its linear iterations passed the limit.
     usual : float
         Mean of recent linear iterations per Newton iteration, which the limit is for.
+    stopped_by : str
+        The option that ended the solve while the scene's force tolerance was not met; or nothing.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class Convergence:
     def begin(self) -> None:
         """A new solve."""
         self.norm, self.fell, self.at_roundoff = 0.0, False, False
-        self.left, self.too_slow = np.inf, False
+        self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
 
@@ -96,17 +98,20 @@ class Convergence:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
         rtol, atol, stol, _ = snes.getTolerances()
-        if residual <= atol:
-            return int(Reason.CONVERGED_FNORM_ABS)
-        if iteration == 0:
+        if residual > atol and iteration == 0:
             self._first_norm = residual
             return None
-        if residual <= rtol * self._first_norm:
-            return int(Reason.CONVERGED_FNORM_RELATIVE)
         balanced = residual <= self._tolerances.force_tolerance * self._equations.largest_force()
+        if residual <= atol:
+            self.stopped_by = "" if balanced else "-snes_atol"
+            return int(Reason.CONVERGED_FNORM_ABS if balanced else Reason.DIVERGED_INNER)
+        if residual <= rtol * self._first_norm:
+            self.stopped_by = "" if balanced else "-snes_rtol"
+            return int(Reason.CONVERGED_FNORM_RELATIVE)
         if balanced and self.left <= self._tolerances.step_tolerance * self._spacing:
             return int(Reason.CONVERGED_FNORM_RELATIVE)
         if 0.0 < self.left <= stol * self._spacing:
+            self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
 

@@ -126,7 +126,7 @@ class Equilibrium:
                 self._integrator.pseudo = min(
                     self._integrator.pseudo * growth(attempt.newton_iterations), self._longest
                 )
-            elif self._stepper.linear_solver_failed:
+            elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
                 self._integrator.pseudo *= SHRINK

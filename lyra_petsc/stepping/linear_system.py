@@ -50,8 +50,10 @@ class LinearSystem:
         self._equations, self._surface, self._preset = equations, surface, preset
         self._iterates = iterates
         direct = PETSc.Options().getString("ksp_type", "cg") == PETSc.KSP.Type.PREONLY
+        # this one is a way to multiply by the operator, and needs its entries
+        self._one_matrix = PETSc.Options().getString("pc_type", "") == PETSc.PC.Type.EISENSTAT
         # else the preconditioner is built from the operator's own values
-        self._regularised = iterates and hessian != "regularised" and not direct
+        self._regularised = iterates and hessian != "regularised" and not direct and not self._one_matrix
         self._shifts = not direct
         self._cycles = multigrid.is_asked_for()
         self._interpolations: list[InterpolationRows] | None = None
@@ -67,7 +69,7 @@ class LinearSystem:
         kind = presets.matrix_type(self._preset)
         self.operator: Matrix
         self.preconditioner: Matrix
-        if is_set("mat_type"):
+        if is_set("mat_type") or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
             self.operator = BlockMatrix(layout, pattern)

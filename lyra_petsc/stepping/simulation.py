@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number
+from lyra_petsc.linear.refused_options import check_options, check_size
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.compression_watch import Compression
@@ -37,6 +38,9 @@ SMALLEST_FRACTION = 2.0**-12
 
 LARGEST_FRACTION = 0.1
 """Largest Δt of an adaptive run over its length (``-ts_adapt_dt_max`` overrides it)."""
+
+MOST_STEPS, MOST_STATES = 1e8, 1e6
+"""Beyond them a run would never end, or fill any disk."""
 
 SMALLEST_ADAPTED = 1e-6
 """Smallest Δt of an adaptive run over the largest (``-ts_adapt_dt_min`` overrides it)."""
@@ -104,6 +108,7 @@ class Simulation:
         self.phases = phases or Phases()
         self._filled = fill_gaps(scene.petsc)
         try:
+            check_options()
             self.scene = with_ts_options(scene)
             self._set_up(self.scene)
         except BaseException:
@@ -114,6 +119,7 @@ class Simulation:
         self.problem: Problem = build_problem(self.comm, scene, self.phases)
         self.notes, self.earlier_notes = list(self.problem.outline.notes), 0
         outline, system = self.problem.outline, self.problem.system
+        check_size(self.problem.points.n_unknowns)
         with self.phases("solve"):
             floor = residual_roundoff(system, outline.reach)
             if not math.isfinite(floor):
@@ -130,6 +136,7 @@ class Simulation:
             _positive("-ts_dt", petsc_number("ts_dt", ts.getTimeStep())),
             _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
         )
+        self._check_length(self.control)
         self.time, self.step_number = 0.0, 0
         self.local_error = LocalError(system) if scene.time.adaptive else None
         self.estimated_error = 0.0
@@ -157,6 +164,27 @@ class Simulation:
             return ToleranceControl(step, largest, end, every, events(self.scene), smallest)
         return StepControl(largest, end, every, events(self.scene), smallest)
 
+    def _check_length(self, control: StepControl) -> None:
+        """Refuse what would never end."""
+        time, every = self.scene.time, self.scene.output.every
+        if time.analysis == "static":  # an increment grows while it is easy
+            return
+        steps = control.end / control.step
+        if steps > MOST_STEPS:
+            names = [f"-{name}" for name in ("ts_adapt_dt_max", "ts_dt", "ts_max_time") if is_set(name)]
+            self._refuse_length(f"{steps:.3g} steps", MOST_STEPS, control.step, [*names, "time.step"][0])
+        states = steps if every is None else control.end / every
+        if states > MOST_STATES:
+            step = control.step if every is None else every
+            self._refuse_length(f"{states:.3g} states", MOST_STATES, step, "output.every")
+
+    def _refuse_length(self, count: str, most: float, step: float, key: str) -> None:
+        raise InputError(
+            f"{step:g} s makes {count} in {self.control.end:g} s; at most {most:g} are made: give more",
+            file=None if key.startswith("-") else self.scene.source,
+            key=key,
+        )
+
     @property
     def budget(self) -> Budget:
         """Energies and works up to the present state."""
@@ -165,7 +193,12 @@ class Simulation:
     @property
     def finished(self) -> bool:
         """Whether the end of the scene, or ``-ts_max_steps``, is reached."""
-        return self.control.is_end(self.time) or self.step_number >= self.max_steps
+        return self.at_end or self.step_number >= self.max_steps
+
+    @property
+    def at_end(self) -> bool:
+        """Whether the end of the scene is reached."""
+        return self.control.is_end(self.time)
 
     def step(self) -> StepReport:
         """One accepted step, retried with a smaller Δt where needed.
@@ -209,6 +242,12 @@ class Simulation:
             self.notes.append(note)
         if attempt.at_roundoff and "roundoff" not in self._told:
             self._tell_of_roundoff(attempt.residual)
+        if self.stepper.stopped_by and "option" not in self._told:
+            self._told.add("option")
+            self.notes.append(
+                f"step {self.step_number} ({self._now()}): {self.stepper.stopped_by} stopped Newton's "
+                f"method at a residual of {attempt.residual:.2g} N, short of solver.force_tolerance"
+            )
         for term in system.elastic:
             if term.registration.state:
                 term.accept(system.x, system.frozen[term])
@@ -269,7 +308,7 @@ class Simulation:
                     f"going on with '{following}'"
                 )
                 return
-        in_vain = isinstance(self._seek, Equilibrium) and self._seek.in_vain
+        in_vain = (isinstance(self._seek, Equilibrium) and self._seek.in_vain) or self.stepper.stopped_by
         if in_vain or not self.control.failed():
             self.failure = self._explain(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
@@ -301,7 +340,10 @@ class Simulation:
             kind=trouble(diagnosis, stuck),
             tried=self._tried,
             diagnosis=diagnosis,
-            advice=advice(diagnosis, stuck, scene, now),
+            advice=[
+                *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
+                *advice(diagnosis, stuck, scene, now),
+            ],
             sources=outline.sources,
             stuck=stuck,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from lyra_petsc.errors import SolverError
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.petsc_options import Value, culprits, fill_gaps, is_set, refused
@@ -160,13 +161,19 @@ class Stepper:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=1e-6, max_it=5000)
             ksp.setInitialGuessNonzero(True)
+        # what PETSc frees when Python is gone must not call it
+        self._at_exit = weakref.finalize(self, _forget_python, ksp)
         try:
             self.velocity.setFromOptions()
             with hidden():
                 ts.setFromOptions()
-        except PETSc.Error as error:
-            raise refused(error) from None
-        self.linear.attach(ksp)
+            self.linear.attach(ksp)
+        except Exception as error:
+            if not isinstance(error, (PETSc.Error, InputError)) and not _runs_foreign_python():
+                raise
+            problem = error if isinstance(error, InputError) else refused(error)
+            self.destroy()
+            raise problem from None
         if ksp.getType() in presets.CONJUGATE_GRADIENTS and not is_set("ksp_norm_type"):
             # a preconditioner near breakdown makes the preconditioned norm meaningless
             ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
@@ -200,6 +207,7 @@ class Stepper:
         database = PETSc.Options()
         for name in self._filled:
             database.delValue(name)
+        self._at_exit()
         self.ts.destroy()
         self.linear.destroy()
         self.velocity.destroy()
@@ -271,7 +279,9 @@ class Stepper:
         self._trace.begin()
         try:
             self.ts.step()
-        except PETSc.Error as error:
+        except Exception as error:
+            if not isinstance(error, PETSc.Error) and not _runs_foreign_python():
+                raise
             together = all_here(equations.points.comm)
             kept = "the state before it" if together else "the last checkpoint (the other ranks work on)"
             raise SolverError(
@@ -283,6 +293,9 @@ class Stepper:
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
             self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)
+            if self.stopped_by:
+                self._linear_failed = False
+                return None, f"{self.stopped_by} stopped Newton's method short of solver.force_tolerance"
             return None, reasons.in_words(self.snes, self.ksp)
         velocity = self.snes.getSolution().getArray(readonly=True).reshape(self._shape).copy()
         if equations.points.comm.allreduce(int(not np.isfinite(velocity).all())):
@@ -309,6 +322,11 @@ class Stepper:
             v = self._equations.v[: self._shape[0]]
             self._extrapolation.restore(arrays, numbers.get("extrapolation", {}), time, v)
         self.start(time, step)
+
+    @property
+    def stopped_by(self) -> str:
+        """The option that ended the last solve short of the scene's force tolerance; or nothing."""
+        return self._newton.convergence.stopped_by
 
     @property
     def linear_solver_slow(self) -> bool:
@@ -348,3 +366,18 @@ class Stepper:
         if self._iterates:
             self._newton.globalisation.remember(u)
         return True
+
+
+def _forget_python(ksp: PETSc.KSP) -> None:
+    """Let a KSP and its PC be of types that run no Python; collective."""
+    pc = ksp.getPC()
+    if pc.getType() == PETSc.PC.Type.PYTHON:
+        pc.setType(PETSc.PC.Type.NONE)
+    if ksp.getType() == PETSc.KSP.Type.PYTHON:
+        ksp.setType(PETSc.KSP.Type.PREONLY)
+
+
+def _runs_foreign_python() -> bool:
+    """Whether PETSc calls Python that is not this program's."""
+    types = {name: value for name, value in PETSc.Options().getAll().items() if name.endswith("python_type")}
+    return any(value != presets.PYTHON_TYPE for value in types.values())

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from launch import SCENE, Left, done, lyra, write_scene
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return found
 
 
 def history(folder: Path) -> list[dict[str, str]]:
@@ -94,6 +101,37 @@ def test_a_value_that_petsc_refuses_is_named(tmp_path: Path, options: list[str],
     (line,) = left.ours
     assert line.startswith(f"lyra-petsc: {words}")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_run_of_a_few_steps_says_so_and_goes_on(tmp_path: Path) -> None:
+    left = ran(tmp_path, "-ts_max_steps", "1")
+    assert left.out.splitlines()[-1].startswith(
+        "outcome      stopped at step 1, t = 0.01 of 0.05 s, by -ts_max_steps"
+    )
+    assert summary(tmp_path / "out")["outcome"] == "stopped"
+    left = done(["run", "--out", "out", "--resume"], tmp_path)
+    assert left.out.splitlines()[-1] == "outcome      done"
+    assert summary(tmp_path / "out")["outcome"] == "done"
+    assert len(history(tmp_path / "out")) == 6
+    left = ran(tmp_path, "-ts_max_steps", "5", "--force")  # which is the end
+    assert summary(tmp_path / "out")["outcome"] == "done"
+
+
+@pytest.mark.parametrize("settings", [[], ["--set", "time.analysis=static", "--set", "time.end=1"]])
+def test_an_absolute_tolerance_does_not_replace_that_of_the_scene(
+    tmp_path: Path, settings: list[str]
+) -> None:
+    scene = write_scene(tmp_path)
+    left = lyra(["run", scene, "--out", "out", *settings, "-snes_atol", "1e30"], tmp_path)
+    assert left.code == 3
+    assert "-snes_atol stopped Newton's method short of solver.force_tolerance" in left.ours[0]
+    assert "try a smaller -snes_atol" in left.ours[0]
+    ran(tmp_path, "-snes_atol", "1e-12", "--force")
+
+
+def test_a_loose_relative_tolerance_is_noted(tmp_path: Path) -> None:
+    left = ran(tmp_path, "-snes_rtol", "0.5")
+    assert "note: step 1 (t = 0.01 s): -snes_rtol stopped Newton's method at a residual of" in left.err
 
 
 def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_path: Path) -> None:

@@ -101,6 +101,8 @@ def _outcome(facts: Facts, done: float) -> str:
         return f"The run was killed, or its machine went down, after {now}, {percent(done)}."
     if facts.outcome == "unknown":
         return f"How the run ended is not known (no summary.json); its last step is at {now}."
+    if facts.outcome == "stopped":
+        return f"The run was to stop at {now}, {percent(done)}, by -ts_max_steps."
     return f"The run stopped at {now}, {percent(done)}: {facts.outcome}"
 
 

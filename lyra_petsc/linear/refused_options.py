@@ -1,0 +1,115 @@
+"""PETSc's options that no run can follow: refused in words, before anything is made.
+
+Whatever else PETSc itself refuses becomes an error where it does so (``petsc_options.refused``).
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.linear.petsc_options import is_set
+
+SNES_TYPES = ("newtonls", "ksponly")
+"""Newton's method with a line search, and one linear solve."""
+
+JACOBIANS = ("snes_mf", "snes_mf_operator", "snes_fd", "snes_fd_color")
+"""Options that replace the assembled Jacobian."""
+
+NEEDS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
+"""Preconditioners that without an option take for ever (sweeps that are not symmetric), or crash (an operator
+without entries)."""
+
+MOST_DENSE = 3000
+"""Unknowns up to which work on dense matrices of that size is done."""
+
+DENSE = ("pc_type svd", "snes_test_jacobian")
+"""What is done with dense matrices."""
+
+
+def check_options() -> None:
+    """Look at the options of all sources together, as they stand in the database.
+
+    Raises
+    ------
+    InputError
+        For numbers that are not finite, and for what has no meaning here.
+    """
+    options = PETSc.Options()
+    for name, value in options.getAll().items():
+        if not all(map(_finite, (value or "").split(","))):
+            raise InputError(f"must be a finite number, not {value}", key=f"-{name}")
+        if name.endswith("python_type"):
+            _check_class(name, value)
+        elif name.endswith("_type") and value == "python":
+            stem = name.removesuffix("type")
+            if name != "mat_type" and not is_set(f"{stem}python_type"):
+                raise InputError(f"python needs -{stem}python_type package.module.Class", key=f"-{name}")
+    if is_set("ts_init_time"):
+        raise InputError(
+            "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
+        )
+    for name in JACOBIANS:
+        if _is_on(name):
+            raise InputError(
+                "regularisation needs the entries of the exact Jacobian; leave it out", key=f"-{name}"
+            )
+    if _is_on("fp_trap"):
+        raise InputError(
+            "ends Python at numbers that overflow, which here make a step fail; leave it out", key="-fp_trap"
+        )
+    kind = options.getString("snes_type", "")
+    if is_set("snes_type") and kind not in SNES_TYPES:
+        allowed = " and ".join(SNES_TYPES)
+        raise InputError(
+            f"'{kind}' is not available: regularisation and convergence test belong to {allowed}",
+            key="-snes_type",
+        )
+    kind = options.getString("pc_type", "")
+    if kind in NEEDS and not is_set(NEEDS[kind]):
+        raise InputError(f"'{kind}' needs -{NEEDS[kind]} as well here", key="-pc_type")
+
+
+def check_size(unknowns: int) -> None:
+    """Refuse work on dense matrices of so many unknowns.
+
+    Raises
+    ------
+    InputError
+    """
+    for words in DENSE:
+        name, _, value = words.partition(" ")
+        asked = PETSc.Options().getString(name, "") == value if value else _is_on(name)
+        if asked and unknowns > MOST_DENSE:
+            raise InputError(
+                f"works on a dense matrix, here of {unknowns} unknowns: none above {MOST_DENSE}; "
+                "take a coarser mesh, or leave it out",
+                key=f"-{words}",
+            )
+
+
+def _is_on(name: str) -> bool:
+    """Whether an option is set, and not to false."""
+    return is_set(name) and PETSc.Options().getString(name, "").lower() not in ("0", "false", "no", "off")
+
+
+def _finite(text: str) -> bool:
+    """Whether a text is no number, or a finite one."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return True
+
+
+def _check_class(option: str, name: str) -> None:
+    module, _, cls = name.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), cls)
+    except Exception as error:
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise InputError(f"'{name}' cannot be imported ({why})", key=f"-{option}") from None
+    if not callable(found):
+        raise InputError(f"'{name}' is no class", key=f"-{option}")

@@ -1,0 +1,155 @@
+"""Each type that PETSc lists solves, or is refused in one line: no crash, no traceback, no hang."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from launch import SCENE, done, environment, write_scene
+
+LISTS = ("ksp_type", "pc_type", "snes_type", "snes_linesearch_type")
+SLOW = ("cp", "deflation")
+"""Halve Δt twelve times before they give up."""
+
+REFUSED = [
+    ["-ksp_rtol", "nan"],
+    ["-ksp_rtol", "1e999"],
+    ["-snes_atol", "inf"],
+    ["-pc_type", "mg", "-ksp_rtol", "foo"],
+    ["-pc_type", "mg", "-ksp_type", "nosuch"],
+    ["--set", "petsc.pc_type=mg", "--set", "petsc.ksp_type=nosuch"],
+    ["-ksp_type", "python"],
+    ["-pc_type", "python"],
+    ["-pc_type", "python", "-pc_python_type", "nosuch"],
+    ["-ksp_type", "python", "-ksp_python_type", "nosuch.Thing"],
+    ["-pc_type", "python", "-pc_python_type", "os.path.join"],
+    ["-pc_type", "kaczmarz"],
+    ["-pc_type", "redistribute"],
+    ["-ts_init_time", "5"],
+    ["-ts_dt", "1e-30"],
+    ["-snes_mf"],
+    ["-snes_mf_operator"],
+    ["-snes_fd"],
+    ["-snes_fd_color"],
+    ["-fp_trap"],
+    ["--set", "output.every=1e-12"],
+    ["--set", "time.step=auto", "--set", "time.tolerance=1e-30"],
+    ["--set", "time.step=auto", "-ts_adapt_dt_max", "1e-12"],
+]
+
+SOLVED = [
+    ["-pc_type", "fieldsplit", "-pc_fieldsplit_block_size", "3"],
+    ["-pc_type", "eisenstat"],
+    ["-pc_type", "kaczmarz", "-pc_kaczmarz_symmetric"],
+    ["-pc_type", "redistribute", "-mat_type", "aij"],
+    ["-mat_type", "mpiaij"],
+    ["-mat_type", "mpibaij", "-pc_type", "bjacobi"],
+    ["-mat_type", "seqaij"],
+    ["-ksp_initial_guess_nonzero"],
+    ["-pc_type", "mg", "-ksp_initial_guess_nonzero"],
+    ["-pc_type", "svd"],
+    ["-snes_test_jacobian"],
+    ["-snes_mf", "false"],
+]
+
+
+class Walk:
+    """The process that forks the runs."""
+
+    def __init__(self, folder: Path) -> None:
+        write_scene(folder, SCENE.replace("end: 0.05", "end: 0.01"))
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).with_name("walk.py")), str(folder)],
+            env=environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+
+    def ends(self, runs: list[list[str]]) -> list[tuple[int, list[str]]]:
+        """Of each run its exit code and the lines in which the program says why."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        print(json.dumps(runs), file=self._process.stdin, flush=True)
+        found = []
+        for code, out, err in json.loads(self._process.stdout.readline()):
+            assert "Traceback" not in out + err
+            found.append((code, [line for line in err.splitlines() if line.startswith("lyra-petsc: ")]))
+        return found
+
+    def end(self) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Walk]:
+    walk = Walk(tmp_path_factory.mktemp("walk"))
+    yield walk
+    walk.end()
+
+
+def lists(folder: Path) -> dict[str, list[str]]:
+    """The types that ``-help`` names."""
+    text = done(["run", write_scene(folder), "--out", "out", "-help"], folder).out
+    found = {}
+    for option in LISTS:
+        line = re.search(rf"^\s*-{option}:? <[^\n]*\(one of\)([^\n]*)", text, re.MULTILINE)
+        assert line, option
+        found[option] = re.sub(r"\([^)]*\)", "", line[1]).split()
+    return found
+
+
+@pytest.mark.slow
+def test_each_type_solves_or_is_refused_in_one_line(tmp_path: Path, walk: Walk) -> None:
+    from petsc4py import PETSc
+
+    types = lists(tmp_path)
+    assert min(map(len, types.values())) > 6
+    runs = [[f"-{option}", kind] for option, kinds in types.items() for kind in kinds if kind not in SLOW]
+    runs += [["-pc_type", "mg", "-ksp_type", kind] for kind in types["ksp_type"]]
+    runs += [["-pc_type", "mg", "-snes_type", kind] for kind in ("qn", "ngmres", "anderson", "ncg", "fas")]
+    runs += [["-mat_type", kind] for name, kind in vars(PETSc.Mat.Type).items() if name.isupper()]
+    solved = []
+    for words, (code, lines) in zip(runs, walk.ends(runs), strict=True):
+        assert (code, len(lines)) in ((0, 0), (2, 1), (3, 1)), (words, code, lines)
+        if code == 0:
+            solved.append(" ".join(words))
+    assert {"-ksp_type gmres", "-pc_type gamg", "-pc_type fieldsplit", "-snes_linesearch_type l2"} <= set(
+        solved
+    )
+
+
+def test_what_has_no_meaning_is_refused_before_the_run(walk: Walk) -> None:
+    for words, (code, lines) in zip(REFUSED, walk.ends(REFUSED), strict=True):
+        assert (code, len(lines)) == (2, 1), (words, code, lines)
+        option = next(word for word in reversed(words) if word.startswith("-"))
+        assert option == "--set" or option in lines[0] or words[-1] == "nosuch", lines
+
+
+def test_what_petsc_solves_is_solved(walk: Walk) -> None:
+    for words, end in zip(SOLVED, walk.ends(SOLVED), strict=True):
+        assert end == (0, []), (words, end)
+
+
+def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path) -> None:
+    """At its end PETSc frees what calls Python; the runs above leave before."""
+    for words in (["-pc_type", "mg", "-ksp_type", "nosuch"], ["-options_file", "nosuch.txt"], ["-fp_trap"]):
+        left = subprocess.run(
+            [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out", *words],
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert left.returncode == 2, left.stderr
+        assert len(left.stderr.splitlines()) == 1, left.stderr
+        assert words[-1] in left.stderr
