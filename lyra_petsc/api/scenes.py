@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from lyra_petsc.errors import in_python
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.schema import Scene
@@ -33,7 +34,8 @@ def load(source: SceneLike | None = None, changes: Mapping[str, Any] | None = No
     InputError
         On anything that cannot be used, naming file and key.
     """
-    if isinstance(source, Mapping):
-        return scene_of(source, changes)
-    scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
-    return scene.changed(changes) if changes else scene
+    with in_python():
+        if isinstance(source, Mapping):
+            return scene_of(source, changes)
+        scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
+        return scene.changed(changes) if changes else scene
