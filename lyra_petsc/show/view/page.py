@@ -281,7 +281,8 @@ class Page:
         state = self._state
         asked = None
         try:
-            asked = ColourRange.parse(state.range) if (state.range or "").strip() else None
+            text = str(state.range or "").strip()
+            asked = ColourRange.parse(text) if text else None
             state.range_error = ""
         except InputError as error:
             state.range_error = error.message
