@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from lyra_petsc.api.runs import run
     from lyra_petsc.api.scenes import load
     from lyra_petsc.api.simulations import Simulation, Step
     from lyra_petsc.errors import InputError, LyraError, OutputError, SolverError
-    from lyra_petsc.output.read_run import Run
     from lyra_petsc.scene.schema import Scene
+    from lyra_petsc.show.notebook import Run, run
 
 __all__ = [
     "InputError",
@@ -43,12 +42,12 @@ _HOMES = {
     "LyraError": "errors",
     "OutputError": "errors",
     "SolverError": "errors",
-    "Run": "output.read_run",
+    "Run": "show.notebook",
     "Scene": "scene.schema",
     "Simulation": "api.simulations",
     "Step": "api.simulations",
     "load": "api.scenes",
-    "run": "api.runs",
+    "run": "show.notebook",
 }
 
 

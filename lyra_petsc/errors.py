@@ -7,7 +7,9 @@ them into one line on rank 0 and the exit code.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class LyraError(Exception):
@@ -16,6 +18,10 @@ class LyraError(Exception):
     exit_code = 1
     details: tuple[str, ...] = ()
     """Further lines for the user, below the one that says it."""
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython and Jupyter show instead of the whole traceback."""
+        return [f"{type(self).__name__}: {self}", *(f"  {detail}" for detail in self.details)]
 
 
 class InputError(LyraError):
@@ -82,6 +88,28 @@ class Interrupted(LyraError):
 
     def __reduce__(self) -> tuple[object, ...]:
         return (Interrupted, (str(self), self.signal_number))
+
+
+_FLAGS = {"force", "resume", "sheet", "handles", "wind", "cells"}
+_COMMAND = re.compile(r"--([a-z]+)\b")
+
+
+def _words(text: str) -> str:
+    return _COMMAND.sub(lambda found: f"{found[1]}={'True' * (found[1] in _FLAGS)}", text)
+
+
+@contextmanager
+def in_python() -> Iterator[None]:
+    """Within it errors speak of arguments, as of Python (``force=True``), not of options (``--force``)."""
+    try:
+        yield
+    except LyraError as error:
+        error.args = tuple(_words(part) if isinstance(part, str) else part for part in error.args)
+        error.details = tuple(map(_words, error.details))
+        if isinstance(error, InputError):
+            error.message = _words(error.message)
+            error.key = None if error.key is None else error.key.removeprefix("--")
+        raise
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

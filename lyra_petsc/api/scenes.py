@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from lyra_petsc.errors import in_python
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.schema import Scene
@@ -38,9 +39,10 @@ def load(
     InputError
         On anything that cannot be used, naming file and key.
     """
-    if isinstance(source, Mapping):
-        scene = scene_of(source, changes)
-    else:
-        scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
-        scene = scene.changed(changes) if changes else scene
-    return scene.trusting_meshes() if trust_mesh else scene
+    with in_python():
+        if isinstance(source, Mapping):
+            scene = scene_of(source, changes)
+        else:
+            scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
+            scene = scene.changed(changes) if changes else scene
+        return scene.trusting_meshes() if trust_mesh else scene

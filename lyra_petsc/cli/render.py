@@ -13,9 +13,6 @@ from lyra_petsc.cli.options import SETTINGS, example, helped, results
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
 
-PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
-"""What pictures need of the extra ``view``."""
-
 
 @click.command(
     context_settings=SETTINGS,
@@ -56,7 +53,7 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
     from lyra_petsc.parallel import on_root
     from lyra_petsc.show.render.opengl import share_cores
     from lyra_petsc.show.render.paraview_script import write_script
-    from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
+    from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 
     given = {name: value for name, value in chosen.items() if value is not None}
     options = RenderOptions(run, ground=not no_ground, label=not no_label, **given)

@@ -92,14 +92,19 @@ class Served:
 @click.command(context_settings=SETTINGS, epilog=example("lyra-petsc view runs/flag"))
 @helped
 @results
+@click.option("--field", metavar="NAME", help="Colour by speed, strain, displacement or a written field.")
+@click.option("--range", metavar="LOW,HIGH", help="Of the colours: values, or percentiles as 2%,98%.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="render.KEY=VALUE", help="Change the camera; may be repeated."
+)
 @where_served
 @click.pass_obj
-def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: bool) -> None:
+def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser: bool, **look: Any) -> None:
     """Play RUN, a folder of results, in the browser; follow it if it goes on."""
     problem: LyraError | None = None
     if comm.rank == 0:
         try:
-            _serve(run, Served.of(host, port, no_browser))
+            _serve(run, Served.of(host, port, no_browser), look)
         except LyraError as error:
             problem = error
     request = comm.Ibarrier()
@@ -108,7 +113,7 @@ def view(comm: Any, run: Path, host: str | None, port: int | None, no_browser: b
     raise_together(comm, problem)
 
 
-def _serve(folder: Path, served: Served) -> None:
+def _serve(folder: Path, served: Served, look: dict[str, Any]) -> None:
     """Serve until a signal."""
     served.check("view")
     from lyra_petsc.show.view.server import find_run, serve
@@ -117,6 +122,6 @@ def _serve(folder: Path, served: Served) -> None:
         served.announce(url, click.echo)
         click.echo("Ctrl-C ends")
 
-    number = asyncio.run(serve(find_run(folder), served.host, served.port, ready))
+    number = asyncio.run(serve(find_run(folder), served.host, served.port, ready, **look))
     if number not in (0, signal.SIGINT):  # Ctrl-C is how a page ends
         raise Interrupted(f"ended by {signal.Signals(number).name}", number)

@@ -23,6 +23,9 @@ from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 Array = NDArray[np.float64]
 
+PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
+"""What pictures need of the extra ``view``."""
+
 SIZE = "1280x720"
 SMALLEST, LARGEST = 32, 8192
 """Pixels."""

@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 BACKGROUND = (0.955, 0.96, 0.97)
 PLAIN = (0.77, 0.34, 0.28)
 EDGES = (0.15, 0.15, 0.18)
+HELD, WIND, MARK = (0.19, 0.2, 0.23), (0.43, 0.56, 0.68), (0.9, 0.0, 0.5)
 
 
 class Cloth:
@@ -54,8 +55,47 @@ class Cloth:
         self._renderer = vtkRenderer()
         self._renderer.SetBackground(*BACKGROUND)
         self._renderer.AddActor(actor)
+        self._held, self._wind, self._mark = (self._add(color) for color in (HELD, WIND, MARK))
         self.window = vtkRenderWindow()
         self.window.AddRenderer(self._renderer)
+
+    def _add(self, color: tuple[float, float, float]) -> vtkPolyData:
+        """Points and lines of one colour; empty."""
+        data, mapper, actor = vtkPolyData(), vtkPolyDataMapper(), vtkActor()
+        data.SetPoints(vtkPoints())
+        mapper.SetInputData(data)
+        actor.SetMapper(mapper)
+        look = actor.GetProperty()
+        look.SetColor(*color)
+        look.SetLighting(False)
+        look.SetPointSize(9.0)
+        look.SetLineWidth(4.0)
+        self._renderer.AddActor(actor)
+        return data
+
+    def show_held(self, positions: Array, edges: NDArray[np.int64]) -> None:
+        """Show held vertices (n, 3) [m] and the edges (k, 2) between them; none to hide them."""
+        _put(self._held, positions, edges)
+
+    def show_wind(self, feet: Array, arrow: Array) -> None:
+        """Show arrows (3,) from feet (n, 3), both [m]; none to hide them."""
+        across = np.cross(arrow, [0.3, 0.5, 0.8])
+        across *= 0.1 * np.linalg.norm(arrow) / max(float(np.linalg.norm(across)), 1e-300)
+        heads = feet + arrow
+        barbs = [heads - 0.25 * arrow + side for side in (across, -across)]
+        n = np.arange(len(feet))
+        ends = [np.column_stack([i * len(feet) + n, len(feet) + n]) for i in (0, 2, 3)]
+        _put(self._wind, np.concatenate([feet, heads, *barbs]), np.concatenate(ends), points=False)
+
+    def mark(self, vertex: int | None) -> None:
+        """Mark a vertex of the state shown by a pin through it, which is seen from both sides; or none."""
+        if vertex is None:
+            _put(self._mark, np.empty((0, 3)), np.empty((0, 2), dtype=np.int64))
+            return
+        size = np.linalg.norm(self._positions.max(axis=0) - self._positions.min(axis=0))
+        pin = 0.02 * size * self._normals[vertex]
+        ends = self._positions[vertex] + np.array([pin, -pin])
+        _put(self._mark, ends, np.array([[0, 1]]))
 
     def set_mesh(self, triangles: NDArray[np.int64]) -> None:
         """Replace the triangles; the vertices have no positions until the next `show`."""
@@ -81,7 +121,8 @@ class Cloth:
         data, vertices, cells = self._data, self._data.GetPointData(), self._data.GetCellData()
         data.GetPoints().SetData(_as_vtk(positions.astype(np.float32)))
         data.GetPoints().Modified()
-        normals = _as_vtk(vertex_normals(positions, self._triangles).astype(np.float32))
+        self._positions, self._normals = positions, vertex_normals(positions, self._triangles)
+        normals = _as_vtk(self._normals.astype(np.float32))
         normals.SetName("Normals")
         vertices.SetNormals(normals)
         vertices.SetScalars(None)
@@ -109,6 +150,19 @@ class Cloth:
         camera.SetFocalPoint(*view.target)
         camera.SetViewUp(*view.up)
         camera.SetViewAngle(view.angle)
+
+
+def _put(data: vtkPolyData, places: Array, edges: NDArray[np.int64], *, points: bool = True) -> None:
+    """Replace the points and lines of a mesh."""
+    data.GetPoints().SetData(_as_vtk(places.astype(np.float32).reshape(-1, 3)))
+    data.GetPoints().Modified()
+    single = np.arange(len(places) if points else 0, dtype=np.int64)
+    for size, cells, put in ((1, single, data.SetVerts), (2, edges.astype(np.int64), data.SetLines)):
+        made = vtkCellArray()
+        if len(cells):
+            made.SetData(size, _as_vtk(cells.ravel()))
+        put(made)
+    data.Modified()
 
 
 def _as_vtk(values: NDArray[Any]) -> Any:

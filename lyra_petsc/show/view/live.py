@@ -22,11 +22,11 @@ from lyra_petsc.errors import LyraError
 READY, FAILED = "ready ", "failed "
 """Beginnings of that line."""
 
-NICENESS = 15
-"""On Linux 36 / (1024 + 36) = 3.4 % of a processor's time beside a busy rank, all of it on an idle one."""
+NICENESS = 10
+"""On Linux 110 / (1024 + 110) = 10 % of a processor's time beside a busy rank, all of it on an idle one.
 
-NICENESS_AT_START = 10
-"""Until the page is there: 10 % of the time, for work of a second that falls mostly into the set-up."""
+It takes that only while a page is loaded; of less, the megabytes of the page take minutes.
+"""
 
 
 class LivePage:
@@ -86,7 +86,7 @@ class LivePage:
 
 def main(host: str, port: int) -> None:
     """Serve the page of the run whose folder is the first line of the standard input."""
-    _lower_priority(NICENESS_AT_START)
+    _lower_priority(NICENESS)
     # the imports take a second, in which the run sets itself up
     from lyra_petsc.show.view.server import LONGEST_STAY, find_run, serve
 
@@ -108,7 +108,6 @@ def main(host: str, port: int) -> None:
         )
 
     def ready(url: str) -> None:
-        _lower_priority(NICENESS)
         tell(READY + url)
 
     try:

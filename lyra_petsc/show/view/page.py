@@ -6,38 +6,60 @@ import asyncio
 import math
 import time as clock
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from trame.app import get_server
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html, plotly, vtk
 from trame.widgets import vuetify3 as v
+from trame_vtk.modules.vtk.serializers import SynchronizationContext
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import Run, read_history
 from lyra_petsc.output.run_folder import in_use
 from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
+from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
+from lyra_petsc.show.render.render_plan import scene_shown
+from lyra_petsc.show.render.scene_drawing import Bounds, wind_arrows
+from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
 from lyra_petsc.show.view.access import Access
 from lyra_petsc.show.view.cloth import Cloth
 
-STYLE = Path(__file__).with_name("style.css")
+Array = NDArray[np.float64]
 
-LONGEST_DRAWING = 2.0
-"""Seconds after which the next state is sent although no page has reported that it drew the last one."""
+STYLE, SCRIPT = (Path(__file__).with_name(name) for name in ("style.css", "keys.js"))
+MOVED = 5.0
+"""Pixels from which on the mouse was drawn, not clicked."""
+
+SLOW_DRAWING = 2.0
+"""Seconds without a report that the last state was drawn after which the page says that it waits."""
+LONGEST_DRAWING = 30.0
+"""Seconds after which the next state is sent all the same: who waits shows the last one that is whole."""
+
+ARRAY_BYTES = 256 * 2**20
+"""Of arrays that were sent and are kept for pages that are late to fetch them."""
+ARRAY_SECONDS = 20.0
+"""Age below which they are kept in any case."""
 
 POLLING_SHARE = 0.02
-"""Share of its time that this process spends looking for new states."""
-POLL_SECONDS = 0.5
-"""Least time between two such looks."""
+"""Share of a processor's time that looking for new states takes."""
+POLL_SECONDS, LONGEST_POLL = 0.5, 5.0
+"""Least and longest time between two such looks."""
+LATE = 5.0
+"""Seconds without a new state after which the page says that it waits for the run."""
 
 MARK_SECONDS = 0.25
 """Seconds between two moves of the plots' time marks while it plays."""
 
 PLAIN = "none"
 """Choice of a quantity: the cloth in one colour."""
+AUTOMATIC = "automatic"
+"""Choice of a colour map: what suits the quantity."""
 
 MOTION_STATES = 24
 """States to which the camera is fitted."""
@@ -45,6 +67,41 @@ SIGHT_STATES = 6
 """States from which its direction is chosen."""
 FIRST_ASPECT = 1.6
 """Width of the picture over its height until the page reports its size."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a page is to show the run at first.
+
+    Attributes
+    ----------
+    field : str or None
+        The quantity of the colours.
+    range : str or None
+        Their range, as of ``render --range``.
+    settings : tuple of str
+        Changes of the scene's camera, as of ``render --set``.
+    """
+
+    field: str | None = None
+    range: str | None = None
+    settings: tuple[str, ...] = ()
+
+    def check(self, run: Run) -> None:
+        """Check that the run can be shown so.
+
+        Raises
+        ------
+        InputError
+        """
+        scene_shown(run, self.settings)
+        if self.field is not None:
+            quantity(run, self.field)
+        if self.range is not None:
+            ColourRange.parse(self.range)
+
+
+AS_USUAL = Look()
 
 
 class Page:
@@ -55,6 +112,7 @@ class Page:
     run : Run
     access : Access
         Counts the open pages.
+    look : Look
 
     Attributes
     ----------
@@ -62,8 +120,9 @@ class Page:
     cloth : Cloth
     """
 
-    def __init__(self, run: Run, access: Access) -> None:
-        self._run, self._access = run, access
+    def __init__(self, run: Run, access: Access, look: Look = AS_USUAL) -> None:
+        self._run, self._access, self._asked = run, access, look
+        SynchronizationContext.check_for_arrays_to_release = release_oldest
         self.server = get_server("lyra-petsc")
         self._state = state = self.server.state
         self._triangles = run.triangles
@@ -75,6 +134,12 @@ class Page:
         self._drawn = asyncio.Event()
         self._shown = -1
         self._marked = 0.0
+        self._news = clock.monotonic()
+        self._probe: content.Probe | None = None
+        self._pressed: tuple[float, float] | None = None
+        self._positions = run.positions[0]
+        self._held: HeldVertices | None = None
+        self._find_handles()
         self._unit = "" if run.scene.time.analysis == "static" else "s"
         self._figures: dict[str, dict[str, Any]] = {}
         self._fill()
@@ -84,6 +149,8 @@ class Page:
         state.change("quantity")(self._quantity_changed)
         state.change("speed")(self._speed_changed)
         state.change("edges")(self._edges_changed)
+        state.change("range", "map")(self._colours_changed)
+        state.change("around")(self._around_changed)
         state.change("size")(self._size_changed)
 
     def _fill(self) -> None:
@@ -92,10 +159,14 @@ class Page:
         state.trame__title = f"{run.name} – lyra_petsc"
         state.title = run.scene.title or run.name
         state.status, state.notice, state.farewell = self._outcome(), "", ""
+        state.waiting, state.picked = "", []
+        state.range, state.range_error = self._asked.range or "", ""
+        state.map, state.maps = AUTOMATIC, [AUTOMATIC, *content.MAPS]
+        state.around = True
         state.frame, state.last = player.shown, player.last
         state.playing, state.edges = False, False
         state.clock, state.bar = "", None
-        state.quantity = "speed"
+        state.quantity = self._asked.field or "speed"
         unit = "×" if self._unit else "/s"
         state.speeds = [
             {"title": f"{factor * player.speed:g} {unit}", "value": factor * player.speed}
@@ -120,6 +191,9 @@ class Page:
         if outcome == "running" and not in_use(self._run.folder):
             outcome = "broken off"
         words = [f"{len(self._run.rest):,} vertices", f"{len(self._run)} states"]
+        late = clock.monotonic() - self._news
+        if outcome == "running" and late > LATE:
+            outcome = f"running, the next state awaited for {late:.0f} s"
         if ranks:
             words.append(f"{ranks} rank{'s' * (ranks != 1)}")
         return " · ".join([*words, outcome] if outcome else words)
@@ -157,6 +231,33 @@ class Page:
 
     def _edges_changed(self, edges: Any, **_: Any) -> None:
         self.cloth.show_edges(bool(edges))
+        self._choose(self._state.quantity)  # where triangles are seen, each has its own value
+        self._again()
+
+    def _colours_changed(self, **_: Any) -> None:
+        self._choose(self._state.quantity)
+        self._again()
+
+    def _around_changed(self, **_: Any) -> None:
+        self._show_wind()
+        self._again()
+
+    def press(self, event: Any) -> None:
+        """Called where the left button goes down on the cloth."""
+        self._pressed = _place(event, "position")
+
+    def pick(self, event: Any) -> None:
+        """Show the values at the vertex nearest to a click; a click beside the cloth ends that."""
+        at = _place(event, "displayPosition")
+        moved = self._pressed is not None and at is not None and math.dist(at, self._pressed) > MOVED
+        place = event.get("worldPosition") if isinstance(event, dict) else None
+        if moved:  # the camera, not a click
+            return
+        self._probe = None
+        if isinstance(place, list) and len(place) == 3 and all(isinstance(x, int | float) for x in place):
+            nearest = np.linalg.norm(self._positions - np.array(place), axis=1).argmin()
+            with suppress(LyraError):
+                self._probe = content.Probe(self._run, int(nearest))
         self._again()
 
     def _again(self) -> None:
@@ -177,8 +278,20 @@ class Page:
                 self.fit()
 
     def _choose(self, name: Any) -> None:
+        state = self._state
+        asked = None
         try:
-            self._palette = content.Palette(self._run, name) if name in content.names(self._run) else None
+            text = str(state.range or "").strip()
+            asked = ColourRange.parse(text) if text else None
+            state.range_error = ""
+        except InputError as error:
+            state.range_error = error.message
+        colour_map = state.map if state.map in content.MAPS else ""
+        try:
+            self._palette = None
+            if name in content.names(self._run):
+                cells = bool(state.edges)
+                self._palette = content.Palette(self._run, name, asked, colour_map, cells=cells)
         except LyraError as error:
             self._palette = None
             self._state.notice = str(error)
@@ -199,6 +312,8 @@ class Page:
             state.notice = str(error)
         else:
             self.cloth.show(positions, colours, on_triangles=on_triangles)
+            self._positions = positions
+            self._show_around(index)
         state.bar = self._palette.bar() if self._palette else None
         state.frame, state.playing = index, self._player.playing
         name, end = ("t", f" of {run.times[-1]:.4g} {self._unit}") if self._unit else ("load", "")
@@ -206,14 +321,52 @@ class Page:
         if not self._player.playing or clock.monotonic() - self._marked > MARK_SECONDS:
             self._mark()
 
+    def _show_around(self, index: int) -> None:
+        """Show what is held, and the vertex that was picked."""
+        x, probe = self._positions, self._probe
+        held, edges = np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+        if self._held is not None and self._state.around:
+            held, edges = self._held.at(float(self._run.times[index]))
+        self.cloth.show_held(x[held], np.searchsorted(held, edges))
+        if probe is not None and probe.vertex < len(x):
+            only = self._state.quantity if self._player.playing else ""
+            self._state.picked = probe.values(index, x[probe.vertex], only)
+            self.cloth.mark(probe.vertex)
+        else:
+            self._state.picked = []
+            self.cloth.mark(None)
+
+    def _find_handles(self) -> None:
+        self._held = None
+        with suppress(LyraError):  # then without them
+            self._held = HeldVertices(self._run) if self._run.scene.handles else None
+
+    def _show_wind(self) -> Array:
+        """Show arrows along the wind, or hide them; (n, 3) where they begin and end [m]."""
+        wind, feet, arrow = self._run.scene.wind, np.empty((0, 3)), np.zeros(3)
+        if wind is not None and any(wind.velocity) and self._state.around:
+            feet, arrow = wind_arrows(self._bounds, np.array(wind.velocity))
+        self.cloth.show_wind(feet, arrow)
+        return np.concatenate([feet, feet + arrow])
+
     def _look_at_all(self) -> None:
         """Move the camera to where `render` would put it."""
         run = self._run
-        up = upwards(run.scene)
+        scene = scene_shown(run, self._asked.settings)
+        up = upwards(scene)
         shapes = (run.positions[i] for i in content.sample(len(run), SIGHT_STATES))
-        fit = Fit(run.scene, line_of_sight(run.scene, up, shapes, run.triangles), up, self._aspect)
+        fit = Fit(scene, line_of_sight(scene, up, shapes, run.triangles), up, self._aspect)
+        axes = Bounds.axes_of(up)
+        normals = np.concatenate([fit.normals, axes, -axes])
         motion = (run.positions[i] for i in content.sample(len(run), MOTION_STATES))
-        self.cloth.look_from(fit.view(np.max([(x @ fit.normals.T).max(axis=0) for x in motion], axis=0)))
+        reaches = np.array([(x @ normals.T).max(axis=0) for x in motion])
+        n, whole = len(fit.normals), reaches.max(axis=0)
+        self._bounds = Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
+        reach = fit.most(reaches[:, :n])
+        arrows = self._show_wind()
+        if len(arrows):
+            reach = np.maximum(reach, (arrows @ fit.normals.T).max(axis=0))
+        self.cloth.look_from(fit.view(reach))
 
     def _draw_plots(self) -> None:
         history = read_history(self._run.folder)
@@ -242,21 +395,34 @@ class Page:
             with self._state:
                 self._show()
             self._view.update()
-            await _wait(self._drawn, LONGEST_DRAWING if self._access.watching else 0.0)
+            await self._wait_for_pages()
+
+    async def _wait_for_pages(self) -> None:
+        """Wait until a page has drawn the state, so that none falls behind; say so where that takes long."""
+        if not self._access.watching or await _wait(self._drawn, SLOW_DRAWING):
+            return
+        with self._state as state:
+            state.waiting = "waiting for the browser to draw the state"
+        await _wait(self._drawn, LONGEST_DRAWING)
+        with self._state as state:
+            state.waiting = ""
 
     async def follow(self) -> None:
         """Look for new states of the run while a page is open; does not end."""
         while True:
-            began = clock.monotonic()
+            # of the processor: beside busy ranks much more time passes
+            began = clock.process_time()
             if self._access.watching:
                 self.look()
-            await asyncio.sleep(max(POLL_SECONDS, (clock.monotonic() - began) / POLLING_SHARE))
+            pause = (clock.process_time() - began) / POLLING_SHARE
+            await asyncio.sleep(min(max(POLL_SECONDS, pause), LONGEST_POLL))
 
     def look(self) -> None:
         """Show what the run has written meanwhile."""
         with self._state as state:
             try:
                 if self._player.follow():
+                    self._news = clock.monotonic()
                     self._renew()
                     state.last, state.notice = self._player.last, ""
                 state.status = self._outcome()
@@ -268,6 +434,8 @@ class Page:
         if self._run.triangles is not self._triangles:
             self._triangles = self._run.triangles
             self.cloth.set_mesh(self._triangles)
+            self._probe = None
+            self._find_handles()
             self._offer_quantities()
             self.fit()
             self._again()
@@ -282,15 +450,41 @@ class Page:
             state.farewell = words
 
 
-async def _wait(event: asyncio.Event, seconds: float) -> None:
+async def _wait(event: asyncio.Event, seconds: float) -> bool:
     with suppress(asyncio.TimeoutError):
         await asyncio.wait_for(event.wait(), None if math.isinf(seconds) else seconds)
+        return True
+    return False
+
+
+def _place(event: Any, name: str) -> tuple[float, float] | None:
+    """Pixels of an event of the page, if it has them."""
+    try:
+        at = event[name]
+        x, y = (at["x"], at["y"]) if isinstance(at, dict) else at[:2]
+        return float(x), float(y)
+    except (TypeError, KeyError, IndexError, ValueError):
+        return None
+
+
+def release_oldest(context: Any, *_: Any) -> None:
+    """Forget the oldest arrays that were sent, beyond what may be kept.
+
+    trame forgets them after 20 s. On a busy machine pages fetch them later, and would show nothing then.
+    """
+    kept, now = 0, clock.time()
+    for name, record in sorted(context.data_array_cache.items(), key=lambda item: -item[1]["ts"]):
+        array = record["array"]
+        kept += 1024 * array.GetActualMemorySize()
+        if kept > ARRAY_BYTES and array.GetReferenceCount() == 1 and now - record["ts"] > ARRAY_SECONDS:
+            del context.data_array_cache[name]
 
 
 def _lay_out(page: Page) -> Any:
     """Create the page's elements and bind them to its variables; returns trame's view of the cloth."""
     with VAppLayout(page.server):
         client.Style(STYLE.read_text(encoding="utf-8"))
+        client.Script(SCRIPT.read_text(encoding="utf-8"))
         with html.Div(classes="page"):
             _top(page)
             with html.Div(classes="cloth", id="cloth"):
@@ -298,8 +492,18 @@ def _lay_out(page: Page) -> Any:
                 with html.Div(classes="picture"):
                     client.SizeObserver("size", style="position: absolute; inset: 0; z-index: -1")
                     view = vtk.VtkLocalView(
-                        page.cloth.window, ref="cloth", after_scene_loaded=(page.drawn, "[]")
+                        page.cloth.window,
+                        ref="cloth",
+                        after_scene_loaded=(page.drawn, "[]"),
+                        picking_modes=("['click']",),
+                        click=(page.pick, "[$event]"),
+                        interactor_events=("['LeftButtonPress']",),
+                        LeftButtonPress=(page.press, "[utils.vtk.event($event)]"),
+                        on_image_capture="utils.download(title + '.png', $event, 'image/png')",
                     )
+                with html.Div(v_if="picked.length", classes="picked", id="picked"):
+                    html.Div("{{ line.name }}: {{ line.value }}", v_for="(line, i) in picked", key="i")
+                html.Div("{{ waiting }}", v_if="waiting", classes="waiting", id="waiting")
                 html.Div("{{ notice || farewell }}", v_if="notice || farewell", classes="notice", id="notice")
             with html.Div(classes="plots"):
                 for name in ("energies", "iterations"):
@@ -322,13 +526,17 @@ def _top(page: Page) -> None:
         _choice("quantity", "quantities", "colour", "choice")
         _choice("speed", "speeds", "speed", "pace")
         _button("mdi-grid", "edges", "show the triangles", click="edges = !edges")
+        _button("mdi-pin-outline", "around", "show handles and wind", click="around = !around")
+        _button("mdi-camera", "shot", "save the picture", click="trame.refs.cloth.captureImage()")
         _button("mdi-fit-to-screen-outline", "fit", "show the whole motion", click=page.fit)
 
 
 def _bottom(page: Page) -> None:
     with html.Div(classes="time"):
         _button("mdi-skip-previous", "first", "first state", click="frame = 0")
+        _button("mdi-chevron-left", "back", "state before", click="frame = Math.max(frame - 1, 0)")
         _button(("playing ? 'mdi-pause' : 'mdi-play'",), "play", "play or pause", click=page.play_or_pause)
+        _button("mdi-chevron-right", "next", "next state", click="frame = Math.min(frame + 1, last)")
         _button("mdi-skip-next", "last", "newest state", click="frame = last")
         v.VSlider(
             v_model=("frame",),
@@ -368,3 +576,16 @@ def _colours() -> None:
             html.Div(classes="shades", style=("{ '--shades': bar.shades }",))
             with html.Div(classes="ticks"):
                 html.Div("{{ tick }}", v_for="(tick, i) in bar.ticks", key="i")
+        v.VTextField(
+            v_model=("range",),
+            label="range",
+            placeholder="0,5 or 2%,98%",
+            id="range",
+            title=("range_error || 'two values, or percentiles of the whole run; empty: automatic'",),
+            error=("!!range_error",),
+            classes="setting",
+            density="compact",
+            hide_details=True,
+            variant="outlined",
+        )
+        _choice("map", "maps", "map", "setting")

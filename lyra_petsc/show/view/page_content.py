@@ -79,7 +79,7 @@ class Player:
         """Play from the state shown, or from the first one if that is the last."""
         if self.shown >= self.last:
             self.shown = 0
-        self.playing = True
+        self.playing = self.shown < self.last  # a single state does not play
         self._restart()
 
     def pause(self) -> None:
@@ -149,6 +149,30 @@ def names(run: Run) -> list[str]:
     """Names of the quantities by which a run's states can be coloured."""
     derived = [name for name in DERIVED if name != "speed" or "velocity" in run.fields]
     return derived + [name for name in run.fields if name != "velocity"]
+
+
+class Probe:
+    """The values of all quantities at a vertex.
+
+    Parameters
+    ----------
+    run : Run
+    vertex : int
+        Its number in the mesh file, from 0.
+    """
+
+    def __init__(self, run: Run, vertex: int) -> None:
+        self._run, self.vertex = run, vertex
+        self._quantities = {name: quantity(run, name).on_vertices(run) for name in names(run)}
+
+    def values(self, state: int, place: NDArray[np.float64], only: str = "") -> list[dict[str, str]]:
+        """Names and values with units in a state; ``place`` (3,) [m]; of one quantity alone if ``only``."""
+        numbers = ", ".join(f"{x:.5g}" for x in place)
+        found = [{"name": f"vertex {self.vertex}", "value": f"({numbers}) m"}]
+        for name, shown in self._quantities.items():
+            if only in ("", name) and not shown.on_triangles:
+                found.append({"name": shown.label, "value": f"{float(shown.values(state)[self.vertex]):.5g}"})
+        return found
 
 
 class Palette:

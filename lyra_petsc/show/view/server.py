@@ -58,7 +58,12 @@ def _refusal(host: str, port: int, error: BaseException) -> InputError:
 
 
 async def serve(
-    run: Run, host: str, port: int, ready: Callable[[str], None], ended: Callable[[], str] | None = None
+    run: Run,
+    host: str,
+    port: int,
+    ready: Callable[[str], None],
+    ended: Callable[[], str] | None = None,
+    **look: Any,
 ) -> int:
     """Serve the page of a run until a signal, or until the run has ended and no page is open.
 
@@ -73,6 +78,8 @@ async def serve(
         Called with the page's address once it can be opened.
     ended : callable, optional
         Called in a thread; returns when the run has ended, with a text for the page.
+    **look
+        Of `Look`: how the page shows the run at first.
 
     Returns
     -------
@@ -82,14 +89,16 @@ async def serve(
     Raises
     ------
     InputError
-        If it cannot listen there.
+        If it cannot listen there, or the run cannot be shown so.
     """
     os.environ["WSLINK_READY_MSG"] = ""  # else it writes to our stdout
-    from lyra_petsc.show.view.page import Page
+    from lyra_petsc.show.view.page import Look, Page
 
+    asked = Look(**look)
+    asked.check(run)
     token = secrets.token_urlsafe(24)
     access = Access(token, host)
-    page = Page(run, access)
+    page = Page(run, access, asked)
     server = page.server
     web: list[Any] = []
 

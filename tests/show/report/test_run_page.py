@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
 
 from launch import SCENE, done, finish, lyra, start, without_pictures, write_scene
 
-from lyra_petsc.cli.report import write_page
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.show.report.page_file import write_page
 from lyra_petsc.show.report.run_advice import OPTIONS, advice
 from lyra_petsc.show.report.run_facts import Facts
 
@@ -77,7 +77,7 @@ def test_the_page_does_without_what_draws_films(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = copied(finished, tmp_path)
-    monkeypatch.setattr("lyra_petsc.cli.render.PACKAGES", ("no_such_package",))
+    monkeypatch.setattr("lyra_petsc.show.report.page_file.PACKAGES", ("no_such_package",))
     write_page(run, None)
     page = (run / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/svg+xml") == 3 + 2 + 1 + 1

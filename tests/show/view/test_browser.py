@@ -163,6 +163,68 @@ def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
     assert seen.asked_elsewhere(page.url) == []
 
 
+def test_hand_and_eye(serve, browser, tmp_path):
+    """Keys, a vertex picked, range and map of the colours, handles and wind, the picture saved."""
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    run = written(tmp_path / "run", states=9)
+    scene = (run / "scene.yaml").read_text(encoding="utf-8").replace("handles: []\n", "")
+    more = "handles: [{nodes: [0, 2]}]\nwind: {velocity: [1, 0, 0], density: 1}\n"
+    (run / "scene.yaml").write_text(scene + more, encoding="utf-8")
+    level = ["render.camera.position=[1.5,1.5,12]", "render.camera.target=[1.5,1.5,0]"]
+    settings = [word for text in level for word in ("--set", text)]
+    page = serve(run, "--field", "stress", "--range", "0,4", *settings)
+    seen = Seen(browser, page.url)
+    ticks = seen.text("colours").split("\n")
+    assert ticks[:6] == ["largest principal stress [N/m]", "4", "3", "2", "1", "0"]
+
+    def press(*keys):
+        ActionChains(browser).send_keys(*keys).perform()
+
+    press(Keys.HOME)
+    seen.until(lambda: seen.time() == 0.0)
+    press(Keys.ARROW_RIGHT)
+    seen.until(lambda: seen.time() == pytest.approx(0.1))
+    press(Keys.ARROW_RIGHT, Keys.ARROW_LEFT)
+    seen.until(lambda: seen.time() == pytest.approx(0.1))
+    press(Keys.END)
+    seen.until(lambda: seen.time() == pytest.approx(0.8))
+    press(" ")  # at the last state: from the first one on
+    seen.until(lambda: seen.time() < 0.7)
+    seen.until(lambda: seen.time() == pytest.approx(0.8))
+
+    # the ring's hole is in the middle: nothing is picked there, at its side a vertex is
+    (canvas,) = seen.elements(".picture canvas")
+    aside = canvas.size["width"] // 2 - canvas.size["height"] // 2
+    step = canvas.size["height"] // 5
+    assert aside > 0
+    ActionChains(browser).move_to_element_with_offset(canvas, -step, 0).click().perform()
+    seen.until(lambda: "vertex " in seen.text("picked"))
+    assert "stress [N/m]: " in seen.text("picked")
+    assert " m\n" in seen.text("picked")
+    ActionChains(browser).move_to_element(canvas).click().perform()
+    seen.until(lambda: not seen.text("picked"))
+
+    before = seen.picture()
+    seen.element("around").click()
+    seen.until_drawn(before)
+    before = seen.picture()
+    seen.choose("map", "gray")
+    seen.until_drawn(before)
+    field = seen.element("range")
+    field.send_keys(Keys.CONTROL, "a")
+    field.send_keys("0%,100%")
+    seen.until(lambda: seen.text("colours").split("\n")[1] not in ("", "4"))
+
+    browser.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path / "saved")}
+    )
+    seen.element("shot").click()
+    seen.until(lambda: list((tmp_path / "saved").glob("*.png")))
+    assert seen.complaints() == []
+
+
 def test_a_run_that_goes_on_is_followed(serve, browser, tmp_path):
     writer = Writer(tmp_path / "run")
     writer.write()

@@ -1,0 +1,260 @@
+"""Runs as notebooks and scripts use them: progress while they go on, pictures, films and the page inline."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lyra_petsc.errors import LyraError, in_python
+from lyra_petsc.extras import require
+from lyra_petsc.output import read_run
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from lyra_petsc.api.runs import OnStep
+    from lyra_petsc.api.scenes import SceneLike
+    from lyra_petsc.stepping.simulation import StepReport
+
+SIZE = "640x360"
+"""Pixels of pictures and films."""
+REDRAW_SECONDS = 0.3
+TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
+
+
+class Media:
+    """A picture, a film or a page, which notebooks show inline.
+
+    Attributes
+    ----------
+    data : bytes
+        Of the file.
+    kind : str
+        Its MIME type.
+    """
+
+    def __init__(self, data: bytes, kind: str) -> None:
+        self.data, self.kind = data, kind
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write it to a file."""
+        Path(path).write_bytes(self.data)
+        return Path(path)
+
+    def _repr_png_(self) -> bytes | None:
+        return self.data if self.kind == "image/png" else None
+
+    def _repr_html_(self) -> str | None:
+        if self.kind == "image/png":
+            return None
+        if self.kind == "text/html":
+            page = html.escape(self.data.decode())
+            return f'<iframe srcdoc="{page}" width="100%" height="640" style="border: 0"></iframe>'
+        source = f"data:{self.kind};base64,{base64.b64encode(self.data).decode()}"
+        if self.kind == "image/gif":
+            return f'<img src="{source}">'
+        return f'<video controls loop autoplay muted src="{source}"></video>'
+
+    def __repr__(self) -> str:
+        return f"<{self.kind}, {len(self.data)} bytes>"
+
+
+class Run(read_run.Run):
+    """The results of a run; reads what was asked for and keeps no file open.
+
+    Parameters
+    ----------
+    folder : path
+
+    Raises
+    ------
+    InputError
+        If there is no run, or nothing of it can be read yet.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        with in_python():
+            super().__init__(folder)
+
+    def render(self, at: float | None = None, *, film: bool | str = False, **options: Any) -> Media:
+        """A picture or a film, as of the command ``render``; not collective.
+
+        Parameters
+        ----------
+        at : float, optional
+            Time of the picture [s]; the last state without it.
+        film : bool or str
+            A film of the whole run instead: True for mp4, or ``"gif"``, ``"webm"``.
+        **options
+            ``field``, ``range``, ``size``, ``fps``, ``speed``, ``texture``, ``colors``, ``handles``,
+            ``wind``, ``cells``, ``ground``, ``label``, ``settings``: as of the command.
+
+        Returns
+        -------
+        Media
+            Shown inline by notebooks; ``save(path)`` writes it.
+
+        Raises
+        ------
+        InputError
+            For what cannot be drawn, or packages that are missing.
+        TypeError
+            For an option that there is none of.
+        """
+        with in_python():
+            from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
+
+            require("render", PACKAGES, "view")
+            from mpi4py import MPI
+
+            from lyra_petsc.show.render.draw import draw
+
+            with tempfile.TemporaryDirectory() as folder:
+                ending = film if isinstance(film, str) else "mp4"
+                asked: dict[str, Any] = {"out": Path(folder), "size": SIZE, **options}
+                if film:
+                    asked["film"] = Path(folder) / f"film.{ending.lstrip('.')}"
+                else:
+                    asked["at"] = repr(float(self.times[-1] if at is None else at))
+                if isinstance(asked.get("range"), tuple | list):
+                    asked["range"] = ",".join(map(str, asked["range"]))
+                (path,) = draw(
+                    MPI.COMM_SELF, make_plan(RenderOptions(self.folder, **asked)), lambda done, count: None
+                )
+                return Media(path.read_bytes(), TYPES[path.suffix.lower()])
+
+    def report(self, out: str | os.PathLike[str] | None = None) -> Media:
+        """The page about the run, as of the command ``report``; written to ``out`` or the run's folder.
+
+        Raises
+        ------
+        InputError, OutputError
+            If it cannot be made or written.
+        """
+        with in_python():
+            require("report", ("matplotlib", "jinja2"))
+            from lyra_petsc.show.report.page_file import write_page
+
+            path = write_page(self.folder, None if out is None else Path(out))
+            return Media(path.read_bytes(), "text/html")
+
+
+def run(
+    scene: SceneLike,
+    out: str | os.PathLike[str] | None = None,
+    *,
+    force: bool = False,
+    resume: bool = False,
+    on_step: OnStep | None = None,
+    comm: MPI.Comm | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Simulate a scene and write its results, as the command ``run`` does; collective.
+
+    An interrupt (the stop button of a notebook, Ctrl-C) lets the step end, writes a checkpoint and raises
+    KeyboardInterrupt; ``resume=True`` goes on from there.
+
+    Parameters
+    ----------
+    scene : Scene, path or mapping
+    out : path, optional
+        Folder of the results; else ``runs/<scene file stem>``, or ``…-2``, ``…-3`` when that exists.
+    force : bool
+        Replace the results in ``out``.
+    resume : bool
+        Go on from the newest checkpoint.
+    on_step : callable, optional
+        Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
+    comm : MPI.Comm, optional
+        COMM_WORLD unless given.
+    progress : bool, optional
+        Show how far it is in the notebook; without it where there is one.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    InputError
+        Bad input; nothing is written.
+    SolverError, OutputError
+        The run could not go on; what was written stands.
+    """
+    from lyra_petsc.api.runs import run as simulate
+    from lyra_petsc.api.scenes import load
+
+    with in_python():
+        bar = None
+        if in_notebook() if progress is None else progress:
+            scene = load(scene)
+            bar = NotebookProgress(scene.time.end if scene.time.analysis != "static" else 1.0)
+
+        def step(report: StepReport) -> None:
+            if bar is not None:
+                bar.update(report.step, report.time)
+            if on_step is not None:
+                on_step(report)
+
+        try:
+            done = simulate(scene, out, force=force, resume=resume, on_step=step, comm=comm)
+        except (LyraError, KeyboardInterrupt):
+            if bar is not None:
+                bar.end("stopped")
+            raise
+        if bar is not None:
+            bar.end(f"done: {done.folder}")
+        return Run(done.folder)
+
+
+def in_notebook() -> bool:
+    """Whether this is a notebook's kernel (and rank 0 of it)."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return type(shell).__name__ == "ZMQInteractiveShell"
+
+
+class NotebookProgress:
+    """A bar below the cell.
+
+    Parameters
+    ----------
+    end : float
+        Time at the end [s], or load factor.
+    """
+
+    def __init__(self, end: float) -> None:
+        self._end, self._words, self._share = end, "set-up and first step", 0.0
+        self._shown = -REDRAW_SECONDS
+        from IPython.display import display
+
+        self._handle = display(self, display_id=True)
+
+    def update(self, step: int, time_reached: float) -> None:
+        """A step was accepted."""
+        self._share = min(time_reached / self._end, 1.0) if self._end > 0.0 else 1.0
+        self._words = f"step {step}, t = {time_reached:.4g} of {self._end:.4g}"
+        if time.monotonic() - self._shown >= REDRAW_SECONDS:
+            self._show()
+
+    def end(self, words: str) -> None:
+        """No step follows."""
+        self._words += f", {words}"
+        self._show()
+
+    def _show(self) -> None:
+        self._shown = time.monotonic()
+        if self._handle is not None:
+            self._handle.update(self)
+
+    def _repr_html_(self) -> str:
+        return f'<progress max="1" value="{self._share:.4f}"></progress> {html.escape(self._words)}'
+
+    def __repr__(self) -> str:
+        return f"{self._share:.0%} {self._words}"

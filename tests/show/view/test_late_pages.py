@@ -1,0 +1,85 @@
+"""Pages that are late: what they still have to fetch is kept, and they are told."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from types import SimpleNamespace
+
+import pytest
+from written_run import written
+
+from lyra_petsc.output.read_run import Run
+
+pytest.importorskip("trame")
+
+
+class Sent:
+    """An array that was sent, which nothing else refers to."""
+
+    def __init__(self, mebibytes: float, references: int = 1) -> None:
+        self._size, self._references = int(1024 * mebibytes), references
+
+    def GetActualMemorySize(self) -> int:
+        return self._size
+
+    def GetReferenceCount(self) -> int:
+        return self._references
+
+
+def test_only_the_oldest_beyond_the_budget_are_forgotten() -> None:
+    from lyra_petsc.show.view.page import release_oldest
+
+    now = time.time()
+    cache = {
+        "in use": {"array": Sent(100, 2), "ts": now - 900},
+        "oldest": {"array": Sent(100), "ts": now - 800},
+        "late": {"array": Sent(100), "ts": now - 60},
+        "newer": {"array": Sent(100), "ts": now - 1},
+    }
+    release_oldest(SimpleNamespace(data_array_cache=cache))
+    assert list(cache) == ["in use", "late", "newer"]
+    young = {str(i): {"array": Sent(100), "ts": now} for i in range(9)}
+    release_oldest(SimpleNamespace(data_array_cache=young))
+    assert len(young) == 9
+
+
+def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None:
+    from lyra_petsc.show.view import page as module
+
+    monkeypatch.setattr(module, "SLOW_DRAWING", 0.05)
+    access = SimpleNamespace(watching=1)
+    page = module.Page(Run(written(tmp_path / "run", states=9)), access)
+    state = page.server.state
+
+    async def watch() -> None:
+        task = asyncio.create_task(page.animate())
+        page._player.go(2)
+        await asyncio.sleep(0.3)
+        assert "waiting for the browser" in state.waiting
+        assert state.frame == 2
+        page._player.go(3)
+        await asyncio.sleep(0.3)
+        assert state.frame == 2, "another state was sent before the last one was drawn"
+        page.drawn()
+        await asyncio.sleep(0.3)
+        assert state.frame == 3
+        page.drawn()
+        await asyncio.sleep(0.3)
+        assert state.waiting == ""
+        task.cancel()
+
+    asyncio.run(watch())
+
+
+def test_a_run_that_is_late_is_said_to_be(tmp_path, monkeypatch) -> None:
+    from lyra_petsc.show.view import page as module
+
+    monkeypatch.setattr(module, "in_use", lambda folder: True)
+    run = Run(written(tmp_path / "run", states=3))
+    page = module.Page(run, SimpleNamespace(watching=1))
+    monkeypatch.setattr(Run, "summary", {"outcome": "running"})
+    run.__dict__.pop("summary", None)
+    assert page._outcome().endswith(" running")
+    page._news -= 7.0
+    assert page._outcome().endswith("running, the next state awaited for 7 s")
