@@ -1,11 +1,12 @@
 """Coarser triangle meshes for multigrid: a part of the vertices, and smooth interpolation from them.
 
-A greedy independent set of the vertices stays. Every other vertex belongs to the nearest of its neighbours
-that stay; triangles whose corners belong to three of them make the coarse triangles (the dual of that
-Voronoi diagram on the mesh). A vertex that goes is interpolated by its barycentric coordinates in the
-coarse triangle that contains it. Each vertex is then moved halfway to the mean of its neighbours, as by a
-subdivision scheme: of linear interpolation alone every coarse edge makes a fold, whose bending is twice too
-stiff on each coarser mesh.
+A greedy independent set of the vertices stays, on a grid one that is as regular. Every other vertex belongs
+to the nearest of its neighbours that stay; triangles whose corners belong to three of them make the coarse
+triangles (the dual of that Voronoi diagram on the mesh). A vertex that goes is interpolated by its
+barycentric coordinates in the coarse triangle that contains it. Each vertex is then moved halfway to the mean
+of its neighbours, as by a subdivision scheme: of linear interpolation alone every coarse edge makes a fold,
+whose bending is twice too stiff on each coarser mesh. Small weights are then left out: they make rows of
+coarse matrices long.
 
 Functions of arrays, of a whole mesh.
 """
@@ -26,6 +27,19 @@ Ints = NDArray[np.int64]
 
 OUTSIDE = -0.3
 """Smallest barycentric coordinate with which a linear function is continued beyond its triangle."""
+
+FEWER = 0.95
+"""Fraction of the vertices for which a less regular choice is taken."""
+
+LEAST_WEIGHT = 0.04
+"""Weights below it are left out: on irregular meshes there are many, and without them cycles take a fifth
+less and iterations are as many. The least on a grid of parallel diagonals, which needs it, is 1/24."""
+
+ALIKE = 1e-3
+"""Relative difference of squared distances below which they count as equal."""
+
+OBLIQUE = (1.0, 0.618, 0.382)
+"""A direction in which no two corners of a square or a cube are equally far, however it lies on the axes."""
 
 
 @dataclass
@@ -58,7 +72,7 @@ def coarsen(x: Array, triangles: Ints) -> Coarse:
     n = len(x)
     start, neighbours = vertex_graph([triangles], n)
     border = _borders(n, triangles)
-    stays = _independent(start, neighbours, border)
+    stays = _fewest(start, neighbours, border)
     vertices = np.flatnonzero(stays)
     label = np.full(n, -1, dtype=np.int64)
     label[vertices] = np.arange(len(vertices))
@@ -91,60 +105,101 @@ def _around(n: int, triangles: Ints) -> tuple[Ints, Ints]:
     return start, order // 3
 
 
+def _fewest(start: Ints, neighbours: Ints, border: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Which vertices (N,) stay, begun from corners and borders, or where that leaves many from elsewhere.
+
+    From a corner that no diagonal meets half of a grid of alternating diagonals would stay.
+    """
+    seeds = (np.argsort(-key, kind="stable") for key in (border, np.diff(start)))
+    regular, sparse = (_independent(start, neighbours, border, order) for order in seeds)
+    chosen: NDArray[np.bool_] = sparse if sparse.sum() < FEWER * regular.sum() else regular
+    return chosen
+
+
 @cached()
-def _spread(start, neighbours, seed, only, border, state, queue):  # type: ignore[no-untyped-def]
-    """Decide the vertices reachable from seed, nearest first; those with border ≥ only."""
-    queue[0] = seed
-    head, tail = 0, 1
+def _spread(start, neighbours, seed, only, border, state, layer, ordered):  # type: ignore[no-untyped-def]
+    """Decide the vertices reachable from seed, nearest first; those with border ≥ only.
+
+    Of equally near ones those with most neighbours come first: on a grid of alternating diagonals they are
+    every fourth vertex and have two kinds of neighbours, while those with four are half of the vertices.
+    """
+    layer[0] = seed
+    n = 1
     state[seed] |= 4
-    while head < tail:
-        v = queue[head]
-        head += 1
-        if state[v] & 3 == 0:
-            state[v] |= 1
+    while n > 0:
+        _by_degree(start, layer[:n], ordered)
+        m = 0
+        for i in range(n):
+            v = ordered[i]
+            if state[v] & 3 == 0:
+                state[v] |= 1
+                for k in range(start[v], start[v + 1]):
+                    if state[neighbours[k]] & 3 == 0:
+                        state[neighbours[k]] |= 2
+        for i in range(n):
+            v = ordered[i]
             for k in range(start[v], start[v + 1]):
-                if state[neighbours[k]] & 3 == 0:
-                    state[neighbours[k]] |= 2
-        for k in range(start[v], start[v + 1]):
-            w = neighbours[k]
-            if state[w] & 4 == 0 and border[w] >= only:
-                state[w] |= 4
-                queue[tail] = w
-                tail += 1
+                w = neighbours[k]
+                if state[w] & 4 == 0 and border[w] >= only:
+                    state[w] |= 4
+                    layer[m] = w
+                    m += 1
+        n = m
 
 
 @cached()
-def _independent(start, neighbours, border):  # type: ignore[no-untyped-def]
-    """Which vertices stay: no two neighbours, and all others beside one. Corners first, then borders."""
+def _by_degree(start, vertices, ordered):  # type: ignore[no-untyped-def]
+    """Put the vertices into ``ordered``, those with most neighbours first, others as they stand."""
+    most = 0
+    for v in vertices:
+        most = max(most, start[v + 1] - start[v])
+    at = np.zeros(most + 2, np.int64)
+    for v in vertices:
+        at[most - (start[v + 1] - start[v]) + 1] += 1
+    for i in range(most + 1):
+        at[i + 1] += at[i]
+    for v in vertices:
+        i = most - (start[v + 1] - start[v])
+        ordered[at[i]] = v
+        at[i] += 1
+
+
+@cached()
+def _independent(start, neighbours, border, seeds):  # type: ignore[no-untyped-def]
+    """Which vertices stay: no two neighbours, and all others beside one. Corners first, then borders.
+
+    ``seeds`` (N,) is the order in which vertices are begun with.
+    """
     n = len(border)
     state = np.zeros(n, np.uint8)  # 1 stays, 2 goes, 4 was looked at
-    queue = np.empty(max(n, 1), np.int64)
+    layer, ordered = np.empty(n, np.int64), np.empty(n, np.int64)
     for only in (2, 1, 0):
         for v in range(n):
             state[v] &= 3
-        for least in (2, 1, 0):
-            for v in range(n):
-                if border[v] >= max(only, least) and state[v] & 4 == 0:
-                    _spread(start, neighbours, v, only, border, state, queue)
-    stays = np.empty(n, np.bool_)
-    for v in range(n):
-        stays[v] = state[v] & 1 == 1
-    return stays
+        for v in seeds:
+            if border[v] >= only and state[v] & 4 == 0:
+                _spread(start, neighbours, v, only, border, state, layer, ordered)
+    return (state & 1) > 0
 
 
 @cached()
 def _nearest(x, start, neighbours, label):  # type: ignore[no-untyped-def]
-    """Label of the nearest neighbour that stays; its own for those that stay."""
+    """Label of the nearest neighbour that stays; its own for those that stay.
+
+    Of equally near ones the farthest along an oblique direction: so squares that have their corners in the
+    coarse mesh are all cut alike, and it is as regular as this one.
+    """
     owner = label.copy()
     for v in range(len(label)):
         if label[v] < 0:
-            best = np.inf
+            best = farthest = np.inf
             for k in range(start[v], start[v + 1]):
                 w = neighbours[k]
                 if label[w] >= 0:
                     d = (x[v, 0] - x[w, 0]) ** 2 + (x[v, 1] - x[w, 1]) ** 2 + (x[v, 2] - x[w, 2]) ** 2
-                    if d < best:
-                        best, owner[v] = d, label[w]
+                    back = -(OBLIQUE[0] * x[w, 0] + OBLIQUE[1] * x[w, 1] + OBLIQUE[2] * x[w, 2])
+                    if d < (1.0 - ALIKE) * best or (d < (1.0 + ALIKE) * best and back < farthest):
+                        best, farthest, owner[v] = d, back, label[w]
     return owner
 
 
@@ -208,6 +263,22 @@ def _between(x, start, neighbours, label, vertices, v, parents, weights):  # typ
 
 
 @cached()
+def _without_small(parents, weights, lo, hi):  # type: ignore[no-untyped-def]
+    """Leave out the small ones of the weights lo..hi, whose sum stays; where they then end."""
+    before = after = 0.0
+    end = lo
+    for p in range(lo, hi):
+        before += weights[p]
+        if abs(weights[p]) >= LEAST_WEIGHT:
+            parents[end], weights[end] = parents[p], weights[p]
+            after += weights[p]
+            end += 1
+    for p in range(lo, end):
+        weights[p] *= before / after
+    return end
+
+
+@cached()
 def _smoothed(along_start, along_ends, start, neighbours, border, parents, weights):  # type: ignore[no-untyped-def]  # fmt: skip
     """Compressed rows of (parents, weights) (N, 3), each halfway to its neighbours' mean.
 
@@ -241,5 +312,6 @@ def _smoothed(along_start, along_ends, start, neighbours, border, parents, weigh
                     out[q], share[q] = p, 0.0
                     q += 1
                 share[at[p]] += part * weights[w, i]
+        q = _without_small(out, share, first[v], q)
         first[v + 1] = q
     return first, out[:q].copy(), share[:q].copy()

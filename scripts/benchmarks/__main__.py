@@ -147,6 +147,7 @@ class Bench:
         if asked.presets is not None:
             self._presets()
         if not asked.only_rows:
+            self._meshes()
             self._weak()
             self._apart()
             self._rest()
@@ -176,6 +177,19 @@ class Bench:
                 lambda: measures.peer_row(name, command, vertices, self._folder, self._asked.limits),
             ),
         )
+
+    def _meshes(self) -> None:
+        asked = self._asked
+        for vertices in asked.vertices:
+            self._add(
+                "meshes",
+                self._attempt(
+                    f"{vertices} vertices, other meshes, {asked.ranks[0]} rank(s)",
+                    lambda vertices=vertices: measures.meshes(
+                        vertices, asked.ranks[0], self._petsc, self._folder, asked.limits
+                    ),
+                ),
+            )
 
     def _growth(self) -> None:
         known = measures.first_method(self.results["rows"])

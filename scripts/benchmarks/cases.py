@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 CLOTH = "gray-interlock"
@@ -52,6 +53,46 @@ def hanging_square(
         "handles": [{"nodes": corners(vertices)}],
         "time": {"end": 1e6 * step, "step": step, "integrator": method},
     }
+
+
+MESHES = ("diagonal", "alternating", "criss-cross", "gmsh", "gmsh 1:20")
+"""Kinds of triangles that the square is cut into; the first is that of all other measurements."""
+
+GRADED = 20.0
+"""Largest over smallest edge of the last of them."""
+
+
+def on_mesh(kind: str, vertices: int, folder: Path) -> dict[str, Any]:
+    """`hanging_square` on another kind of mesh, which gmsh makes from a file in ``folder``."""
+    scene = hanging_square(vertices)
+    if kind in ("diagonal", "alternating"):
+        scene["mesh"]["grid"]["pattern"] = kind
+    elif kind == "criss-cross":
+        # a centre for each cell, numbered after the corners of all cells
+        scene = hanging_square(vertices // 2)
+        scene["mesh"]["grid"]["pattern"] = kind
+    else:
+        file = folder / f"{kind.replace(':', '-').replace(' ', '-')}-{vertices}.geo"
+        file.write_text(square_script(vertices, GRADED if kind == MESHES[-1] else 1.0), encoding="ascii")
+        scene |= {"mesh": {"file": str(file)}, "handles": [{"group": "held"}]}
+    return scene
+
+
+def square_script(vertices: int, ratio: float) -> str:
+    """For gmsh: the square with about so many vertices, edges below so many times shorter than above."""
+    # of equilateral triangles of edge h there is a vertex for each √3/2 h²; h grows with the height
+    lower = math.sqrt(2.0 / (math.sqrt(3.0) * ratio * vertices))
+    sizes = (lower, lower, ratio * lower, ratio * lower)
+    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
+    lines = ['SetFactory("Built-in");']
+    lines += [
+        f"Point({n}) = {{{x}, {y}, 0, {size:.9g}}};"
+        for n, ((x, y), size) in enumerate(zip(corners, sizes, strict=True), 1)
+    ]
+    lines += [f"Line({n}) = {{{n}, {n % 4 + 1}}};" for n in range(1, 5)]
+    lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};"]
+    lines += ['Physical Surface("sheet") = {1};', 'Physical Point("held") = {3, 4};']
+    return "\n".join(lines) + "\n"
 
 
 def small_sheet() -> dict[str, Any]:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cases import METHODS, STEP, hanging_square, small_sheet, square_number
+from cases import MESHES, METHODS, STEP, hanging_square, on_mesh, small_sheet, square_number
 from peers import measure_peer
 from processes import Limits, measure, run
 from tables import growth
@@ -67,6 +67,14 @@ def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Re
 def _steps(kind: str, scene: dict[str, Any], ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
     few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": limits.seconds}
     return measure(kind, ranks, petsc, limits.process, scene=scene, **few)
+
+
+def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits) -> Result:
+    """Steps of the square on every kind of mesh, by turns."""
+    few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": len(MESHES) * limits.seconds}
+    with _scratch(folder) as scratch:
+        scenes = {kind: on_mesh(kind, vertices, scratch) for kind in MESHES}
+        return measure("meshes", ranks, petsc, len(MESHES) * limits.process, scenes=scenes, **few)
 
 
 def first_method(rows: Sequence[Result]) -> list[Result]:

@@ -114,6 +114,46 @@ def _cells(row: Result, first: Result | None) -> list[str]:
     ]
 
 
+def of_vertex(found: Result) -> float:
+    """CPU seconds of a step over vertices."""
+    return median_of(found, "cpu") / found["vertices"]
+
+
+def meshes_table(results: Sequence[Result]) -> list[str]:
+    """Kinds of meshes beside the first, by time a vertex, and the slowest of all."""
+    rows, slowest, first = [], (0.0, ""), next(iter(results[0]["meshes"]))
+    for result in results:
+        base = of_vertex(result["meshes"][first])
+        for kind, found in result["meshes"].items():
+            ratio = of_vertex(found) / base
+            slowest = max(slowest, (ratio, f"{kind}, {found['vertices']} vertices"))
+            cpu = [step["cpu"] for step in found["steps"]]
+            rows.append(
+                [
+                    str(found["vertices"]),
+                    kind,
+                    spread(cpu, 1e3),
+                    number(1e6 * of_vertex(found)),
+                    number(ratio),
+                    number(median_of(found, "cg")),
+                    found["preset"],
+                    number(found["set_up_cpu"]),
+                ]
+            )
+    head = (
+        "vertices",
+        "mesh",
+        "CPU ms a step",
+        "µs a vertex",
+        f"times {first}",
+        "CG iterations",
+        "preset",
+        "set-up CPU s",
+    )
+    ratio, where = slowest
+    return [*table(head, rows), "", f"Worst: {where}, {number(ratio)} times the time a vertex of {first}."]
+
+
 def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
     """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
     x = np.log([row["vertices"] for row in rows])
@@ -240,6 +280,8 @@ def document(results: Result) -> str:
     ]
     if results["rows"]:
         lines += [*main_table(results["rows"]), ""]
+    if results.get("meshes"):
+        lines += ["## Other meshes", "", *meshes_table(results["meshes"]), ""]
     if "growth" in results:
         lines += [*growth_words(results["growth"]), ""]
     if results.get("weak"):

@@ -160,6 +160,41 @@ def steps(comm: Comm, job: Result) -> Result:
     }
 
 
+def meshes(comm: Comm, job: Result) -> Result:
+    """CPU time, summed over ranks, of steps of several sheets by turns: what else the machine does hits all.
+
+    ``scenes`` are theirs by name; ``warm_up``, ``steps`` and ``seconds`` as of `steps`.
+    """
+    simulations, found = {}, {}
+    for name, scene in job["scenes"].items():
+        began = time.process_time()
+        simulation = Simulation(comm, Scene.model_validate(scene))
+        simulation.problem.release()
+        simulation.step()
+        simulations[name] = simulation
+        found[name] = {
+            "vertices": simulation.problem.outline.n_vertices,
+            "preset": simulation.stepper.preset,
+            "set_up_cpu": comm.allreduce(time.process_time() - began),
+            "steps": [],
+        }
+        for option in simulation.stepper.our_options:
+            PETSc.Options().delValue(option)  # the next chooses its own
+    first, last = now(comm), job["warm_up"] - 1 + job["steps"]
+    for number in range(1, last + 1):
+        for name, simulation in simulations.items():
+            comm.Barrier()
+            began = time.process_time()
+            report = simulation.step()
+            cpu = comm.allreduce(time.process_time() - began)
+            if number >= job["warm_up"]:
+                found[name]["steps"].append({"cpu": cpu, "cg": report.linear_iterations})
+        enough = number >= job["warm_up"] - 1 + FEWEST
+        if comm.bcast(time.perf_counter() - first > job["seconds"] and enough):
+            break
+    return {"meshes": found}
+
+
 def apart(comm: Comm, job: Result) -> Result:
     """Each rank has a sheet of its own, at the same time: the steps of all, in seconds."""
     own = steps(MPI.COMM_SELF, job)
@@ -223,7 +258,7 @@ def _write_plain(path: Path, block: bytes) -> None:
         os.fsync(file.fileno())
 
 
-KINDS = {"steps": steps, "apart": apart, "overhead": overhead, "output": output}
+KINDS = {"steps": steps, "meshes": meshes, "apart": apart, "overhead": overhead, "output": output}
 
 
 def main() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import corners, hanging_square, small_sheet, square_number
+from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
 from peers import write_files, write_scene
 from processes import Failed, run
-from tables import COLUMNS, document, exponent, growth, number, spread
+from tables import COLUMNS, document, exponent, growth, meshes_table, number, spread
 
 from lyra_petsc.api.mpirun import environment
 from lyra_petsc.mesh.build import build_mesh
@@ -111,6 +111,11 @@ def test_json_holds_every_measurement(measured):
     assert 0.0 < results["default_scene"]["output_share"] < 1.0
     assert len(results["start_up"]["seconds"]) == 3
     assert [row["vertices"] for row in results["weak"]] == [square_number(50), square_number(100)]
+    (meshes,) = results["meshes"]
+    assert tuple(meshes["meshes"]) == MESHES
+    for found in meshes["meshes"].values():
+        assert min(step["cpu"] for step in found["steps"]) > 0.0
+        assert found["vertices"] < 2 * 36
     (apart,) = results["apart"]
     assert 2 * 2 <= len(apart["step_seconds"]) <= 2 * 3
     assert apart["vertices"] == square_number(18)
@@ -126,10 +131,13 @@ def test_markdown_shows_them(measured):
     for lines in tables_of(text):
         assert {len(line) for line in lines} == {len(lines[0])}
         assert all(cell for line in lines for cell in line)
-    rows, weak, apart, presets, single = tables_of(text)
+    rows, meshes, weak, apart, presets, single = tables_of(text)
     assert tuple(rows[0]) == COLUMNS
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
     assert rows[1][5] == "1.00"
+    assert [line[1] for line in meshes[1:]] == list(MESHES)
+    assert meshes[1][4] == "1.00"
+    assert f"times the time a vertex of {MESHES[0]}" in text
     assert len(weak) == 3
     assert [line[:2] for line in apart[1:]] == [["36", "2"]]
     assert apart[1][5] == "2 × 16"
@@ -200,6 +208,30 @@ def test_corners_and_small_sheet():
         top = mesh.positions[:, 1].max()
         assert sorted(map(tuple, held)) == [(0.0, top, 0.0), (mesh.positions[:, 0].max(), top, 0.0)]
     assert mesh.n_triangles == 100
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_the_square_on_every_kind_of_mesh(tmp_path, kind):
+    scene = Scene.model_validate(on_mesh(kind, 2500, tmp_path))
+    mesh = build_mesh(scene.mesh)
+    assert mesh.n_vertices == pytest.approx(2500, rel=0.2)
+    (handle,) = scene.handles
+    held = list(handle.nodes) if handle.nodes is not None else mesh.groups[handle.group].vertices
+    assert sorted(map(tuple, mesh.positions[held])) == [(0.0, 1.0, 0.0), (1.0, 1.0, 0.0)]
+    edges = mesh.positions[mesh.triangles] - mesh.positions[np.roll(mesh.triangles, 1, axis=1)]
+    sizes = np.sort(np.linalg.norm(edges, axis=2).ravel())
+    assert (sizes[-1] / sizes[0] > GRADED / 2) == (kind == "gmsh 1:20")
+
+
+def test_the_worst_mesh_is_named():
+    def found(vertices: int, cpu: float) -> dict:
+        step = {"cpu": cpu, "cg": 7}
+        return {"vertices": vertices, "preset": "multigrid", "set_up_cpu": 1.0, "steps": [step] * 3}
+
+    small = {"meshes": {"diagonal": found(100, 1.0), "gmsh": found(110, 1.32)}}
+    large = {"meshes": {"diagonal": found(1000, 10.0), "gmsh": found(1000, 11.0)}}
+    lines = meshes_table([small, large])
+    assert lines[-1] == "Worst: gmsh, 110 vertices, 1.20 times the time a vertex of diagonal."
 
 
 def row(vertices: int, seconds: float) -> dict:
