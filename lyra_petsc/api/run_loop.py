@@ -200,6 +200,7 @@ class _RunLoop:
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
             **simulation.totals,
+            **simulation.stability,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
             "notes": simulation.notes,

@@ -26,6 +26,7 @@ from lyra_petsc.stepping.failure_report import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.problem import Problem, build_problem, events
 from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.ts_options import with_ts_options
@@ -86,6 +87,8 @@ class Simulation:
     step_number : int
     totals : dict of str to int
         Newton and linear iterations, and rejected attempts, of all steps.
+    stability : dict
+        Of a static analysis: what summary.json says of the last equilibrium.
     failure : Failure or None
         Why the last step could not be taken.
     notes : list of str
@@ -135,6 +138,9 @@ class Simulation:
         self.estimated_error = 0.0
         self.compression = Compression(self.problem)
         self._told: set[str] = set()
+        self.stability: dict[str, Any] = {}
+        if scene.time.analysis == "static":
+            self.stability = Stability(reason="the end is not reached").content
         self.totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
@@ -197,6 +203,14 @@ class Simulation:
                 system.integrator.restore(*past)
                 self.stepper.start(self.time, self.step_number)
             rejected += 1
+        if isinstance(self._seek, Equilibrium) and self.control.is_end(end):
+            with self.phases("solve"):
+                settled = self._seek.settle(self.time, end)
+            newton += settled.newton_iterations
+            linear += settled.linear_iterations
+            self.stability = settled.stability.content
+            if settled.note:
+                self.notes.append(settled.note)
         self.control.succeeded(newton)
         dt, self.time = end - self.time, end
         self.step_number += 1
@@ -313,6 +327,7 @@ class Simulation:
             "step": self.step_number,
             "budget": self.ledger.memory()[1],
             "totals": dict(self.totals),
+            "stability": self.stability,
             "notes": list(self.notes),
             "told": sorted(self._told),
             **self.control.memory(),
@@ -365,6 +380,7 @@ class Simulation:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
+        self.stability = self.stability and memory.get("stability", self.stability)
         self._told |= set(memory.get("told", ()))
         earlier = [str(note) for note in memory.get("notes", ())]
         self.earlier_notes = len(earlier)
