@@ -139,6 +139,8 @@ class _RunLoop:
                     )
             with simulation.phases("output"):
                 recorder.settle()
+            if simulation.note_of_repeats:
+                callbacks.note(simulation.note_of_repeats)
         except SolverError as error:
             if error.collective:
                 error.details += self._write_failure(str(error))
@@ -203,7 +205,7 @@ class _RunLoop:
             **simulation.stability,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
-            "notes": simulation.notes,
+            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats])],
             **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)

@@ -142,6 +142,8 @@ class Simulation:
         if scene.time.analysis == "static":
             self.stability = Stability(reason="the end is not reached").content
         self.totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
+        self._repeated: dict[str, int] = {}
+        self._least = math.inf
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
@@ -287,6 +289,32 @@ class Simulation:
         if in_vain or not self.control.failed():
             self.failure = self._explain(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
+        why = attempt.words or "no solution was found"
+        if attempt.stuck and attempt.stuck.snes_reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
+            why += f" ({self._iterations_key} {self.stepper.snes.getTolerances()[3]})"
+        self._repeated[why] = self._repeated.get(why, 0) + 1
+        self._least = min(self._least, self.control.factor * self.control.step)
+
+    @property
+    def _iterations_key(self) -> str:
+        """Where the limit of Newton's iterations stands."""
+        return "-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations"
+
+    @property
+    def note_of_repeats(self) -> str:
+        """How many attempts so far were repeated with a smaller step, and why; nothing if none was."""
+        if not self._repeated:
+            return ""
+        times = sum(self._repeated.values())
+        often = sorted(self._repeated.items(), key=lambda each: -each[1])
+        reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
+        what, unit = ("Δt", " s") if self.problem.system.integrator.moves else ("increment", "")
+        note = f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "
+        note += f"down to {self._least:.3g}{unit} ({reasons})"
+        if self.scene.time.adaptive or not self.problem.system.integrator.moves:
+            return note
+        planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
+        return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
 
     def _explain(self, attempt: Attempt, end: float) -> Failure:
         """Why the last attempt at a step failed; collective."""
@@ -302,7 +330,7 @@ class Simulation:
             spacing=outline.spacing,
             floor=self._floor,
             max_iterations=stepper.snes.getTolerances()[3],
-            iterations_key="-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations",
+            iterations_key=self._iterations_key,
             linear_iterations=stepper.ksp.getTolerances()[3],
             preconditioner=stepper.ksp.getPC().getType(),
             ranks=self.comm.size,
@@ -328,6 +356,8 @@ class Simulation:
             "budget": self.ledger.memory()[1],
             "totals": dict(self.totals),
             "stability": self.stability,
+            "repeated": dict(self._repeated),
+            "least": self._least if self._repeated else None,
             "notes": list(self.notes),
             "told": sorted(self._told),
             **self.control.memory(),
@@ -381,6 +411,8 @@ class Simulation:
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
         self.stability = self.stability and memory.get("stability", self.stability)
+        self._repeated = {str(why): int(count) for why, count in memory.get("repeated", {}).items()}
+        self._least = math.inf if memory.get("least") is None else float(memory["least"])
         self._told |= set(memory.get("told", ()))
         earlier = [str(note) for note in memory.get("notes", ())]
         self.earlier_notes = len(earlier)
