@@ -147,6 +147,8 @@ class _RunLoop:
                     )
             with simulation.phases("output"):
                 recorder.settle()
+            if simulation.note_of_repeats:
+                callbacks.note(simulation.note_of_repeats)
         except SolverError as error:
             if error.collective:
                 error.details += self._write_failure(str(error))
@@ -210,9 +212,10 @@ class _RunLoop:
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
             **simulation.totals,
+            **simulation.stability,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
-            "notes": simulation.notes,
+            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats])],
             **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)

@@ -200,7 +200,7 @@ class Simulation:
     @property
     def notes(self) -> list[str]:
         """What one should know: mesh repairs, a linear solver that was changed, …"""
-        return list(self._running.notes)
+        return [*self._running.notes, *filter(None, [self._running.note_of_repeats])]
 
     def gather(self, rows: NDArray[Any], on: Literal["vertex", "triangle"] = "vertex") -> NDArray[Any] | None:
         """Rows of the ranks' vertices, or triangles, in the order of the mesh file: on rank 0, else None.

@@ -82,6 +82,11 @@ class BlockPattern:
         made._locate(couplings, keys, n_local)
         return made, place
 
+    def offsets_of(self, stencil: NDArray[np.int32], n_local: int) -> Offsets:
+        """Offsets of further elements, all of whose couplings have a block already."""
+        rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
+        return _offsets(stencil, rows * n_local + self.columns, self.n_owned, n_local)
+
     @classmethod
     def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:
         """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""

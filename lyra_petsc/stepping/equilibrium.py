@@ -21,6 +21,7 @@ from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton_trace import Iteration, Stuck
 from lyra_petsc.stepping.relaxation import Relaxation
+from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 
@@ -51,6 +52,20 @@ LONGEST = 1e7
 
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
+
+
+MOST_DESCENTS = 5
+"""How often an unstable equilibrium is left."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settled:
+    """How the last equilibrium stands, what it took to get there, and what there is to tell."""
+
+    stability: Stability
+    newton_iterations: int
+    linear_iterations: int
+    note: str
 
 
 class Equilibrium:
@@ -143,6 +158,49 @@ class Equilibrium:
             stuck=stuck,
         )
 
+    def settle(self, before: float, factor: float) -> Settled:
+        """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
+        system, n = self._system, self._system.points.n_owned
+        anchored = system.moving_energy_before
+        newton = linear = followed = 0
+        words = ""
+        while True:
+            examination = Examination(system, self._spacing, self._size)
+            try:
+                found = examination.stability
+                if found.stable is not False:
+                    break
+                mode, way = examination.mode(), None
+                if mode is None:
+                    words = "its lowest mode was not found"
+                elif examination.wrinkles(mode):
+                    words = (
+                        "sheets without bending wrinkle as finely as the mesh, which is not followed; give a "
+                        "bending stiffness"
+                    )
+                elif followed == MOST_DESCENTS:
+                    words = f"its lowest mode was followed {followed} times"
+                elif (way := examination.way_down(mode)) is None:
+                    words = "nothing along its lowest mode has less energy"
+                if way is None:
+                    break
+            finally:
+                examination.destroy()
+            x = system.x[:n].copy()
+            system.state.set(x + way, np.zeros_like(x))
+            attempt = self.attempt(before, factor)
+            newton += attempt.newton_iterations
+            linear += attempt.linear_iterations
+            if not attempt.converged:
+                system.state.set(x, np.zeros_like(x))
+                system.begin_step(before, factor)
+                system.stay()
+                words = "from its lowest mode no other was found"
+                break
+            followed += 1
+        system.moving_energy_before = anchored
+        return Settled(found, newton, linear, _note(found, followed, words))
+
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold to go on alike."""
         return {"scale": self._scale, "in_vain": self._in_vain}
@@ -212,6 +270,24 @@ class Equilibrium:
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
+
+
+def _note(found: Stability, followed: int, words: str) -> str:
+    """What the user should know of an equilibrium's stability, or nothing."""
+    if found.stable is None:
+        return f"whether the equilibrium is stable is not known: {found.reason}"
+    if not found.stable:
+        ways = "1 way" if found.negative == 1 else f"{found.negative} ways"
+        return f"the equilibrium is unstable, it gives way in {ways} (negative pivots): {words}"
+    notes = []
+    if followed:
+        times = "once" if followed == 1 else f"{followed} times"
+        notes.append(
+            f"the first equilibrium was unstable; its lowest mode was followed {times}, to a stable one"
+        )
+    if found.neutral:
+        notes.append(f"the equilibrium is neutral: nothing resists {found.neutral} motions (neutral pivots)")
+    return "; ".join(notes)
 
 
 def _row(force: float, attempt: Attempt | None) -> Iteration:

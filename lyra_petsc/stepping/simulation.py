@@ -27,6 +27,7 @@ from lyra_petsc.stepping.failure_report import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.problem import Problem, build_problem, events
 from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.ts_options import with_ts_options
@@ -90,6 +91,8 @@ class Simulation:
     step_number : int
     totals : dict of str to int
         Newton and linear iterations, and rejected attempts, of all steps.
+    stability : dict
+        Of a static analysis: what summary.json says of the last equilibrium.
     failure : Failure or None
         Why the last step could not be taken.
     notes : list of str
@@ -142,7 +145,12 @@ class Simulation:
         self.estimated_error = 0.0
         self.compression = Compression(self.problem)
         self._told: set[str] = set()
+        self.stability: dict[str, Any] = {}
+        if scene.time.analysis == "static":
+            self.stability = Stability(reason="the end is not reached").content
         self.totals = {"newton_iterations": 0, "linear_iterations": 0, "rejected": 0}
+        self._repeated: dict[str, int] = {}
+        self._least = math.inf
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
@@ -230,6 +238,14 @@ class Simulation:
                 system.integrator.restore(*past)
                 self.stepper.start(self.time, self.step_number)
             rejected += 1
+        if isinstance(self._seek, Equilibrium) and self.control.is_end(end):
+            with self.phases("solve"):
+                settled = self._seek.settle(self.time, end)
+            newton += settled.newton_iterations
+            linear += settled.linear_iterations
+            self.stability = settled.stability.content
+            if settled.note:
+                self.notes.append(settled.note)
         self.control.succeeded(newton)
         dt, self.time = end - self.time, end
         self.step_number += 1
@@ -312,6 +328,32 @@ class Simulation:
         if in_vain or not self.control.failed():
             self.failure = self._explain(attempt, end)
             raise SolverError(self.failure.sentence, collective=True, details=self.failure.lines)
+        why = attempt.words or "no solution was found"
+        if attempt.stuck and attempt.stuck.snes_reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT:
+            why += f" ({self._iterations_key} {self.stepper.snes.getTolerances()[3]})"
+        self._repeated[why] = self._repeated.get(why, 0) + 1
+        self._least = min(self._least, self.control.factor * self.control.step)
+
+    @property
+    def _iterations_key(self) -> str:
+        """Where the limit of Newton's iterations stands."""
+        return "-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations"
+
+    @property
+    def note_of_repeats(self) -> str:
+        """How many attempts so far were repeated with a smaller step, and why; nothing if none was."""
+        if not self._repeated:
+            return ""
+        times = sum(self._repeated.values())
+        often = sorted(self._repeated.items(), key=lambda each: -each[1])
+        reasons = "; ".join(f"{why}: {count} times" if count > 1 else f"{why}: once" for why, count in often)
+        what, unit = ("Δt", " s") if self.problem.system.integrator.moves else ("increment", "")
+        note = f"{times} {'attempt was' if times == 1 else 'attempts were'} repeated with a smaller {what}, "
+        note += f"down to {self._least:.3g}{unit} ({reasons})"
+        if self.scene.time.adaptive or not self.problem.system.integrator.moves:
+            return note
+        planned = math.ceil(self.time / self.control.step * (1.0 - 1e-9))
+        return f"{note}; {self.step_number} steps were taken where {planned} of the full Δt would do"
 
     def _explain(self, attempt: Attempt, end: float) -> Failure:
         """Why the last attempt at a step failed; collective."""
@@ -327,7 +369,7 @@ class Simulation:
             spacing=outline.spacing,
             floor=self._floor,
             max_iterations=stepper.snes.getTolerances()[3],
-            iterations_key="-snes_max_it" if is_set("snes_max_it") else "solver.max_iterations",
+            iterations_key=self._iterations_key,
             linear_iterations=stepper.ksp.getTolerances()[3],
             preconditioner=stepper.ksp.getPC().getType(),
             ranks=self.comm.size,
@@ -355,6 +397,9 @@ class Simulation:
             "step": self.step_number,
             "budget": self.ledger.memory()[1],
             "totals": dict(self.totals),
+            "stability": self.stability,
+            "repeated": dict(self._repeated),
+            "least": self._least if self._repeated else None,
             "notes": list(self.notes),
             "told": sorted(self._told),
             **self.control.memory(),
@@ -407,6 +452,9 @@ class Simulation:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
+        self.stability = self.stability and memory.get("stability", self.stability)
+        self._repeated = {str(why): int(count) for why, count in memory.get("repeated", {}).items()}
+        self._least = math.inf if memory.get("least") is None else float(memory["least"])
         self._told |= set(memory.get("told", ()))
         earlier = [str(note) for note in memory.get("notes", ())]
         self.earlier_notes = len(earlier)

@@ -25,6 +25,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.damping import Damping
@@ -33,6 +34,7 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
+from lyra_petsc.terms.load_stiffness import following_stiffness
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.remembered import Remembered
@@ -266,6 +268,10 @@ class StageEquations:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
         return ((self.x - self._xh) / self.stage.reach)[: self.points.n_owned]
 
+    def stay(self) -> None:
+        """Let the stage be where the step starts; collective."""
+        self._evaluate_at(self.velocity_of_staying())
+
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
         n, given, free = self.points.n_owned, self.integrator.given, self.prescribed.free
@@ -452,3 +458,29 @@ class StageEquations:
                 wind.add_hessian(vs, self.frozen[wind], rows.pattern.offsets, values)
         if len(self.prescribed.rows):
             rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
+
+    def exact_hessian(self, values: Array) -> None:
+        """Add to block rows (n_blocks, 3, 3) the exact Hessian [N/m] of all energies at the state.
+
+        And the symmetric part of the stiffness of loads that follow it; prescribed unknowns are decoupled.
+        """
+        rows = self.discretisation.rows
+        for term in self.elastic:
+            rows.add_stiffness(term, self.x, self.frozen[term], 0.0, 1.0, values)
+        following: list[Load | Viscous] = [load for load in self.loads if load.follows]
+        for load in [*following, *self.viscous]:
+            blocks = self.load_factor * following_stiffness(load, self.x, self._force_of)
+            offsets = rows.pattern.offsets_of(load.stencil, self.points.n_local)
+            add_elements(np.ones(load.n_elements), blocks, offsets, values)
+        if len(self.prescribed.rows):
+            rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
+
+    def _force_of(self, term: Term, x: Array, out: Array) -> None:
+        """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
+        if isinstance(term, Load):
+            term.add_force(x, self.t0, self.t1, out)
+        elif isinstance(term, Viscous):
+            against = np.zeros_like(out)
+            frozen = term.freeze(Step(self.t0, self.t1, self.t1, x, self.reference.at))
+            term.add_gradient(np.zeros_like(x), frozen, against)
+            out -= against

@@ -16,7 +16,7 @@ def test_anything_a_run_collects_becomes_plain_json(comm, shared_tmp):
     content = {
         "outcome": "done",
         "vertices": np.int64(4),
-        "seconds": {"solve": np.float64(0.5), "other": float("nan")},
+        "seconds": {"solve": np.float64(0.5), "other": float("nan"), "left": -np.inf},
         "sizes": np.arange(3),
         "terms": ("membrane", "wind"),
         "folder": path.parent,
@@ -27,7 +27,7 @@ def test_anything_a_run_collects_becomes_plain_json(comm, shared_tmp):
     assert json.loads(path.read_text()) == {
         "outcome": "done",
         "vertices": 4,
-        "seconds": {"solve": 0.5, "other": None},
+        "seconds": {"solve": 0.5, "other": None, "left": None},
         "sizes": [0, 1, 2],
         "terms": ["membrane", "wind"],
         "folder": str(path.parent),

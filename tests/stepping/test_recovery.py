@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -77,3 +78,24 @@ def test_spectral_radius_by_petsc_option() -> None:
         journey("bdf2", 0.02, MPI.COMM_SELF)  # not asked for
     finally:
         PETSc.Options().delValue("ts_alpha_radius")
+
+
+@pytest.mark.parallel(2)
+def test_one_note_says_how_often_and_why(comm: MPI.Comm) -> None:
+    PETSc.Options()["snes_max_it"] = 2
+    simulation = Simulation(comm, scene_of(SCENE | {"time": {"end": 0.12, "step": 0.04}}))
+    assert not simulation.note_of_repeats
+    for _ in range(6):
+        simulation.step()
+    times = simulation.totals["rejected"]
+    assert times > 1
+    words = f"({times} attempts were repeated with a smaller Δt, down to )([0-9.e-]+) s .*-snes_max_it 2"
+    found = re.match(words, simulation.note_of_repeats)
+    assert found
+    assert 0.0 < float(found[2]) < 0.04
+    assert "6 steps were taken where 1 of the full Δt would do" in simulation.note_of_repeats
+    other = Simulation(comm, simulation.scene)  # as a run that is resumed
+    other.resume(simulation.memory(), simulation.arrays())
+    assert other.note_of_repeats == simulation.note_of_repeats
+    simulation.destroy()
+    other.destroy()

@@ -1,0 +1,135 @@
+"""Signs of the eigenvalues of a symmetric matrix, from the pivots of its factors; and its lowest mode.
+
+Sylvester: a symmetric matrix has as many negative eigenvalues as its factors LDLᵀ have negative pivots. The
+factors are MUMPS's, of a solver of its own with the options prefix ``stability_``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.linear.failed_factors import LACKS_ROOM, LARGEST
+from lyra_petsc.linear.matrix import AssembledMatrix
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.mesh.points import Layout
+
+Array = NDArray[np.float64]
+
+PREFIX = "stability_"
+
+NEUTRAL = 1e-10
+"""Size of a pivot over that of the largest diagonal entry below which it has no sign."""
+
+FIRST_SHIFT, MORE = 1e-8, 10.0
+"""Shift over the largest diagonal entry at which a positive-definite matrix is sought, and its growth."""
+
+SOLVES, SAME = 100, 1e-3
+"""Most inverse iterations, and the relative change of the eigenvalue at which they end."""
+
+
+@dataclass(frozen=True)
+class Pivots:
+    """How many pivots are negative, and how many are too small to have a sign."""
+
+    negative: int
+    neutral: int
+
+
+class Inertia:
+    """Factors a symmetric matrix of block rows; collective.
+
+    Parameters
+    ----------
+    layout : Layout
+    pattern : BlockPattern
+    values : (n_blocks, 3, 3)
+        Its block rows, prescribed unknowns decoupled with a positive diagonal.
+    """
+
+    def __init__(self, layout: Layout, pattern: BlockPattern, values: Array) -> None:
+        self._layout, self._values = layout, values
+        self._diagonal = pattern.indptr[:-1]
+        entries = np.abs(values[self._diagonal][:, range(3), range(3)])
+        self._largest = float(layout.comm.allreduce(float(entries.max(initial=0.0)), MPI.MAX))
+        self._matrix = AssembledMatrix(layout, pattern, "aij", prefix=PREFIX)
+        self._ksp: PETSc.KSP | None = None
+        self._margin = 50
+
+    def pivots(self, shift: float = 0.0) -> Pivots | None:
+        """Of the matrix plus shift times the identity; None if there is no memory for its factors.
+
+        Unknowns that no energy depends on have neutral pivots.
+        """
+        values = self._values.copy()
+        values[self._diagonal] += shift * np.eye(3)
+        self._matrix.set(values)
+        while True:
+            factors = self._factor()
+            error = factors.getMumpsInfog(1)
+            if error >= 0:
+                return Pivots(int(factors.getMumpsInfog(12)), int(factors.getMumpsInfog(28)))
+            if error not in LACKS_ROOM or self._margin >= LARGEST:
+                return None
+            self._margin *= 4
+
+    def _factor(self) -> PETSc.Mat:
+        self._free_solver()
+        self._ksp = ksp = PETSc.KSP().create(self._layout.comm)
+        ksp.setOptionsPrefix(PREFIX)
+        ksp.setType(PETSc.KSP.Type.PREONLY)
+        ksp.setOperators(self._matrix.mat)
+        pc = ksp.getPC()
+        pc.setType(PETSc.PC.Type.CHOLESKY)
+        pc.setFactorSolverType("mumps")
+        pc.setFactorSetUpSolverType()
+        factors = pc.getFactorMatrix()
+        factors.setOptionsPrefix(PREFIX)  # else it takes the options of the steps' factors
+        # unscaled; all pivots are counted, also those of the last dense block, and null ones apart
+        for number, value in {6: 0, 8: 0, 13: 1, 14: self._margin, 24: 1}.items():
+            factors.setMumpsIcntl(number, value)
+        factors.setMumpsCntl(1, 0.01)
+        factors.setMumpsCntl(3, -NEUTRAL * self._largest)
+        ksp.setUp()
+        return factors
+
+    def lowest_mode(self, start: Array) -> tuple[float, Array] | None:
+        """Lowest eigenvalue [N/m] and its vector (n_owned, 3) of length one, by inverse iteration.
+
+        From ``start`` (n_owned, 3), which is 0 in prescribed unknowns. None if the factors fail.
+        """
+        shift = FIRST_SHIFT * self._largest
+        while (pivots := self.pivots(shift)) is not None and pivots.negative:
+            shift *= MORE
+        if pivots is None:
+            return None
+        assert self._ksp is not None
+        x, y = self._matrix.mat.createVecs()
+        x.setArray(start.ravel())
+        x.normalize()
+        lowest = np.inf
+        for _ in range(SOLVES):
+            self._ksp.solve(x, y)
+            before, lowest = lowest, 1.0 / y.dot(x) - shift
+            y.normalize()
+            x, y = y, x
+            if lowest < 0.0 and abs(lowest - before) <= SAME * abs(lowest):
+                break
+        mode = x.getArray(readonly=True).reshape(start.shape).copy()
+        x.destroy()
+        y.destroy()
+        return float(lowest), mode
+
+    def _free_solver(self) -> None:
+        if self._ksp is not None:
+            self._ksp.destroy()
+            self._ksp = None
+
+    def destroy(self) -> None:
+        """Free the factors and the matrix; collective."""
+        self._free_solver()
+        self._matrix.destroy()

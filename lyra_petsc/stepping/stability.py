@@ -1,0 +1,161 @@
+"""Whether an equilibrium is stable: the signs of the exact Hessian on the free unknowns, and where it leads.
+
+The Hessian is that of all energies, plus the symmetric part of the stiffness of loads that follow the shape.
+Unknowns of edges need no care of their own: of a matrix with a positive-definite block of theirs the negative
+pivots are those of its Schur complement, on the vertices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.linear.inertia import Inertia
+from lyra_petsc.stepping.stage_equations import StageEquations
+
+Array = NDArray[np.float64]
+
+MOST_VERTICES = 200_000
+"""Beyond which no factors are made."""
+
+FIRST_WAY, FARTHEST = 1e-3, 0.25
+"""Of the way along a mode: the first over the mean edge length, the longest over the mesh's size."""
+
+HALVINGS, DOUBLINGS = 10, 40
+
+BENDS = 0.5
+"""Part of a mode that must be on vertices with bending stiffness for it not to be a wrinkle."""
+
+
+@dataclass(frozen=True)
+class Stability:
+    """What the pivots say of an equilibrium.
+
+    Attributes
+    ----------
+    stable : bool or None
+        Whether none is negative; None: not known.
+    negative, neutral : int or None
+        How many are negative, and how many too small to have a sign.
+    reason : str
+        Why it is not known.
+    """
+
+    stable: bool | None = None
+    negative: int | None = None
+    neutral: int | None = None
+    reason: str = ""
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Entries of summary.json."""
+        return {
+            "stable": self.stable,
+            "negative_pivots": self.negative,
+            "neutral_pivots": self.neutral,
+        } | ({"stability_unknown": self.reason} if self.reason else {})
+
+
+class Examination:
+    """Of the equilibrium that the equations are at; collective.
+
+    Attributes
+    ----------
+    stability : Stability
+    """
+
+    def __init__(self, system: StageEquations, spacing: float, size: float) -> None:
+        self._system, self._spacing, self._size = system, spacing, size
+        self._inertia: Inertia | None = None
+        self.stability = self._examine()
+
+    def _examine(self) -> Stability:
+        system = self._system
+        points = system.points
+        if not PETSc.Sys.hasExternalPackage("mumps"):
+            return Stability(reason="this PETSc has no MUMPS, whose factors tell")
+        if points.n_vertices_global > MOST_VERTICES:
+            return Stability(
+                reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
+                "that factors are made for"
+            )
+        values = system.discretisation.rows.zeros()
+        system.exact_hessian(values)
+        self._inertia = Inertia(points, system.discretisation.rows.pattern, values)
+        pivots = self._inertia.pivots()
+        if pivots is None:
+            return Stability(reason="there is no memory for the factors")
+        return Stability(pivots.negative == 0, pivots.negative, pivots.neutral)
+
+    def mode(self) -> Array | None:
+        """The unstable mode (n_owned, 3) of length one with the lowest eigenvalue, if it can be had."""
+        assert self._inertia is not None
+        points = self._system.points
+        # the same on any number of ranks
+        whole = np.random.default_rng(0).standard_normal((points.n_vertices_global, 3))
+        start = np.zeros((points.n_owned, 3))
+        start[: points.n_vertices] = whole[points.original]
+        found = self._inertia.lowest_mode(np.where(self._system.prescribed.free, start, 0.0))
+        return None if found is None or not found[0] < 0.0 else found[1]
+
+    def wrinkles(self, mode: Array) -> bool:
+        """Whether a mode is mostly where nothing resists bending."""
+        system = self._system
+        bent = np.zeros(system.points.n_local, dtype=bool)
+        for term in system.elastic:
+            if term.registration.energy == "bending_energy":
+                bent[term.stencil] = True
+        n = system.points.n_vertices
+        square = (mode[:n] ** 2).sum(axis=1)
+        on_bent, all_of_it = system.points.summed(float(square[bent[:n]].sum()), float(square.sum()))
+        return bool(on_bent < BENDS * all_of_it)
+
+    def way_down(self, mode: Array) -> Array | None:
+        """The way (n_owned, 3) along a mode to about the lowest potential on it; None if none is lower."""
+        points = self._system.points
+        largest = points.comm.allreduce(float(np.abs(mode).max(initial=0.0)), MPI.MAX)
+        first, most = FIRST_WAY * self._spacing / largest, FARTHEST * self._size / largest
+        here = self._potential(0.0 * mode)
+        best, lowest = 0.0, here
+        for sign in (1.0, -1.0):
+            length = sign * first
+            for _ in range(HALVINGS):
+                if (value := self._potential(length * mode)) < here:
+                    break
+                length *= 0.5
+            else:
+                continue
+            for _ in range(DOUBLINGS):
+                farther = self._potential(2.0 * length * mode)
+                if not farther < value or abs(2.0 * length) > most:
+                    break
+                length, value = 2.0 * length, farther
+            if value < lowest:
+                best, lowest = length, value
+        if best == 0.0:
+            return None
+        way = best * mode
+        if self._system.limits_step:
+            system = self._system
+            way *= system.largest_step(np.zeros_like(mode), way / system.stage.reach)
+        return way
+
+    def _potential(self, way: Array) -> float:
+        """Energies minus the work of the present loads [J] at the end of a way from here."""
+        system = self._system
+        x = system.x.copy()
+        x[: len(way)] += way
+        system.points.update_ghosts(x)
+        stored = sum(float(term.energies(x, system.frozen[term]).sum()) for term in system.elastic)
+        return float(system.points.summed(stored - float(np.vdot(system.loads_now, way)))[0])
+
+    def destroy(self) -> None:
+        """Free the factors; collective."""
+        if self._inertia is not None:
+            self._inertia.destroy()
+            self._inertia = None

@@ -1,0 +1,62 @@
+"""The list of changes that tests must notice is of the present code."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "mutate.py"
+
+
+@pytest.fixture
+def mutate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("mutate", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "mutate", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_change_is_of_the_present_code(
+    mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["mutate.py", "--list"])
+    assert mutate.main() == 0, capsys.readouterr().out
+    assert len(capsys.readouterr().out.splitlines()) == len(mutate.CHANGES) >= 40
+    for change in mutate.CHANGES:
+        for test in change.tests:
+            assert (mutate.ROOT / test.rpartition("@")[2].split("::")[0]).is_file(), test
+
+
+def test_text_that_is_not_found_is_an_error(
+    mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = [mutate.Change("lyra_petsc/errors.py", "no such text", "", ("tests/test_house.py",))]
+    monkeypatch.setattr(mutate, "CHANGES", changes)
+    monkeypatch.setattr(sys, "argv", ["mutate.py"])
+    assert mutate.main() == 2
+    assert "not found once" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "code"), [("value = 1", "value = 2", 0), ("unused = 3", "unused = 4", 1)]
+)
+def test_what_is_noticed(
+    old: str, new: str, code: int, mutate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "code.py").write_text("value = 1\nunused = 3\n")
+    (tmp_path / "test_code.py").write_text(
+        "from pathlib import Path\n"
+        "def test(): assert 'value = 1' in Path(__file__).with_name('code.py').read_text()\n"
+    )
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
+    monkeypatch.setattr(mutate, "CHANGES", [mutate.Change("code.py", old, new, ("test_code.py",))])
+    monkeypatch.setattr(sys, "argv", ["mutate.py"])
+    assert mutate.main() == code
+    assert (tmp_path / "code.py").read_text() == "value = 1\nunused = 3\n"

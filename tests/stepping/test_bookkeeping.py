@@ -1,0 +1,129 @@
+"""Forces of handles, energies of turning clamps, tolerances: numbers that no motion depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.terms.term import Step
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+SHEET: dict[str, Any] = {
+    "mesh": grid(1.0, 0.8, 6, 5, "alternating"),
+    "material": CLOTH | {"bending": 1e-3},
+    "gravity": [0, 0, -9.81],
+}
+WEIGHT = 0.2 * 0.8 * 9.81
+STATIC = {"analysis": "static"}
+
+
+@contextmanager
+def done(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
+    simulation = Simulation(comm, scene_of(SHEET | content))
+    while not simulation.finished:
+        simulation.step()
+    yield simulation
+    simulation.destroy()
+
+
+def handle_sums(comm: MPI.Comm, handles: list[dict[str, Any]]) -> Array:
+    with done(comm, handles=handles, time=STATIC) as simulation:
+        return np.array(simulation.ledger.handle_forces(len(handles)))
+
+
+@pytest.mark.parametrize("stiffness", [None, 40.0])
+def test_handles_bear_the_weight(stiffness: float | None, comm: MPI.Comm) -> None:
+    """On any number of ranks, each of them, exact or soft: what they do to the sheet, upwards."""
+    soft = {} if stiffness is None else {"stiffness": stiffness}
+    handles = [{"nodes": [corner]} | soft for corner in (0, 6, 35, 41)]
+    forces = handle_sums(comm, handles)
+    np.testing.assert_allclose(forces.sum(axis=0), [0.0, 0.0, WEIGHT], rtol=0, atol=1e-6 * WEIGHT)
+    assert (forces[:, 2] > 0.2 * WEIGHT).all()
+    np.testing.assert_allclose(forces, handle_sums(MPI.COMM_SELF, handles), rtol=0, atol=1e-6 * WEIGHT)
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2"])
+def test_a_turning_clamp_stores_energy_where_it_stands(integrator: str, comm: MPI.Comm) -> None:
+    """Energies of a state are against the targets at its time, whatever time the stage had."""
+    turned = {"rotate": {"axis": [0, 1, 0], "degrees": -60}}
+    handles = [{"group": "left", "clamp": True, "motion": "turn"}]
+    motions = {"turn": [{"time": 0}, {"time": 0.1} | turned]}
+    time = {"end": 0.03, "step": 0.01, "integrator": integrator}
+    material = CLOTH | {"bending": 0.1}
+    scene = {"handles": handles, "motions": motions, "time": time, "material": material}
+    with done(comm, **scene) as simulation:
+        system, problem = simulation.problem.system, simulation.problem
+        end = Step(0.02, simulation.time, simulation.time, system.x, system.reference.at)
+        here = 0.0
+        for name in ("bending", "clamp"):
+            term: Any = problem.terms[name]
+            here += float(term.energies(system.x, term.freeze(end)).sum())
+        assert simulation.budget.bending == pytest.approx(comm.allreduce(here), rel=1e-12)
+        assert comm.allreduce(here) > 1e-4
+
+
+def test_statics_end_at_their_tolerance(comm: MPI.Comm) -> None:
+    """Not far above it, where it is loose enough for the last proximal step not to end far below."""
+    left = []
+    for tolerance in (1e-2, 1e-3, 1e-4, 1e-5):
+        content = {"handles": [{"nodes": [0, 6]}], "solver": {"force_tolerance": tolerance}, "time": STATIC}
+        with done(comm, **content) as simulation:
+            force = simulation.problem.system.out_of_balance()[0]
+            norm = np.sqrt(comm.allreduce(float(np.vdot(force, force))))
+            # the largest part of the forces is hardly larger than the pull of the two handles
+            left.append(norm / (tolerance * WEIGHT))
+    assert max(left) < 5.0, left
+
+
+def test_the_first_order_estimate_is_the_error_of_free_fall(comm: MPI.Comm) -> None:
+    """Where backward Euler errs by ½ g Δt² in every step, and errors add up."""
+    time = {"end": 0.2, "step": "auto", "tolerance": 0.02}
+    with done(comm, time=time) as simulation:
+        size = simulation.problem.outline.size
+        fallen = gathered(simulation.problem.points, simulation.problem.system.x)[:, 2]
+        error = np.abs(fallen + 0.5 * 9.81 * 0.2**2).max() / size
+        assert simulation.estimated_error == pytest.approx(error, rel=0.02)
+        assert error < 1.2 * 0.02
+
+
+def test_a_static_analysis_begins_in_balance(comm: MPI.Comm) -> None:
+    """What a start shape needs to stay is let go of with the load factor."""
+    still = {"gravity": [0, 0, 0], "initial": {"noise": 5e-3}, "handles": [{"nodes": [0, 6]}]}
+    simulation = Simulation(comm, scene_of(SHEET | still | {"time": STATIC}))
+    system, left = simulation.problem.system, []
+    for factor in (0.0, 0.5, 1.0):
+        system.load_factor = factor
+        system.begin_step(0.0, factor)
+        left.append(comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
+    assert left[0] < 1e-12 * left[2]
+    assert left[1] == pytest.approx(0.5 * left[2])
+    simulation.destroy()
+
+
+def test_a_load_that_switches_begins_the_scheme_anew() -> None:
+    """What generalised-α remembers of before the jump does not count after it: it stays of second order."""
+    content = {
+        "gravity": [0, 0, 0],
+        "mesh": grid(0.5, 0.4, 3, 2, "alternating"),
+        "material": CLOTH | {"bending": 1e-2, "damping": 2e-2},
+        "handles": [{"group": "left"}],
+        "loads": [{"group": "right", "force": [0, 0, 4.0], "from": 0.08}],
+    }
+    shapes = []
+    for step in (0.008, 0.004, 0.001):
+        time = {"end": 0.16, "step": step, "integrator": "alpha2"}
+        with done(MPI.COMM_SELF, **content, time=time) as simulation:
+            shapes.append(gathered(simulation.problem.points, simulation.problem.system.x))
+    coarse, fine = (np.abs(shape - shapes[-1]).max() for shape in shapes[:2])
+    assert coarse / fine > 3.2

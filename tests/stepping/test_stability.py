@@ -1,0 +1,182 @@
+"""Equilibria that are unstable are left for stable ones, and how they stand is counted right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from edge_angle_term import IN_PLACE_OF_HINGES
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.stepping import equilibrium
+from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.stability import Examination
+from lyra_petsc.terms import registry
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+BENDING, LENGTH = 1e-2, 1.0
+CRITICAL = 7.837 * 0.8 * BENDING / (9.81 * LENGTH**3)
+"""Density [kg/m²] at which an upright strip, clamped below, buckles under its weight (Greenhill 1881); hinges
+on a diagonal grid bend with 0.8 B."""
+
+
+def strip(weight: float) -> dict[str, Any]:
+    """An upright strip, clamped below, of so many times its critical weight."""
+    upright = {"transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
+    stretch = {"c11": 1e3, "c22": 1e3, "c12": 0.0, "c33": 500.0}
+    return {
+        "mesh": grid(0.1, LENGTH, 2, 20) | upright,
+        "material": {"density": weight * CRITICAL, "membrane": stretch, "bending": BENDING},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"box": [[-1, -1, -1e-6], [2, 1, 1e-6]], "clamp": True}],
+        "time": {"analysis": "static", "step": 1.0},
+    }
+
+
+@contextmanager
+def at_rest(comm: MPI.Comm, content: dict[str, Any]) -> Iterator[Simulation]:
+    """A scene's static analysis, done."""
+    simulation = Simulation(comm, scene_of(content))
+    while not simulation.finished:
+        simulation.step()
+    yield simulation
+    simulation.destroy()
+
+
+def shape(simulation: Simulation) -> Array:
+    return gathered(simulation.problem.points, simulation.problem.system.x)
+
+
+def test_a_strip_below_its_critical_weight_stands(comm: MPI.Comm) -> None:
+    with at_rest(comm, strip(0.95)) as simulation:
+        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
+        assert not simulation.notes
+        assert np.abs(shape(simulation)[:, 1]).max() < 1e-6 * LENGTH
+
+
+@pytest.mark.parametrize("weight", [1.05, 1.2, 1.5])
+def test_a_strip_above_it_falls_over(weight: float, comm: MPI.Comm) -> None:
+    with at_rest(comm, strip(weight)) as simulation:
+        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 0}
+        assert "its lowest mode was followed once" in simulation.notes[0]
+        tip = shape(simulation)[-1]
+        assert np.abs(tip[1]) > 0.3 * LENGTH
+        system = simulation.problem.system
+        free = system.out_of_balance()[0]
+        assert comm.allreduce(np.abs(free).max(initial=0.0), MPI.MAX) < 1e-6 * weight * CRITICAL
+
+
+def test_what_is_not_followed_far_enough_is_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equilibrium, "MOST_DESCENTS", 0)
+    with at_rest(comm, strip(1.5)) as simulation:
+        assert simulation.stability == {"stable": False, "negative_pivots": 1, "neutral_pivots": 0}
+        assert "unstable" in simulation.notes[0]
+        assert "followed 0 times" in simulation.notes[0]
+
+
+def test_unknowns_of_edges_leave_the_counts_alone(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equilibrium, "MOST_DESCENTS", 0)
+    counts = []
+    for terms in (registry.REGISTRY, IN_PLACE_OF_HINGES):
+        monkeypatch.setattr(registry, "REGISTRY", terms)
+        with at_rest(comm, strip(12.0)) as simulation:  # its second mode is critical at 7.1 times
+            counts.append(simulation.stability)
+            assert (simulation.problem.points.n_edges_global > 0) == (terms is IN_PLACE_OF_HINGES)
+    assert counts[0] == counts[1]
+    assert counts[0]["negative_pivots"] == 2
+
+
+def test_with_unknowns_of_edges_the_strip_falls_over(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    with at_rest(comm, strip(1.2)) as simulation:
+        hinges = np.abs(shape(simulation))
+    monkeypatch.setattr(registry, "REGISTRY", IN_PLACE_OF_HINGES)
+    with at_rest(comm, strip(1.2)) as simulation:
+        assert simulation.stability["stable"]
+        np.testing.assert_allclose(np.abs(shape(simulation)), hinges, rtol=0, atol=1e-5)
+
+
+PRESSED = {
+    "mesh": grid(1.0, 1.0, 4, 4),
+    "material": CLOTH,
+    "handles": [{"group": "left"}, {"group": "right", "motion": "in"}],
+    "motions": {"in": [{"time": 0}, {"time": 1, "translate": [-0.05, 0, 0]}]},
+    "time": {"analysis": "static", "step": 1.0},
+}
+
+
+def test_wrinkles_of_a_sheet_without_bending_are_told_not_followed(comm: MPI.Comm) -> None:
+    with at_rest(comm, PRESSED) as simulation:
+        assert simulation.stability["stable"] is False
+        assert simulation.stability["negative_pivots"] == 15  # every free vertex gives way across the sheet
+        assert "without bending" in simulation.notes[-1]
+        assert np.abs(shape(simulation)[:, 2]).max() == 0.0
+
+
+def test_what_nothing_resists_is_neutral(comm: MPI.Comm) -> None:
+    still = PRESSED | {"motions": {"in": [{"time": 0}]}}
+    with at_rest(comm, still) as simulation:
+        assert simulation.stability == {"stable": True, "negative_pivots": 0, "neutral_pivots": 15}
+        assert "nothing resists 15 motions" in simulation.notes[-1]
+
+
+def test_too_many_vertices_are_told(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lyra_petsc.stepping.stability.MOST_VERTICES", 10)
+    with at_rest(comm, strip(0.5)) as simulation:
+        assert simulation.stability["stable"] is None
+        assert simulation.stability["negative_pivots"] is None
+        assert "more than the 10" in simulation.stability["stability_unknown"]
+        assert any("is not known" in note for note in simulation.notes)
+
+
+FOLLOWING: dict[str, dict[str, Any]] = {
+    "pressure": {"loads": [{"pressure": 40.0}]},
+    "wind": {"wind": {"velocity": [1.0, 2.0, 5.0], "density": 1.2, "drag": 0.2}},
+    "neither": {},
+}
+
+
+@pytest.mark.parametrize("name", FOLLOWING)
+def test_the_hessian_is_the_slope_of_all_forces(name: str) -> None:
+    """Its symmetric part where loads follow the shape; by finite differences of forces on free unknowns."""
+    scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
+    simulation = Simulation(MPI.COMM_SELF, scene_of(scene))
+    system = simulation.problem.system
+    system.load_factor, system.unbalanced = 0.7, None
+    system.x[:, 0] *= 0.95
+    system.begin_step(0.3, 0.7)
+    free = np.flatnonzero(system.prescribed.free)
+    examination = Examination(system, 0.25, 1.4)
+    inertia = examination._inertia
+    assert inertia is not None
+    indices, columns, entries = inertia._matrix.mat.getValuesCSR()
+    dense = np.zeros((system.x.size, system.x.size))
+    dense[np.repeat(np.arange(len(dense)), np.diff(indices)), columns] = entries
+    dense = dense[np.ix_(free, free)]
+    slopes = np.empty_like(dense)
+    here = system.x.copy()
+    for column, place in enumerate(free):
+        force = []
+        for sign in (1.0, -1.0):
+            system.x.ravel()[:] = here.ravel()
+            system.x.ravel()[place] += sign * 1e-6
+            system.begin_step(0.3, 0.7)
+            force.append(system.out_of_balance()[0].ravel()[free])
+        slopes[:, column] = (force[1] - force[0]) / 2e-6
+    symmetric = 0.5 * (slopes + slopes.T)
+    np.testing.assert_allclose(dense, symmetric, rtol=0, atol=1e-6 * np.abs(slopes).max())
+    values = np.linalg.eigvalsh(symmetric)
+    assert examination.stability.negative == np.sum(values < 0.0)
+    assert examination.stability.negative > 0
+    mode = examination.mode()
+    assert mode is not None
+    assert mode.ravel()[free] @ symmetric @ mode.ravel()[free] == pytest.approx(values[0], rel=0.02)
+    examination.destroy()
+    simulation.destroy()
