@@ -156,7 +156,8 @@ class StageEquations:
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1)
         self._freeze(t0 + after)
-        if changed or t0 in self._events:
+        # a step may begin where a state was written, a rounding beside the event
+        if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
                 follower.disturbed()
         asking = [follower for follower in self.followers if follower.needs_acceleration]
@@ -319,6 +320,10 @@ class StageEquations:
     def moving_energy(self) -> float:
         """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
         return sum(float(term.energies(self.x, self.frozen[term]).sum()) for term in self._moving)
+
+    def pull_of(self, terms: Sequence[Elastic], x: Array) -> Array:
+        """Gradient (n_owned, 3) [N] of the energy of ``terms``, all without targets, at x (n_local, 3)."""
+        return self._sum(terms, x) if self._moving else self._internal(x)
 
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""

@@ -24,6 +24,7 @@ class Bdf2(Integrator):
     name = "bdf2"
     order = 2
     centred = True
+    judged_over = 4
 
     SHARE = 0.48
     """Of the third-order formula; up to 0.5 is A-stable."""
