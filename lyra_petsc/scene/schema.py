@@ -283,6 +283,24 @@ class Material(Block):
 Direction = Literal["x", "y", "z"]
 AXES: tuple[Direction, ...] = ("x", "y", "z")
 _AXES = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
+_ALL_AXES = {
+    "anyOf": [
+        {"type": "null"},
+        {"allOf": [{"not": {"items": {"not": {"const": axis}}}} for axis in AXES]},
+    ]
+}
+
+
+FASTEST = 1e8
+"""Largest speed [m/s] that anything may have; squares of larger ones are soon no numbers."""
+
+_NOT_TOO_FAST = Rule(
+    when(
+        given("velocity"), {"properties": {"velocity": {"items": {"minimum": -FASTEST, "maximum": FASTEST}}}}
+    ),
+    f"must not be faster than {FASTEST:g} m/s",
+    "velocity",
+)
 
 
 class UniformWind(Block):
@@ -297,6 +315,8 @@ class UniformWind(Block):
     drag : float [kg/(m² s)]
         Tangential drag coefficient.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     velocity: Vector
     density: NonNegative
@@ -352,7 +372,7 @@ class VertexChoice(Block):
 class Selector(VertexChoice):
     """Vertices by exactly one of group, nodes, box."""
 
-    rules = (exactly_one("group", "nodes", "box"),)
+    rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
 
 
 class Handle(Selector):
@@ -363,7 +383,7 @@ class Handle(Selector):
     axes : tuple of "x", "y", "z"
         Directions that are held.
     clamp : bool
-        Keep the slope of held boundary edges.
+        Keep the slope of held boundary edges; needs all axes.
     motion : str or None
         Name in ``motions``; without: held in place.
     interpolation : str
@@ -375,6 +395,15 @@ class Handle(Selector):
     stiffness : float [N/m] or None
         Per vertex and axis: a spring instead of a constraint.
     """
+
+    rules = (
+        *Selector.rules,
+        Rule(
+            when(given(clamp={"const": True}), {"properties": {"axes": _ALL_AXES}}),
+            "keeps the slope of an edge that does not move by itself; hold all axes, or leave clamp out",
+            "clamp",
+        ),
+    )
 
     axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
     clamp: Flag = False
@@ -424,6 +453,8 @@ class Keyframe(Block):
     velocity : (3,) [m/s] or None
         Of the translation; without: by central differences, zero at both ends.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     time: Number
     scale: Scale = 1.0
@@ -491,6 +522,8 @@ class Initial(Block):
     seed : int
         Of the noise.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     velocity: Vector = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)
