@@ -171,7 +171,11 @@ class StageEquations:
         self.moving_energy_before = self.moving_energy()
 
     def _accelerations(self) -> Array:
-        force, mass = self.out_of_balance()[0], self.mass[:, None]
+        v = self.v.copy()
+        self.prescribed.begin_with_rates(v[: self.points.n_owned])
+        self.points.update_ghosts(v)
+        parts = self._parts(self.x, v, np.zeros_like(self.history))
+        force, mass = np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
     def _freeze(self, at: float) -> None:
