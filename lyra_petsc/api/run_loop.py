@@ -209,6 +209,7 @@ class _RunLoop:
             "integrator": simulation.scene.time.scheme,
             "time": simulation.time,
             "estimated_error": simulation.estimated_error if simulation.local_error else None,
+            "energy_balance": simulation.guard.content() if simulation.guard else None,
             "steps": simulation.step_number,
             "steps_of_this_run": simulation.step_number - self._first_step,
             **simulation.totals,

@@ -356,7 +356,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
         )
         ours["material"].append({**_material(cloth.materials[0], i, path), **group})
     ours["motions"] = {
-        f"motion{i}": [_keyframe(keyframe) for keyframe in keyframes]
+        f"motion{i}": _the_shortest_way([_keyframe(keyframe) for keyframe in keyframes])
         for i, keyframes in enumerate(scene.motions)
     }
     ours["handles"] = [_handle(handle, i, labels, path) for i, handle in enumerate(scene.handles)]
@@ -389,6 +389,27 @@ def _keyframe(keyframe: OriginalKeyframe) -> dict[str, Any]:
     if keyframe.velocity is not None:
         block["velocity"] = list(keyframe.velocity.translate)
     return block
+
+
+def _the_shortest_way(keyframes: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same rotations, by angles that lead from one to the next by at most 180°.
+
+    The original interpolates quaternions, which know no more than that.
+    """
+    before: dict[str, Any] = {"axis": [0.0, 0.0, 1.0], "degrees": 0.0}
+    for keyframe in keyframes:
+        turn = keyframe.get("rotate", {"axis": before["axis"], "degrees": 0.0})
+        size = math.hypot(*turn["axis"]) * math.hypot(*before["axis"])
+        along = sum(a * b for a, b in zip(turn["axis"], before["axis"], strict=True)) / size
+        near = math.copysign(1.0, along) * before["degrees"] if abs(along) > 1.0 - 1e-12 else 0.0
+        whole = (turn["degrees"] - near) / 360.0
+        turn["degrees"] -= 360.0 * math.copysign(math.ceil(abs(whole) - 0.5), whole)
+        if turn["degrees"] != 0.0:
+            keyframe["rotate"] = turn
+        else:
+            keyframe.pop("rotate", None)
+        before = turn
+    return keyframes
 
 
 def _handle(handle: OriginalHandle, i: int, labels: ObjLabels, path: Path) -> dict[str, Any]:

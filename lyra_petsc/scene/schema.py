@@ -292,6 +292,24 @@ class Material(Block):
 Direction = Literal["x", "y", "z"]
 AXES: tuple[Direction, ...] = ("x", "y", "z")
 _AXES = {"type": "array", "items": {"enum": list(AXES)}, "minItems": 1}
+_ALL_AXES = {
+    "anyOf": [
+        {"type": "null"},
+        {"allOf": [{"not": {"items": {"not": {"const": axis}}}} for axis in AXES]},
+    ]
+}
+
+
+FASTEST = 1e8
+"""Largest speed [m/s] that anything may have; squares of larger ones are soon no numbers."""
+
+_NOT_TOO_FAST = Rule(
+    when(
+        given("velocity"), {"properties": {"velocity": {"items": {"minimum": -FASTEST, "maximum": FASTEST}}}}
+    ),
+    f"must not be faster than {FASTEST:g} m/s",
+    "velocity",
+)
 
 
 class UniformWind(Block):
@@ -306,6 +324,8 @@ class UniformWind(Block):
     drag : float [kg/(m² s)]
         Tangential drag coefficient.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     velocity: Vector
     density: NonNegative
@@ -361,7 +381,7 @@ class VertexChoice(Block):
 class Selector(VertexChoice):
     """Vertices by exactly one of group, nodes, box."""
 
-    rules = (exactly_one("group", "nodes", "box"),)
+    rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
 
 
 class Handle(Selector):
@@ -372,7 +392,7 @@ class Handle(Selector):
     axes : tuple of "x", "y", "z"
         Directions that are held.
     clamp : bool
-        Keep the slope of held boundary edges.
+        Keep the slope of held boundary edges; needs all axes.
     motion : str or None
         Name in ``motions``; without: held in place.
     interpolation : str
@@ -384,6 +404,15 @@ class Handle(Selector):
     stiffness : float [N/m] or None
         Per vertex and axis: a spring instead of a constraint.
     """
+
+    rules = (
+        *Selector.rules,
+        Rule(
+            when(given(clamp={"const": True}), {"properties": {"axes": _ALL_AXES}}),
+            "keeps the slope of an edge that does not move by itself; hold all axes, or leave clamp out",
+            "clamp",
+        ),
+    )
 
     axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
     clamp: Flag = False
@@ -433,6 +462,8 @@ class Keyframe(Block):
     velocity : (3,) [m/s] or None
         Of the translation; without: by central differences, zero at both ends.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     time: Number
     scale: Scale = 1.0
@@ -500,6 +531,8 @@ class Initial(Block):
     seed : int
         Of the noise.
     """
+
+    rules = (_NOT_TOO_FAST,)
 
     velocity: Vector = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)

@@ -7,7 +7,7 @@ bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is conve
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -43,9 +43,34 @@ class Budget:
     more: dict[str, float] = field(default_factory=dict)
 
     @property
+    def elastic(self) -> float:
+        """Energy [J] stored in the sheet."""
+        return self.membrane + self.bending + sum(self.more.values())
+
+    @property
     def total(self) -> float:
         """All energies [J] of the state."""
-        return self.kinetic + self.membrane + self.bending + self.potential + sum(self.more.values())
+        return self.kinetic + self.elastic + self.potential
+
+
+@dataclass(frozen=True)
+class Works:
+    """What a step did, by the forces at its stage.
+
+    Attributes
+    ----------
+    external, heat : float
+        Work [J] of handles, springs and loads without a potential, and of material damping.
+    moving : float
+        By how much the energy [J] of this rank's terms with moving targets is more than before the step.
+    damping : (m,)
+        Force [N] of material damping at the prescribed unknowns.
+    """
+
+    external: float
+    heat: float
+    moving: float
+    damping: Array
 
 
 class Ledger:
@@ -54,7 +79,11 @@ class Ledger:
     Attributes
     ----------
     budget : Budget
+    works : Works
+        Of the last step.
     """
+
+    works: Works
 
     def __init__(self, system: StageEquations) -> None:
         self._system = system
@@ -97,6 +126,14 @@ class Ledger:
         budget.more, budget.kinetic = dict(zip(self._more, sums[3:-1], strict=True)), sums[-1]
         return budget
 
+    def kept(self) -> tuple[Budget, float]:
+        """What `take_back` needs to forget the steps from here on."""
+        return replace(self.budget, more=dict(self.budget.more)), self._moving
+
+    def take_back(self, kept: tuple[Budget, float]) -> None:
+        """Forget what was recorded since; the step is repeated."""
+        self.budget, self._moving = kept
+
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
@@ -108,13 +145,18 @@ class Ledger:
         turned = system.moving_energy_before - self._moving + system.turn_targets_to_end()
         moved = system.x[: len(x_before)] - x_before
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
+        damping = np.zeros(len(self._at))
         if "damping" in parts:
             local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
+            damping = parts["damping"].take(self._at)
         del parts, external, moved  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
-        return self.measure()
+        moving = self._moving
+        self.measure()
+        self.works = Works(float(work), float(heat), self._moving - moving, damping)
+        return self.budget
 
     def _external(self, parts: Mapping[str, Array]) -> Array:
         """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F."""

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.scene.schema import Initial
+from lyra_petsc.scene.schema import FASTEST, Initial, Scene
 
 Array = NDArray[np.float64]
+
+RESOLVED = 1e6
+"""Mean edge over the round-off of the largest coordinate, at least."""
 
 
 def start_positions(initial: Initial, mesh: Mesh, held: dict[int, NDArray[np.int64]]) -> dict[str, Array]:
@@ -32,10 +36,45 @@ def start_positions(initial: Initial, mesh: Mesh, held: dict[int, NDArray[np.int
     return {"start": mesh.positions + amount[:, None] * summed}
 
 
-def start_velocities(initial: Initial, mesh: Mesh, mass: Array) -> dict[str, Array]:
-    """``velocity`` (V, 3) [m/s]: uniform, plus a rotation about the centre of mass; empty if zero."""
+def start_velocities(
+    initial: Initial, mesh: Mesh, mass: Array, *, file: object | None = None
+) -> dict[str, Array]:
+    """``velocity`` (V, 3) [m/s]: uniform, plus a rotation about the centre of mass; empty if zero.
+
+    Raises
+    ------
+    InputError
+        Beyond `FASTEST`.
+    """
     if not any(initial.velocity) and not any(initial.angular_velocity):
         return {}
     centre = mass @ mesh.positions / mass.sum()
-    spin = np.cross(np.asarray(initial.angular_velocity), mesh.positions - centre)
-    return {"velocity": np.asarray(initial.velocity) + spin}
+    with np.errstate(over="ignore", invalid="ignore"):
+        spin = np.cross(np.asarray(initial.angular_velocity), mesh.positions - centre)
+        velocity = np.asarray(initial.velocity) + spin
+    fastest = float(np.abs(velocity).max())  # whose square may not be a number
+    if not fastest <= FASTEST:
+        key = "velocity" if np.abs(initial.velocity).max() > FASTEST else "angular_velocity"
+        raise InputError(
+            f"lets vertices fly at {fastest:.3g} m/s; at most {FASTEST:g} m/s",
+            file=file,
+            key=f"initial.{key}",
+        )
+    return {"velocity": velocity}
+
+
+def check_resolved(spacing: float, reach: float, scene: Scene) -> None:
+    """Refuse a mesh whose edges, ``spacing`` [m] in the mean, are lost in coordinates up to ``reach`` [m].
+
+    Raises
+    ------
+    InputError
+    """
+    smallest = RESOLVED * float(np.finfo(np.float64).eps) * reach
+    if spacing < smallest:
+        raise InputError(
+            f"edges of {spacing:.3g} m in the mean are too short for coordinates of {reach:.3g} m, whose "
+            f"round-off moves them; at least {smallest:.2g} m: move the sheet nearer to the origin",
+            file=scene.source,
+            key="mesh",
+        )

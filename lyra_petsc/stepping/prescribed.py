@@ -125,6 +125,12 @@ class Prescribed:
         if self.held and self._span[1] > self._span[0]:
             self.put(velocity, self._rates(self._span[1]))
 
+    def begin_with_rates(self, velocity: Array) -> None:
+        """Write ẋ* [m/s] just after the start of the step, where it may jump, as `overwrite_with_rates`."""
+        if self.held and self._span[1] > self._span[0]:
+            start, end = self._span
+            self.put(velocity, self._rates(start + 1e-3 * (end - start)))
+
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
         """Write the positions [m] that handles prescribe at time ``at`` into ``out`` (n_owned, 3)."""
         self.held.targets(t0, t1, at, self._reference.at, out)

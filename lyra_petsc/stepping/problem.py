@@ -26,12 +26,12 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.initial_state import start_positions, start_velocities
+from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators.registry import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.motion import Window
-from lyra_petsc.terms.prescribed_handles import Held, is_exact, select_held
+from lyra_petsc.terms.motion import Window, motion_of
+from lyra_petsc.terms.prescribed_handles import Held, disagreements, is_exact, select_held
 from lyra_petsc.terms.registry import Role, active, registered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Term
@@ -149,10 +149,16 @@ def _give_back_freed() -> None:
 
 
 def events(scene: Scene) -> list[float]:
-    """Times [s] on which a step must end: handles and loads begin and end there."""
+    """Times [s] on which a step must end: handles and loads begin and end there, or velocities jump."""
     windows = [Window.of(handle) for handle in scene.handles]
+    jumps = [
+        t
+        for number, window in enumerate(windows)
+        for t in motion_of(scene, number).jumps
+        if window.start < t < window.until + window.fade
+    ]
     windows += [Window(load.start, load.until) for load in scene.loads]
-    return [t for window in windows for t in window.events()]
+    return [*(t for window in windows for t in window.events()), *jumps]
 
 
 def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
@@ -175,6 +181,8 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         names.append(entry.name)
         if found is not None:
             elements[entry.name] = found
+    spacing, reach = mean_edge_length(mesh), float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max()))
+    check_resolved(spacing, reach, scene)
     held = select_held(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
@@ -183,18 +191,19 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         elements[f"probe {name}"] = Elements(vertices[:, None])
     data = {"position": mesh.positions, "mass": rest.mass}
     if scene.initial is not None:
-        data |= start_positions(scene.initial, mesh, held) | start_velocities(scene.initial, mesh, rest.mass)
+        data |= start_positions(scene.initial, mesh, held)
+        data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     outline = Outline(
         n_vertices=mesh.n_vertices,
         n_triangles=mesh.n_triangles,
-        spacing=mean_edge_length(mesh),
+        spacing=spacing,
         size=float(np.linalg.norm(np.ptp(mesh.rest, axis=0))),
-        reach=float(max(np.abs(mesh.positions).max(), np.abs(mesh.rest).max())),
+        reach=reach,
         terms=names,
         sources=mesh.sources,
-        notes=[*mesh.notes, *rest.notes],
+        notes=[*mesh.notes, *rest.notes, *disagreements(scene, mesh, held)],
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None

@@ -20,6 +20,7 @@ from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.compression_watch import Compression
 from lyra_petsc.stepping.energy_balance import Budget, Ledger
+from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
@@ -28,7 +29,7 @@ from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.problem import Problem, build_problem, events
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
-from lyra_petsc.stepping.step_control import LoadControl, StepControl, ToleranceControl
+from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.ts_options import with_ts_options
 
@@ -158,6 +159,7 @@ class Simulation:
         if scene.time.analysis == "static":
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
         self.ledger = Ledger(system)
+        self.guard = EnergyGuard(system) if system.integrator.moves else None
 
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
@@ -218,25 +220,32 @@ class Simulation:
         """
         started = clock.perf_counter()
         system, n = self.problem.system, self.problem.points.n_owned
-        x_before = system.x.copy()
-        v_before = system.v.copy() if self.local_error is not None else system.v  # else no step is undone
-        newton = linear = rejected = 0
+        x_before, v_before = system.x.copy(), system.v.copy()
+        newton = linear = rejected = halvings = 0
         self._tried = []
         while True:
             end = self.control.next_end(self.time)
-            past = system.integrator.memory()
+            past, past_error = system.integrator.memory(), self.estimated_error
+            past_slope = self.local_error.memory() if self.local_error is not None else None
             with self.phases("solve"):
                 attempt = self._seek.attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
                 self._recover(attempt, end)
-            elif self._accurate(v_before[:n], end - self.time):
-                break
             else:
+                accurate = self._accurate(v_before[:n], end - self.time)
+                if accurate and self._keeps_energy(x_before, v_before, end):
+                    break
                 system.state.set(x_before[:n], v_before[:n])
                 system.integrator.restore(*past)
                 self.stepper.start(self.time, self.step_number)
+                if accurate:
+                    self.estimated_error = past_error
+                    if self.local_error is not None and past_slope is not None:
+                        self.local_error.restore(*past_slope)
+                    self._lessen(end - self.time, halvings)
+                    halvings += 1
             rejected += 1
         if isinstance(self._seek, Equilibrium) and self.control.is_end(end):
             with self.phases("solve"):
@@ -250,7 +259,8 @@ class Simulation:
         dt, self.time = end - self.time, end
         self.step_number += 1
         with self.phases("balance"):
-            self.ledger.record(x_before[:n])
+            if self.guard is None:
+                self.ledger.record(x_before[:n])
             when, told = f"step {self.step_number} ({self._now()})", "compression" in self._told
             note = self.compression.look(when, told=told)
         if note:
@@ -311,6 +321,35 @@ class Simulation:
                     f"the smallest Δt = {dt:.3g} s (-ts_adapt_dt_min)"
                 )
         return stands
+
+    def _keeps_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
+        """Whether the step just taken made no energy."""
+        if self.guard is None:
+            return True
+        with self.phases("balance"):
+            kept = self.ledger.kept()
+            after = self.ledger.record(x_before[: self.problem.points.n_owned])
+            balance = self.guard.balance(x_before, v_before, kept[0], after, self.ledger.works)
+            stands = self.guard.stands(balance)
+            if not stands:
+                self.ledger.take_back(kept)
+            return stands
+
+    def _lessen(self, dt: float, halvings: int) -> None:
+        """Halve a step that made energy, or give up; the state is that before it."""
+        assert self.guard is not None
+        where, scheme = f"step {self.step_number + 1} ({self._now()})", self.scene.time.scheme
+        if halvings >= HALVINGS or not self.control.shorten(dt, first=halvings == 0):
+            raise SolverError(
+                f"{where}: {scheme} {self.guard.words}, even with Δt = {dt:.3g} s; "
+                f"the state at {self._now()} is kept; try {self.guard.instead}",
+                collective=True,
+            )
+        if self.guard.gains.repeated == 1:
+            self.notes.append(
+                f"{where}: {scheme} {self.guard.words} with Δt = {dt:.3g} s; such steps are repeated with "
+                f"half of it (energy_balance in summary.json has their number); try {self.guard.instead}"
+            )
 
     def _recover(self, attempt: Attempt, end: float) -> None:
         self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
@@ -407,6 +446,7 @@ class Simulation:
             "integrator": self._numbers(),
             **self.stepper.memory(self.time)[1],
             **({"equilibrium": self._seek.memory()} if isinstance(self._seek, Equilibrium) else {}),
+            "energy": None if self.guard is None else self.guard.memory(),
             "late_starts": sorted(self.problem.system.reference.late),
         }
 
@@ -444,6 +484,9 @@ class Simulation:
             self._seek.restore(memory.get("equilibrium", {}))
         self.estimated_error = float(memory["estimated_error"])
         system.integrator.restore(arrays, memory["integrator"])
+        if self.guard is not None and memory.get("energy"):  # older ones have none
+            same = memory.get("scheme") == self.scene.time.scheme
+            self.guard.restore(memory["energy"], same=same)
         if self.local_error is not None:
             self.local_error.restore(arrays, memory["integrator"])
         for term in system.elastic:

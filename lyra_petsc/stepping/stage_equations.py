@@ -162,7 +162,8 @@ class StageEquations:
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1)
         self._freeze(t0 + after)
-        if changed or t0 in self._events:
+        # a step may begin where a state was written, a rounding beside the event
+        if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
                 follower.disturbed()
         asking = [follower for follower in self.followers if follower.needs_acceleration]
@@ -176,7 +177,11 @@ class StageEquations:
         self.moving_energy_before = self.moving_energy()
 
     def _accelerations(self) -> Array:
-        force, mass = self.out_of_balance()[0], self.mass[:, None]
+        v = self.v.copy()
+        self.prescribed.begin_with_rates(v[: self.points.n_owned])
+        self.points.update_ghosts(v)
+        parts = self._parts(self.x, v, np.zeros_like(self.history))
+        force, mass = np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
     def _freeze(self, at: float) -> None:
@@ -270,7 +275,7 @@ class StageEquations:
 
     def stay(self) -> None:
         """Let the stage be where the step starts; collective."""
-        self._evaluate_at(self.velocity_of_staying())
+        self.evaluate_at(self.velocity_of_staying())
 
     def accept(self, v: Array) -> None:
         """Take v (n_owned, 3) as the velocity of the stage and go to the end of the step; collective."""
@@ -333,6 +338,10 @@ class StageEquations:
     def moving_energy(self) -> float:
         """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
         return sum(float(term.energies(self.x, self.frozen[term]).sum()) for term in self._moving)
+
+    def pull_of(self, terms: Sequence[Elastic], x: Array) -> Array:
+        """Gradient (n_owned, 3) [N] of the energy of ``terms``, all without targets, at x (n_local, 3)."""
+        return self._sum(terms, x) if self._moving else self._internal(x)
 
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""

@@ -12,6 +12,12 @@ SLACK = 1e-6
 GROW_AFTER = 2
 """Successful steps after which a shortened Δt is doubled."""
 
+HALVINGS = 6
+"""How many times a step that was solved and is not good is halved."""
+
+MOST_PATIENCE = 128
+"""The most such steps, after others that were repeated because of their energy."""
+
 SAFETY = 0.85
 SHRINK, GROW = 0.2, 2.0
 """By how much a tolerance may change Δt at once; BDF2 is stable up to a factor of 2.4."""
@@ -39,6 +45,8 @@ class StepControl:
         Present Δt over the nominal one.
     good : int
         Successful steps since it last changed.
+    patience : int
+        Successful steps after which a shortened Δt is doubled.
     """
 
     def __init__(
@@ -47,7 +55,7 @@ class StepControl:
         self.step, self.end, self._every, self.smallest = step, end, every, smallest
         self._events = sorted({t for t in events if 0.0 < t < end} | {end})
         self.factor = 1.0
-        self.good = 0
+        self.good, self.patience = 0, GROW_AFTER
 
     def next_end(self, time: float) -> float:
         """End of the step that starts at ``time`` [s]."""
@@ -88,21 +96,39 @@ class StepControl:
         self.factor *= 0.5
         return True
 
+    def shorten(self, dt: float, *, first: bool) -> bool:
+        """Halve a step of dt [s] that was solved and is not good; False if it is as small as it may be.
+
+        After each step for which that is the ``first`` time a larger Δt is tried later.
+        """
+        self.good = 0
+        if first:
+            self.patience = min(2 * self.patience, MOST_PATIENCE)
+        if 0.5 * dt < self.smallest or self._halved(dt) >= HALVINGS:
+            return False
+        self.factor = 0.5 * dt / self.step
+        return True
+
+    def _halved(self, dt: float) -> int:
+        """How many times the nominal step was halved to dt [s], unless it was cut short to land somewhere."""
+        return round(math.log2(self.step / dt)) if dt >= self.factor * self.step * (1.0 - SLACK) else 0
+
     def succeeded(self, iterations: int) -> None:
         """Let a shortened Δt recover."""
         self.good += 1
-        if self.factor < 1.0 and self.good >= GROW_AFTER:
+        if self.factor < 1.0 and self.good >= self.patience:
             self.factor = min(1.0, 2.0 * self.factor)
             self.good = 0
 
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold to go on alike."""
-        return {"factor": self.factor, "good": self.good, "nominal": self.step}
+        return {"factor": self.factor, "good": self.good, "patience": self.patience, "nominal": self.step}
 
     def restore(self, memory: Mapping[str, float]) -> None:
         """Go on with a memory; one of another nominal step has no say."""
         if float(memory.get("nominal", self.step)) == self.step:
             self.factor, self.good = float(memory["factor"]), int(memory["good"])
+            self.patience = int(memory.get("patience", GROW_AFTER))
 
 
 class ToleranceControl(StepControl):
@@ -142,6 +168,9 @@ class ToleranceControl(StepControl):
 
     def succeeded(self, iterations: int) -> None:
         """The error alone decides."""
+
+    def _halved(self, dt: float) -> int:
+        return 0
 
     def restore(self, memory: Mapping[str, float]) -> None:
         """Go on with a memory; one of another largest step says how long the last was."""

@@ -5,23 +5,48 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.scene.schema import Handle, Keyframe, Scene
+from lyra_petsc.scene.schema import FASTEST, Handle, Keyframe, Rotation, Scene
 
 Array = NDArray[np.float64]
+
+HALF_TURN = 180.0
+"""Angle [degrees] up to which the interpolation of quaternions goes the way that angles say."""
+
+SAME_AXIS = 1e-12
+"""Squared sine of the angle between two axes below which they are one."""
+
+
+def _scaled(rotation: Rotation) -> Array:
+    """Its axis, with a largest component of 1: the square of another may not be a number."""
+    axis = np.asarray(rotation.axis, dtype=np.float64)
+    scaled: Array = axis / np.abs(axis).max()
+    return scaled
 
 
 def _quaternion(keyframe: Keyframe) -> Array:
     if keyframe.rotate is None:
         return np.array([1.0, 0.0, 0.0, 0.0])
-    axis = np.asarray(keyframe.rotate.axis, dtype=np.float64)
-    axis = axis / np.abs(axis).max()  # whose square may not be a number
     half = 0.5 * math.radians(keyframe.rotate.degrees)
+    axis = _scaled(keyframe.rotate)
     return np.concatenate([[math.cos(half)], math.sin(half) * axis / np.linalg.norm(axis)])
+
+
+def _way(first: Array, second: Array) -> tuple[Array, float]:
+    """Axis and angle [rad] of the shortest rotation that leads from one quaternion's to another's."""
+    a, b = second, first * np.array([1.0, -1.0, -1.0, -1.0])
+    real = a[0] * b[0] - a[1:] @ b[1:]
+    imaginary = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    size = float(np.linalg.norm(imaginary))
+    if size == 0.0:
+        return np.array([0.0, 0.0, 1.0]), 0.0
+    axis: Array = imaginary / size
+    return axis, 2.0 * math.atan2(size, float(real))
 
 
 def _rotation(q: Array) -> Array:
@@ -35,42 +60,85 @@ def _rotation(q: Array) -> Array:
     )
 
 
-class Motion:
-    """T(t) = translate ∘ rotate ∘ scale through keyframes.
+def _axis(keyframe: Keyframe) -> Array | None:
+    """Unit vector of a keyframe's rotation; None where it does not turn."""
+    if keyframe.rotate is None or keyframe.rotate.degrees == 0.0:
+        return None
+    axis = _scaled(keyframe.rotate)
+    unit: Array = axis / np.linalg.norm(axis)
+    return unit
 
-    Translation, scale and the quaternion of the rotation are interpolated component by component,
-    either linearly or by the cubic Hermite polynomial with central-difference tangents that vanish at
-    both ends (as the original Lyra does; a keyframe's ``velocity`` replaces the tangent of the
-    translation). Before the first and after the last keyframe the transform stands still. Quaternions
-    are taken as the angles are given, so that a turn of up to 360° between two keyframes goes the way
-    it says.
+
+def _turns(keyframes: Sequence[Keyframe], key: str) -> list[float | None]:
+    """By how many degrees the sheet turns between keyframes; None where their axes differ.
 
     Raises
     ------
     InputError
-        If two keyframes are a full turn apart (the interpolated quaternion would vanish), or their
-        scales differ in sign.
+        If axes differ and an angle exceeds 180°: there is no way that such angles say.
+    """
+    turns: list[float | None] = []
+    for i, (first, second) in enumerate(pairwise(keyframes)):
+        one, other = _axis(first), _axis(second)
+        angles = [k.rotate.degrees if k.rotate is not None else 0.0 for k in (first, second)]
+        if one is None or other is None:
+            turns.append(angles[1] - angles[0])
+        elif (along := float(one @ other)) ** 2 > 1.0 - SAME_AXIS:
+            turns.append(math.copysign(1.0, along) * angles[1] - angles[0])
+        elif max(map(abs, angles)) > HALF_TURN:
+            raise InputError(
+                f"keyframes {i} and {i + 1} turn about different axes, and one by more than 180°; give the "
+                "angle that leads there within 180°, or a keyframe with the same axis between them",
+                key=key,
+            )
+        else:
+            turns.append(None)
+    return turns
+
+
+class Motion:
+    """T(t) = translate ∘ rotate ∘ scale through keyframes.
+
+    Translation, scale and the quaternion of the rotation are interpolated component by component, either
+    linearly or by the cubic Hermite polynomial with central-difference tangents that vanish at both ends (as
+    the original Lyra does; a keyframe's ``velocity`` replaces the tangent of the translation). Before the
+    first and after the last keyframe the transform stands still. Between keyframes with the same axis the
+    sheet turns by the difference of the angles, of which quaternions know only 180°: where one is larger,
+    the angles of the whole motion are interpolated instead. Between different axes it goes the shortest way.
+
+    Raises
+    ------
+    InputError
+        If the axes of two keyframes differ and one of their angles exceeds 180°, scales differ in sign, or
+        it goes faster than `FASTEST`.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str = "motions") -> None:
         self._times = np.array([k.time for k in keyframes], dtype=np.float64)
-        rows = []
-        for k in keyframes:
+        n = len(keyframes)
+        turns = _turns(keyframes, key)
+        rows: list[Array] = []
+        side = 1.0  # a quaternion and its negative are the same rotation
+        for i, k in enumerate(keyframes):
             scale = np.broadcast_to(np.asarray(k.scale, dtype=np.float64), (3,))
-            rows.append(np.concatenate([k.translate, scale, _quaternion(k)]))
+            q = side * _quaternion(k)
+            if i and turns[i - 1] is None and q @ rows[-1][6:] < 0.0:
+                side, q = -side, -q
+            rows.append(np.concatenate([k.translate, scale, q]))
         self._values = np.array(rows)
-        n = len(rows)
         for i in range(n - 1):
-            if self._values[i, 6:] @ self._values[i + 1, 6:] < -0.98:
-                raise InputError(
-                    f"keyframes {i} and {i + 1} are nearly a full turn apart; put a keyframe between them",
-                    key=key,
-                )
             if np.any(self._values[i, 3:6] * self._values[i + 1, 3:6] < 0.0):
                 raise InputError(
                     f"scale changes its sign between keyframes {i} and {i + 1}; it would vanish between them",
                     key=key,
                 )
+        speeds = np.abs(np.diff(self._values[:, :3], axis=0)) / np.diff(self._times)[:, None]
+        if not np.all(speeds <= FASTEST):
+            i = int(np.argmax(~(speeds <= FASTEST).all(axis=1)))
+            raise InputError(
+                f"goes at {speeds[i].max():.3g} m/s from keyframe {i} to {i + 1}; at most {FASTEST:g} m/s",
+                key=key,
+            )
         self._tangents = np.zeros_like(self._values)
         self._linear = interpolation == "linear"
         if not self._linear and n > 2:
@@ -79,6 +147,47 @@ class Motion:
         for i, k in enumerate(keyframes):
             if k.velocity is not None:
                 self._tangents[i, :3] = k.velocity
+        self._windings: list[tuple[Array, float, float, float]] | None = None
+        if any(turn is not None and abs(turn) > HALF_TURN for turn in turns):
+            self._wind(keyframes, turns)
+
+    def _wind(self, keyframes: Sequence[Keyframe], turns: list[float | None]) -> None:
+        """Of each interval the axis and the angle [rad] of its turn, and its rates [rad/s] at both ends."""
+        rates = [0.0] * len(keyframes)
+        axes: list[Array] = []
+        angles: list[float] = []
+        for i, turn in enumerate(turns):
+            axis, angle = _way(self._values[i, 6:], self._values[i + 1, 6:])
+            if turn is not None:
+                given = [each for each in map(_axis, keyframes[i : i + 2]) if each is not None]
+                axis, angle = given[0] if given else axis, math.radians(turn)
+            axes.append(axis)
+            angles.append(angle)
+        if not self._linear:
+            for i in range(1, len(turns)):
+                along = float(axes[i - 1] @ axes[i])
+                if along**2 > 1.0 - SAME_AXIS:  # else it comes to rest before it turns about another axis
+                    span = self._times[i + 1] - self._times[i - 1]
+                    rates[i] = (angles[i - 1] * math.copysign(1.0, along) + angles[i]) / span
+        signs = [1.0 if i == 0 or axes[i - 1] @ axes[i] > 0.0 else -1.0 for i in range(len(turns))]
+        self._windings = []
+        for i, angle in enumerate(angles):
+            end = rates[i + 1] * (signs[i + 1] if i + 1 < len(signs) else 1.0)
+            self._windings.append((axes[i], angle, rates[i], end))
+
+    @property
+    def jumps(self) -> list[float]:
+        """Times [s] at which its velocity jumps."""
+        n = len(self._times)
+        if n == 1:
+            return []
+        if not self._linear:
+            return [float(self._times[i]) for i in (0, n - 1) if self._tangents[i].any()]
+        slopes = np.diff(self._values, axis=0) / np.diff(self._times)[:, None]
+        slopes = np.concatenate([np.zeros((1, 10)), slopes, np.zeros((1, 10))])
+        differ = np.abs(np.diff(slopes, axis=0)) > 1e-9 * np.abs(slopes).max(initial=0.0)
+        wound = np.full(n, self._windings is not None)
+        return [float(time) for time in self._times[differ.any(axis=1) | wound]]
 
     def _at(self, time: float) -> tuple[Array, Array]:
         """Interpolated components and their time derivatives, each (10,)."""
@@ -103,10 +212,31 @@ class Motion:
         slope = 6 * s * (s - 1) * (p - q) + (1 - s) * (1 - 3 * s) * m + s * (3 * s - 2) * n
         return value, slope / h
 
+    @property
+    def times(self) -> list[float]:
+        """Of the keyframes [s]."""
+        return [float(time) for time in self._times]
+
     def transform(self, time: float) -> tuple[Array, Array]:
         """Matrix (3, 3) and translation (3,) [m] of T(t): x ↦ A x + d."""
         value, _ = self._at(time)
-        return _rotation(value[6:]) * value[3:6], value[:3]
+        return self._turned(time, value[6:]) * value[3:6], value[:3]
+
+    def _turned(self, time: float, quaternion: Array) -> Array:
+        """Rotation (3, 3) at a time, of the interpolated quaternion or of the angle."""
+        times = self._times
+        if self._windings is None or not times[0] < time < times[-1]:
+            return _rotation(quaternion)
+        i = int(np.searchsorted(times, time, side="right")) - 1
+        h = times[i + 1] - times[i]
+        s = (time - times[i]) / h
+        axis, angle, first, last = self._windings[i]
+        part = s * angle
+        if not self._linear:
+            part = s * s * (3 - 2 * s) * angle + h * s * (1 - s) ** 2 * first - h * s * s * (1 - s) * last
+        turn = np.concatenate([[math.cos(0.5 * part)], math.sin(0.5 * part) * axis])
+        matrix: Array = _rotation(turn) @ _rotation(self._values[i, 6:])
+        return matrix
 
     def carried(self, points: Array, start: float, time: float) -> Array:
         """T(time) T(start)⁻¹ applied to ``points`` (n, 3) [m]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ Array = NDArray[np.float64]
 Selection = dict[int, NDArray[np.int64]]
 Reference = Callable[[float, NDArray[np.int64]], Array]
 """Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time."""
+
+SAME_PLACE = 1e-9
+"""Distance over the sheet's size up to which two handles hold a vertex in one place."""
 
 BYTES_PER_HELD_VERTEX = 100
 """Memory [B] of a vertex in a handle, while it is distributed and then held."""
@@ -46,6 +50,36 @@ def select_held(scene: Scene, mesh: Mesh) -> Selection:
                 key=key,
             )
     return selection
+
+
+def disagreements(scene: Scene, mesh: Mesh, held: Selection) -> list[str]:
+    """A note for each two exact handles that at some time hold the same vertices in different places."""
+    notes = []
+    windows = {number: Window.of(scene.handles[number]) for number in held}
+    slack = SAME_PLACE * float(np.ptp(mesh.positions, axis=0).max())
+    for first, second in combinations(held, 2):
+        start = max(windows[first].start, windows[second].start)
+        end = min(windows[first].until, windows[second].until, scene.time.end)
+        shared = sorted(set(scene.handles[first].axis_numbers) & set(scene.handles[second].axis_numbers))
+        if not (shared and start < end):
+            continue
+        vertices = np.intersect1d(held[first], held[second])
+        if not len(vertices):
+            continue
+        motions = [motion_of(scene, number) for number in (first, second)]
+        knots = sorted({start, end, *(t for m in motions for t in m.times if start < t < end)})
+        points = mesh.positions[vertices]
+        for time in sorted({*knots, *(0.7 * a + 0.3 * b for a, b in pairwise(knots))}):
+            places = [motion.carried(points, start, time)[:, shared] for motion in motions]
+            apart = np.abs(places[1] - places[0]).max(axis=1) > slack
+            if apart.any():
+                notes.append(
+                    f"handles[{first}] and handles[{second}] hold {int(apart.sum())} vertices (first: "
+                    f"{vertices[apart][0]}) in different places, as at t = {time:g} s; handles[{second}], "
+                    "the later in the scene, is followed"
+                )
+                break
+    return notes
 
 
 class Held:

@@ -255,3 +255,20 @@ def test_bad_material_files(folder: Path, table: object, key: str | None, words:
     assert caught.value.file == str(folder / "mine.json")
     assert caught.value.key == key
     assert words in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("given", "understood"),
+    [
+        ([0, 72, 144, 216, 288, 360], [0, 72, 144, 216, 288, 360]),
+        ([0, 450, 0], [0, 90, 0]),
+        ([0, 270, 360], [0, -90, 0]),
+        ([0, 3600, 180], [0, 0, 180]),
+        ([90, 180, 270, 0], [90, 180, 270, 360]),
+    ],
+)
+def test_motions_go_the_shortest_way(given: list[float], understood: list[float], folder: Path) -> None:
+    points = [{"time": i, "transform": {"rotate": [angle, 0, 0, 1]}} for i, angle in enumerate(given)]
+    scene = load_scene(write(folder, motions=[points]))
+    found = [k.rotate.degrees if k.rotate is not None else 0.0 for k in scene.motions["motion0"]]
+    assert found == understood

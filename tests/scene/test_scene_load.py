@@ -32,7 +32,7 @@ wind: {velocity: [0, 3, 0], density: 1.2}
 handles:
   - {group: pole}
   - {nodes: [2, 3], from: 1, until: 7, fade: 0.5, motion: swing, interpolation: linear}
-  - {box: [[-1, -1, -1], [0, 1, 1]], axes: [z, x], clamp: true, stiffness: 1000}
+  - {box: [[-1, -1, -1], [0, 1, 1]], axes: [z, x], stiffness: 1000}
 motions:
   swing: [{time: 1}, {time: 2, rotate: {axis: [0, 0, 1], degrees: -45}, velocity: [1, 0, 0]}]
 loads: [{group: tip, force: [0, 0, -1]}, {pressure: 10, until: 1}, {traction: [1, 0, 0], group: front}]

@@ -57,6 +57,9 @@ CASES = [
     ("mesh: {file: 3}", "mesh.file", "path of a mesh file"),
     ("handles: [{group: [a]}]", "handles[0].group", "must be text"),
     # not finite, out of range
+    ("initial: {velocity: [0, 1.0e+200, 0]}", "initial.velocity", "must not be faster than 1e+08 m/s"),
+    ("wind: {velocity: [0, -1.0e+9, 0], density: 1}", "wind.velocity", "faster than 1e+08 m/s"),
+    ("handles: [{nodes: [0], axes: [x, z], clamp: true}]", "handles[0].clamp", "hold all axes"),
     ("gravity: [0, 0, .nan]", "gravity", "finite"),
     ("time: {end: .inf, step: 0.1}", "time.end", "finite"),
     ("time: {end: 1" + "0" * 400 + ", step: 0.1}", "time.end", "below 1.8e308"),

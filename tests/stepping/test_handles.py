@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -102,19 +103,54 @@ def test_a_motion_is_relative_to_the_handles_start() -> None:
     np.testing.assert_allclose(motion.carried(np.zeros((1, 3)), 1.0, 1.0), [[0, 0, 0]])
 
 
-def test_keyframes_a_full_turn_apart_are_refused() -> None:
-    with pytest.raises(InputError, match="full turn") as refused:
-        Motion(
-            keyframes({"time": 0}, {"time": 1}, {"time": 2, "rotate": turn(360)}),
-            "hermite",
-            key="motions.swing",
-        )
-    assert refused.value.key == "motions.swing"
+@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize(
+    "degrees", [[0, 360], [0, 450], [0, -3600], [10, 3610, -90], [0, 90, 630], [0, 720, 0, 30]]
+)
+def test_angles_mean_what_they_say(degrees: list[float], kind: str) -> None:
+    rows = [{"time": i, "rotate": turn(angle, [0, 0, 2])} for i, angle in enumerate(degrees)]
+    # the same axis, the other way round, and none
+    rows[-1]["rotate"] = turn(-degrees[-1], [0, 0, -1])
+    motion = Motion(keyframes(*rows), kind)
+    times = np.linspace(0, len(degrees) - 1, 400 * (len(degrees) - 1) + 1)
+    points = np.array([[1.0, 0.0, 0.0]])
+    angles = np.degrees(np.unwrap([np.arctan2(*motion.carried(points, 0.0, t)[0, 1::-1]) for t in times]))
+    np.testing.assert_allclose(angles[::400], np.array(degrees) - degrees[0], atol=1e-9)
+    middle = motion.carried(points, 0.0, 0.5)
+    if kind == "linear" or len(degrees) == 2:
+        half = np.radians(0.5 * (degrees[1] - degrees[0]))
+        np.testing.assert_allclose(middle, [[np.cos(half), np.sin(half), 0.0]], atol=1e-12)
+    rates = np.diff(angles) / np.diff(times)
+    jumps = np.abs(np.diff(rates)).max() / np.abs(rates).max()
+    assert jumps < (0.05 if kind == "hermite" else 3.0)
+
+
+def test_several_turns_twist() -> None:
     content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "m"}]}
     content["motions"] = {"m": [{"time": 0}, {"time": 1, "rotate": turn(-360)}]}
-    with pytest.raises(InputError, match="put a keyframe between") as refused:
-        Simulation(content, MPI.COMM_SELF)
-    assert refused.value.key == "motions.m"
+    Simulation(content, MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("kind", ["linear", "hermite"])
+@pytest.mark.parametrize("extra", [[], [turn(30, [0, 1, 0]), turn(750, [0, 1, 0])]])
+def test_between_different_axes_it_goes_the_shortest_way(extra: list[dict[str, Any]], kind: str) -> None:
+    turns = [turn(170, [1, 0, 0]), turn(170, [-1, 0.1, 0]), turn(160, [-1, 0.1, 0]), *extra]
+    motion = Motion(keyframes(*({"time": i, "rotate": each} for i, each in enumerate(turns))), kind)
+    matrices = [motion.transform(t)[0] for t in np.linspace(0, 2, 201)]
+    ways = [np.arccos(np.clip(0.5 * (np.trace(b @ a.T) - 1.0), -1.0, 1.0)) for a, b in pairwise(matrices)]
+    ends = np.degrees(np.arccos(0.5 * (np.trace(matrices[100] @ matrices[0].T) - 1.0)))
+    assert ends < 30.0
+    assert np.degrees(sum(ways[:100])) == pytest.approx(ends, rel=0.05)
+    assert np.degrees(sum(ways[100:])) == pytest.approx(10.0, rel=0.05)
+
+
+def test_different_axes_and_more_than_half_a_turn_are_refused() -> None:
+    rows = keyframes(
+        {"time": 0}, {"time": 1, "rotate": turn(90)}, {"time": 2, "rotate": turn(181, [1, 0, 0])}
+    )
+    with pytest.raises(InputError, match=r"keyframes 1 and 2 .*180°") as refused:
+        Motion(rows, "hermite", key="motions.swing")
+    assert refused.value.key == "motions.swing"
 
 
 def test_a_scale_through_zero_is_refused() -> None:
@@ -336,3 +372,35 @@ def test_a_clamp_turns_with_its_handle() -> None:
         simulation.run(0.1, 10)
         end = simulation.run(1.0, 30)  # held still by now: the strip comes to rest, straight
         np.testing.assert_allclose(end, start @ rotation([0, 1, 0], -np.pi / 3).T, atol=1e-6)
+
+
+# -- handles that disagree -----------------------------------------------------------------------------
+
+LIFT = {"lift": [{"time": 0}, {"time": 1, "translate": [0, 0, 1]}], "same": [{"time": 0}, {"time": 1}]}
+
+
+@pytest.mark.parametrize(
+    ("handles", "told"),
+    [
+        ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "lift"}], True),
+        (
+            [
+                {"nodes": [0, 1], "motion": "lift"},
+                {"nodes": [1], "motion": "lift", "interpolation": "linear"},
+            ],
+            True,
+        ),
+        ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "lift", "from": 0.5}], True),
+        ([{"nodes": [0, 1]}, {"nodes": [1, 2], "motion": "same"}], False),
+        ([{"nodes": [0, 1], "axes": ["x", "y"]}, {"nodes": [1, 2], "motion": "lift"}], False),
+        ([{"nodes": [0, 1], "until": 0.5}, {"nodes": [1, 2], "motion": "lift", "from": 0.5}], False),
+        ([{"nodes": [0, 1], "stiffness": 10.0}, {"nodes": [1, 2], "motion": "lift"}], False),
+        ([{"nodes": [0, 1]}, {"nodes": [2], "motion": "lift"}], False),
+    ],
+)
+def test_handles_that_disagree_are_told(handles: list[dict[str, Any]], told: bool) -> None:
+    content = {"mesh": MESH, "handles": handles, "motions": LIFT, "time": {"end": 2.0, "step": 0.1}}
+    with Simulation(content, MPI.COMM_SELF) as simulation:
+        notes = [note for note in simulation.problem.outline.notes if "different places" in note]
+    assert len(notes) == told
+    assert all("hold 1 vertices (first: 1)" in note and "handles[1], the later" in note for note in notes)

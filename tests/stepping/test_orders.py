@@ -56,3 +56,32 @@ def test_observed_order(integrator: str, comm: MPI.Comm) -> None:
     shapes = [at_end(integrator, steps, comm) for steps in (40, 80, 160)]
     first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
     assert np.log2(first / second) == pytest.approx(ORDERS[integrator], abs=0.1)
+
+
+SWITCHED = MOVING | {
+    "handles": [
+        MOVING["handles"][0] | {"until": 0.12},
+        {"nodes": [19], "stiffness": 3.0, "motion": "sway", "from": 0.04, "until": 0.1},
+        {"nodes": [15], "motion": "sway", "from": 0.12},
+        {"nodes": [4], "axes": ["z"], "until": 0.06},
+        {"nodes": [5], "motion": "kinks", "interpolation": "linear", "from": 0.04},
+    ],
+    "motions": MOVING["motions"]
+    | {"kinks": [{"time": 0.044}, {"time": 0.08, "translate": [0.02, 0, 0.03]}, {"time": 0.12}]},
+    "loads": [
+        {"pressure": 1.0, "from": 0.02},
+        {"nodes": [17], "force": [0, 0, 0.05], "from": 0.06, "until": 0.1},
+    ],
+}
+"""Forces, holds and velocities of handles jump in mid-run."""
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
+def test_second_order_across_jumps(integrator: str, comm: MPI.Comm) -> None:
+    shapes = []
+    for steps in (40, 80, 160):
+        time = {"end": END, "step": END / steps, "integrator": integrator}
+        with Simulation(SWITCHED | {"time": time}, comm, options={}) as simulation:
+            shapes.append(simulation.run(END / steps, steps))
+    first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
+    assert np.log2(first / second) == pytest.approx(2.0, abs=0.25)

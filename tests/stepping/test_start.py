@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, grid
+
+from lyra_petsc.errors import InputError
 
 MESH = {
     "grid": {"width": 1, "height": 1, "nx": 6, "ny": 6},
@@ -61,3 +65,31 @@ def test_the_seed_decides() -> None:
 def test_noise_is_no_part_of_the_rest_shape() -> None:
     with Simulation({"mesh": MESH, "initial": {"noise": 1e-3}}, MPI.COMM_SELF) as simulation:
         assert simulation.energy("membrane") > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"initial": {"angular_velocity": [0, 0, 1e9]}}, "initial.angular_velocity"),
+        ({"initial": {"angular_velocity": [0, 1e200, 1e200]}}, "initial.angular_velocity"),
+        ({"mesh": MESH | {"transform": {"translate": [1e12, 0, 0]}}}, "mesh"),
+    ],
+)
+def test_what_double_precision_does_not_resolve_is_refused(change: dict[str, Any], key: str) -> None:
+    with pytest.raises(InputError) as refused:
+        Simulation({"mesh": MESH} | change, MPI.COMM_SELF)
+    assert refused.value.key == key
+
+
+def test_a_sheet_far_away_is_simulated() -> None:
+    far = MESH | {"transform": {"translate": [1e8, 0, 0]}}
+    with Simulation({"mesh": far, "initial": {"velocity": [1e7, 0, 0]}}, MPI.COMM_SELF) as simulation:
+        assert np.isfinite(simulation.x).all()
+
+
+def test_a_motion_that_is_too_fast_is_refused() -> None:
+    content = {"mesh": MESH, "handles": [{"nodes": [0], "motion": "m"}]}
+    content["motions"] = {"m": [{"time": 0}, {"time": 1e-3, "translate": [0, 1e6, 0]}]}
+    with pytest.raises(InputError, match=r"1e\+09 m/s from keyframe 0 to 1") as refused:
+        Simulation(content, MPI.COMM_SELF)
+    assert refused.value.key == "motions.m"

@@ -24,6 +24,7 @@ class GeneralisedAlpha(Integrator):
     name = "alpha2"
     order = 2
     centred = True
+    judged_over = 4
     given = True
 
     def __init__(self, radius: float) -> None:

@@ -18,12 +18,14 @@ class Bdf2(Integrator):
 
     Over two past states; over three where the steps are equal, then with 48 % of the third-order formula,
     which keeps the second-order one's damping (L-stable) and halves its error: BDF2OPT, Vatsa, Carpenter &
-    Lockard, AIAA 2010-122. The first step is one of generalised-α with spectral radius 0.
+    Lockard, AIAA 2010-122. The first step, and that after a jump of the forces, is one of generalised-α with
+    spectral radius 0.
     """
 
     name = "bdf2"
     order = 2
     centred = True
+    judged_over = 4
 
     SHARE = 0.48
     """Of the third-order formula; up to 0.5 is A-stable."""
@@ -54,6 +56,8 @@ class Bdf2(Integrator):
         self._starter.start_from(acceleration)
 
     def disturbed(self) -> None:
+        # a polynomial through states before and after a jump is of first order
+        self._past = []
         self._starter.disturbed()
 
     def stage_after(self, dt: float) -> float:

@@ -102,6 +102,9 @@ class Integrator(Forgetful, ABC):
         It is a motion in time, with damping.
     centred : bool
         What is frozen during a step is frozen at the extrapolated stage, as second order needs.
+    judged_over : int
+        Steps over which its gain of energy is averaged before it is judged: a scheme of several steps gives
+        back in the next ones what it has taken in one.
     given : bool
         Prescribed coordinates take part in the stage with their exact position and velocity at its
         time; else with the velocity that the integrator gives them for their position at the end.
@@ -113,6 +116,7 @@ class Integrator(Forgetful, ABC):
     lagged_loads: ClassVar[bool] = False
     moves: ClassVar[bool] = True
     centred: ClassVar[bool] = False
+    judged_over: ClassVar[int] = 1
     given: bool = False
 
     @property

@@ -1,0 +1,359 @@
+"""Whether a step made energy that nothing put in: what no integrator may do unseen.
+
+The gain of a step, with the kinetic energy T of the free coordinates, all elastic energies U (springs and
+clamps too), the potential V of gravity, the heat D of the material damping and the work W of handles, loads
+and wind::
+
+    G = Δ(T + U + V) + D − W
+
+W is by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure with the
+geometry there, times the way. (The integrator's own forces, at its stage, balance a blow-up as well.) A
+target that moves works by the mean over both ends of what its motion does to the energy, which for springs is
+the same rule. G is judged against the scale ::
+
+    S = largest so far of T + U + |V − V₀| + Σ|W| + ΣD
+
+G < 0 is numerical dissipation: allowed, and summed up.
+
+Backward Euler has an identity instead, in which W is the work of the forces at the end of the step::
+
+    Δ(T + U + V) + D − W = −½ ‖Δv‖²_M + bracket        bracket = U(x_{n+1}) − U(x_n) − ∇U(x_{n+1})·Δx
+
+so that it makes energy only where U is not convex. The lesser of the two is judged: where air brakes a sheet
+within a step, the force at its start times the way is many times the work of any real brake.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.stepping.energy_balance import Budget, Works
+from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.stepping.state import fitted
+from lyra_petsc.terms.registry import Role
+from lyra_petsc.terms.term import Elastic, Step
+
+Array = NDArray[np.float64]
+
+LARGEST_GAIN = 0.01
+"""Gain of a step, over S, above which it is repeated."""
+
+LARGEST_SUM = 0.05
+"""Sum of the gains since the start, or over the last steps, over S, above which the step is repeated."""
+
+RECENT = 20
+"""How many steps the last ones are."""
+
+INSTEAD = {"midpoint": "bdf2", "alpha2": "bdf2", "bdf2": "beuler", "semi-implicit": "beuler"}
+"""The integrator to take where another one makes energy."""
+
+ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
+"""Relative round-off of a sum of energies."""
+
+
+@dataclass
+class Gains:
+    """What the guard remembers between steps; energies in J.
+
+    Attributes
+    ----------
+    start : float or None
+        V₀; None before the first step.
+    scale : float
+        S.
+    total : float
+        Sum of the gains since the start.
+    lost, won : float
+        Sums of the negative ones, as a positive number, and of the others.
+    work, heat : float
+        Σ|W|, ΣD.
+    inertia, bracket : float
+        Of backward Euler's identity: Σ ½ ‖Δv‖²_M, and the sum of its brackets.
+    recent : list of float
+        Gains of the last steps, the newest last.
+    repeated : int
+        Attempts that were rejected.
+    """
+
+    start: float | None = None
+    scale: float = 0.0
+    total: float = 0.0
+    lost: float = 0.0
+    won: float = 0.0
+    work: float = 0.0
+    heat: float = 0.0
+    inertia: float = 0.0
+    bracket: float = 0.0
+    recent: list[float] = field(default_factory=list)
+    repeated: int = 0
+
+
+@dataclass(frozen=True)
+class Balance:
+    """What a step did; J, the same on every rank.
+
+    Attributes
+    ----------
+    gain : float
+        G.
+    work, heat : float
+        W, D.
+    potential_before, potential : float
+        V at its ends.
+    stored_before, stored : float
+        T + U at its ends.
+    inertia, bracket : float
+        ½ ‖Δv‖²_M, and what the work of the stage's forces leaves unexplained but for it.
+    noise : float
+        Round-off of all that.
+    """
+
+    gain: float
+    work: float
+    heat: float
+    potential_before: float
+    potential: float
+    stored_before: float
+    stored: float
+    inertia: float
+    bracket: float
+    noise: float
+
+
+class EnergyGuard:
+    """Judges the steps of a motion; collective, and the same on all ranks.
+
+    Parameters
+    ----------
+    system : StageEquations
+    """
+
+    def __init__(self, system: StageEquations) -> None:
+        self._system = system
+        elastic = system.elastic
+        self._targets = [
+            t for t in elastic if t.registration.moving or t.registration.role is Role.CONSTRAINT
+        ]
+        self._plain = [term for term in elastic if term not in self._targets]
+        self._weights = [load for load in system.loads if load.registration.energy]
+        self._forces = [load for load in system.loads if not load.registration.energy]
+        self._pull: tuple[float, Array] | None = None
+        self._next_pull: tuple[float, Array] | None = None
+        self._stiffness: float | None = None
+        self.gains = Gains()
+
+    # -- a step ------------------------------------------------------------------------------------
+
+    def balance(self, x0: Array, v0: Array, before: Budget, after: Budget, works: Works) -> Balance:
+        """Of the step just taken from x0, v0 (n_local, 3), from what the ledger says of it; collective."""
+        system = self._system
+        layout, n = system.points, system.points.n_owned
+        if system.discretisation.changes:  # there may be other ghosts by now
+            x0, v0 = fitted(x0, n, layout.n_local), fitted(v0, n, layout.n_local)
+            for values in (x0, v0):
+                layout.update_ghosts(values)
+        x1, v1, free = system.x, system.v, system.prescribed.free
+        moved, mass = x1[:n] - x0[:n], system.mass[:, None]
+        slower, faster = (0.5 * float(np.sum(mass * v[:n] ** 2, where=free)) for v in (v0, v1))
+        change = 0.5 * float(np.sum(mass * (v1[:n] - v0[:n]) ** 2))
+        work = float(np.vdot(self._outer_force(x0, v0, x1, v1), np.where(free, moved, 0.0)))
+        work += self._handle_work(x0, x1, moved, works)
+        pulled = self._of_targets(x0, x1)
+        reach = max(float(np.abs(x).max(initial=0.0)) for x in (x0, x1))
+        local = (slower, faster, change, work, *pulled, works.moving, self._stiff * reach**2)
+        sums = [float(value) for value in layout.summed(*local)]
+        slower, faster, change, work, rise, from_targets, *springs, moving, stiff = sums
+        work += from_targets
+        plain = after.elastic - before.elastic - moving
+        heat, fall = works.heat, after.potential - before.potential
+        gain = faster - slower + plain + rise + fall + heat - work
+        energy, energy_before = faster + after.elastic + springs[1], slower + before.elastic + springs[0]
+        sizes = energy + energy_before + abs(work) + abs(heat) + abs(before.potential) + abs(after.potential)
+        noise = ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy) * stiff) + ROUND_OFF * stiff)
+        unexplained = after.total - before.total + heat - works.external
+        return Balance(
+            gain=gain,
+            work=work,
+            heat=heat,
+            potential_before=before.potential,
+            potential=after.potential,
+            stored_before=energy_before,
+            stored=energy,
+            inertia=change,
+            bracket=unexplained + change,
+            noise=noise,
+        )
+
+    def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
+        """What terms freeze with their targets where they are at time ``at`` [s] of the step."""
+        system = self._system
+        step = Step(system.t0, system.t1, at, x, system.reference.at)
+        return {term: term.freeze(step) for term in terms}
+
+    def _of_targets(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
+        """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
+        the energy of springs at both ends."""
+        system, rise, work, springs = self._system, 0.0, 0.0, [0.0, 0.0]
+        first = self._frozen(self._targets, system.t0, x0)
+        last = self._frozen(self._targets, system.t1, x1)
+        for term in self._targets:
+            at = [[float(term.energies(x, f[term]).sum()) for f in (first, last)] for x in (x0, x1)]
+            rise += at[1][1] - at[0][0]
+            work += 0.5 * (at[0][1] - at[0][0] + at[1][1] - at[1][0])
+            if not term.registration.energy:
+                springs = [springs[0] + at[0][0], springs[1] + at[1][1]]
+        return rise, work, springs[0], springs[1]
+
+    def _outer_force(self, x0: Array, v0: Array, x1: Array, v1: Array) -> Array:
+        """Mean over both ends of loads without a potential and of wind (n_owned, 3) [N]."""
+        system = self._system
+        t0, t1 = system.t0, system.t1
+        force = np.zeros_like(x1)
+        for x, v in ((x0, v0), (x1, v1)):
+            for load in self._forces:
+                if load.follows or x is x1:
+                    load.add_force(x, t0, t1, force)
+                    if not load.follows:
+                        load.add_force(x, t0, t1, force)
+            wind = np.zeros_like(force)
+            for term in system.viscous:
+                term.add_gradient(v, term.freeze(Step(t0, t1, t0, x, system.reference.at)), wind)
+            force -= wind
+        force *= 0.5
+        return force[: system.points.n_owned]
+
+    def _handle_work(self, x0: Array, x1: Array, moved: Array, works: Works) -> float:
+        """Work [J] of exact handles on this rank, by the mean over both ends of what the sheet and its weight
+        pull them with."""
+        system, self._next_pull = self._system, None
+        at = system.prescribed.at
+        way = moved.take(at)
+        if not way.any():  # most handles stand still
+            return 0.0
+        n = system.points.n_owned
+        if self._pull is None or self._pull[0] != system.t0:
+            self._pull = system.t0, system.pull_of(self._plain, x0)
+        self._next_pull = system.t1, system.pull_of(self._plain, x1)
+        force = 0.5 * (self._pull[1] + self._next_pull[1]).take(at)
+        targets = np.zeros_like(x1)
+        for time, x in ((system.t0, x0), (system.t1, x1)):
+            for term, frozen in self._frozen(self._targets, time, x).items():
+                term.add_gradient(x, frozen, targets)
+        weight = np.zeros_like(x1)
+        for load in self._weights:
+            load.add_force(x1, system.t0, system.t1, weight)
+        force += 0.5 * targets[:n].take(at) - weight[:n].take(at) + works.damping
+        return float(np.vdot(force, way))
+
+    @property
+    def _stiff(self) -> float:
+        """Sum [N/m] of what this rank's elastic forces are proportional to."""
+        if self._stiffness is None:
+            terms = [term for term in self._system.elastic if not term.registration.neighbours]
+            self._stiffness = sum(float(term.force_scale(1.0)[: term.n_owned].sum()) for term in terms)
+        return self._stiffness
+
+    # -- the verdict -------------------------------------------------------------------------------
+
+    def stands(self, step: Balance) -> bool:
+        """Whether a step may stand; then it is remembered. The same on all ranks; collective."""
+        new = self._with(step)
+        over = self._system.integrator.judged_over
+        of_step = math.fsum(new.recent[-over:]) / min(over, len(new.recent))
+        of_steps = max(new.total, math.fsum(new.recent))
+        self.gain = of_step, of_steps, new.scale
+        good = of_step <= max(LARGEST_GAIN * new.scale, step.noise)
+        good = good and of_steps <= max(LARGEST_SUM * new.scale, step.noise)
+        good = bool(self._system.points.comm.bcast(good, root=0))
+        if good:
+            self.gains, self._pull = new, self._next_pull
+        else:
+            self.gains.repeated += 1
+        return good
+
+    @property
+    def _by_identity(self) -> bool:
+        """Whether it is backward Euler."""
+        return self._system.integrator.name == "beuler"
+
+    def _with(self, step: Balance) -> Gains:
+        """What would be remembered with a step."""
+        old = self.gains
+        start = step.potential_before if old.start is None else old.start
+        judged = step.gain
+        if self._by_identity:
+            judged = min(judged, step.bracket - step.inertia)
+        work, heat = old.work + abs(step.work), old.heat + step.heat
+        return Gains(
+            start=start,
+            scale=max(
+                old.scale,
+                step.stored_before + abs(step.potential_before - start),
+                step.stored + abs(step.potential - start) + work + heat,
+            ),
+            total=old.total + judged,
+            lost=old.lost + max(0.0, -step.gain),
+            won=old.won + max(0.0, step.gain),
+            work=work,
+            heat=heat,
+            inertia=old.inertia + step.inertia,
+            bracket=old.bracket + step.bracket,
+            recent=[*old.recent, judged][-RECENT:],
+            repeated=old.repeated,
+        )
+
+    # -- in words ----------------------------------------------------------------------------------
+
+    @property
+    def words(self) -> str:
+        """What the step judged last made of nothing."""
+        of_step, of_steps, scale = self.gain
+        if not (math.isfinite(scale) and math.isfinite(of_step)):
+            return "makes energy without bounds"
+        share, what = of_step / scale, ""
+        if share <= LARGEST_GAIN:
+            share, what = of_steps / scale, " in the steps so far"
+        return f"makes {100.0 * share:.2g} % of the energy at work out of nothing{what}"
+
+    @property
+    def instead(self) -> str:
+        """What to take instead of the integrator."""
+        name = self._system.integrator.name
+        other = INSTEAD.get(name)
+        if other:
+            return f"time.integrator: {other}"
+        return "a smaller time.step, more material.damping, or a finer mesh where the sheet buckles"
+
+    def content(self) -> dict[str, Any]:
+        """For the summary: energies as shares of the scale, which is in J."""
+        gains, scale = self.gains, self.gains.scale or 1.0
+        found: dict[str, Any] = {
+            "scale": gains.scale,
+            "numerical_dissipation": gains.lost / scale,
+            "numerical_gain": gains.won / scale,
+            "repeated": gains.repeated,
+        }
+        if self._by_identity:
+            found["identity"] = {
+                "velocity_changes": gains.inertia / scale,
+                "bracket": gains.bracket / scale,
+            }
+        return found
+
+    # -- checkpoints -------------------------------------------------------------------------------
+
+    def memory(self) -> dict[str, Any]:
+        """What a checkpoint must hold."""
+        return asdict(self.gains)
+
+    def restore(self, memory: Mapping[str, Any], *, same: bool) -> None:
+        """Go on with a memory; with another integrator (not ``same``) its gains are counted anew."""
+        self.gains = Gains(**memory)
+        if not same:
+            self.gains.total, self.gains.recent = 0.0, []

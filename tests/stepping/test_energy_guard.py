@@ -1,0 +1,149 @@
+"""No integrator makes energy unseen: steps that do are repeated, and what is lost is told."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import grid, scene_of
+
+from lyra_petsc.errors import SolverError
+from lyra_petsc.stepping.simulation import Simulation
+
+MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
+SHELL = {"membrane": MEMBRANE, "bending": 1e-3}
+
+FREE: dict[str, Any] = {
+    "mesh": grid(1.0, 1.0, 12, 12, "alternating"),
+    "material": {"density": 0.15, **SHELL},
+    "initial": {"noise": 0.005, "angular_velocity": [0.0, 0.0, 2.0]},
+    "solver": {},
+}
+"""Too stiff for a Δt of 10 ms; nothing acts on it."""
+
+
+def simulation(
+    comm: MPI.Comm, integrator: str, content: dict[str, Any], end: float = 0.2, step: float = 0.01
+) -> Simulation:
+    time = {"end": end, "step": step, "integrator": integrator}
+    return Simulation(comm, scene_of({"time": time} | content))
+
+
+def run(one: Simulation) -> list[float]:
+    """Energy [J] at the start and after each step."""
+    energies = [one.budget.total]
+    while not one.finished:
+        one.step()
+        energies.append(one.budget.total)
+    return energies
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
+def test_a_free_sheet_gains_nothing(integrator: str, comm: MPI.Comm) -> None:
+    one = simulation(comm, integrator, FREE)
+    energies, content = run(one), one.guard.content() if one.guard else {}
+    notes = [note for note in one.notes if "out of nothing" in note]
+    one.destroy()
+    assert max(energies) < 1.05 * energies[0]
+    assert content["scale"] >= max(energies)
+    assert len(notes) == (integrator != "beuler")
+    assert (content["repeated"] > 0) == bool(notes)
+    if integrator == "beuler":
+        lost = (energies[0] - energies[-1]) / content["scale"]
+        assert content["numerical_dissipation"] == pytest.approx(lost, rel=1e-6)
+        identity = content["identity"]
+        assert identity["velocity_changes"] - identity["bracket"] == pytest.approx(lost, rel=1e-4)
+    else:
+        assert "time.integrator: b" in notes[0]
+
+
+def test_a_step_that_was_repeated_is_counted() -> None:
+    one = simulation(MPI.COMM_SELF, "bdf2", FREE, 0.05)
+    first = one.step()
+    assert first.rejected >= 1
+    assert first.dt == pytest.approx(0.01 / 2**first.rejected)
+    one.destroy()
+
+
+def test_what_it_remembers_goes_into_checkpoints() -> None:
+    one, other = (simulation(MPI.COMM_SELF, "alpha2", FREE) for _ in range(2))
+    for _ in range(7):
+        one.step()
+    memory, arrays = json.loads(json.dumps(one.memory())), one.arrays()
+    system = one.problem.system
+    other.problem.system.state.set(system.x.copy(), system.v.copy())
+    other.resume(memory, {name: values.copy() for name, values in arrays.items()})
+    assert run(other) == pytest.approx(run(one), rel=2e-6)  # with other first guesses
+    assert one.guard is not None
+    assert other.guard is not None
+    assert one.guard.gains.repeated == other.guard.gains.repeated > 0
+    assert other.guard.gains.recent == pytest.approx(one.guard.gains.recent, abs=2e-7)
+    assert other.guard.gains.scale == pytest.approx(one.guard.gains.scale, rel=1e-12)
+    for each in (one, other):
+        each.destroy()
+
+
+STIFF = FREE | {
+    "mesh": grid(1.0, 1.0, 6, 6, "alternating"),
+    "material": {"density": 0.15, "membrane": {key: 1e4 * c for key, c in MEMBRANE.items()}, "bending": 1e-3},
+}
+
+
+@pytest.mark.parallel
+def test_after_six_halvings_the_run_is_given_up(comm: MPI.Comm) -> None:
+    one = simulation(comm, "midpoint", STIFF, 0.8, 0.04)
+    states: list[tuple[NDArray[np.float64], dict[str, Any]]] = []
+
+    def on() -> None:
+        while True:
+            states.append((one.problem.system.x.copy(), dict(vars(one.budget))))
+            one.step()
+
+    words = r"even with Δt = 0.000625 s.*time.integrator: bdf2"
+    with pytest.raises(SolverError, match=words) as error:
+        on()
+    before, start = states[-1]
+    assert error.value.collective
+    np.testing.assert_array_equal(one.problem.system.x, before)
+    assert dict(vars(one.budget)) == start
+    one.destroy()
+
+
+DRIVEN: dict[str, Any] = {
+    "mesh": grid(0.5, 0.4, 5, 4, "alternating"),
+    "material": {"density": 0.2, "damping": 0.01, **SHELL},
+    "gravity": [0.0, 0.0, -9.81],
+    "wind": {"velocity": [1.0, 2.0, 3.0], "density": 1.2, "drag": 0.3},
+    "handles": [
+        {"nodes": [0, 6, 12], "clamp": True, "motion": "sway"},
+        {"nodes": [29], "stiffness": 30.0, "motion": "sway", "until": 0.1, "fade": 0.05},
+        {"nodes": [5], "until": 0.08},
+    ],
+    "loads": [{"pressure": 1.0, "from": 0.05}, {"nodes": [20], "force": [0.0, 0.1, 0.0], "until": 0.12}],
+    "motions": {
+        "sway": [
+            {"time": 0},
+            {"time": 0.2, "rotate": {"axis": [0, 1, 0], "degrees": 60}, "translate": [0.1, 0, 0.1]},
+        ]
+    },
+}
+"""Everything that does work, with much of it by moving handles."""
+
+
+@pytest.mark.parallel
+def test_work_of_all_kinds_is_accounted_for(comm: MPI.Comm) -> None:
+    """What a scheme that keeps energy gains is the error of the trapezoidal rule: second order."""
+    gains = []
+    for step in (4e-3, 2e-3):
+        one = simulation(comm, "midpoint", DRIVEN, 0.2, step)
+        run(one)
+        assert one.guard is not None
+        gains.append(abs(one.guard.gains.total) / one.guard.gains.scale)
+        assert one.guard.gains.repeated == 0
+        one.destroy()
+    assert gains[1] < 0.4 * gains[0] < 2e-3
