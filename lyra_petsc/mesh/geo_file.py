@@ -167,6 +167,8 @@ def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str]
         except subprocess.TimeoutExpired:
             pause = min(2.0 * pause, LONGEST_SILENCE)
         outcome = _outcome(told)
+        if outcome.get("stage") != "mesh" and time.monotonic() - began < 2.0 * FIRST_WORD:
+            continue  # most that takes long to read never ends, and is ended soon
         doing = "is meshing" if outcome.get("stage") == "mesh" else "is reading the script"
         if "triangles" in outcome:
             doing += f", roughly {float('{:.1g}'.format(outcome['triangles'])):,.0f} triangles"
