@@ -32,6 +32,9 @@ JACOBIAN_AGAIN = "AssembleAgain"
 FROZEN = "AssembleFrozen"
 """Once an attempt at a step: damping, loads and geometry that stay as they are during it."""
 
+SWEEP, TRANSFER, GALERKIN = "MGSweep", "MGTransfer", "MGGalerkin"
+"""Of the multigrid: a level's Gauss-Seidel sweep, transfers between levels, coarser matrices."""
+
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.exchange_blocks import SharedBlocks
 from lyra_petsc.linear.pattern import BlockPattern, begins, diagonal_keys, index_type, union
 from lyra_petsc.mesh.distribute import local_numbers
 from lyra_petsc.mesh.points import Points
+from lyra_petsc.phases import GALERKIN, logged
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -284,6 +286,7 @@ class Galerkin:
             q += len(new)
         return keys, target
 
+    @logged(GALERKIN)
     def project(self, values: Array, free: Array) -> tuple[Array, Array]:
         """Make coarse block rows of fine ones (n_blocks, 3, 3); collective.
 
@@ -303,6 +306,8 @@ class Galerkin:
         into = self.pattern.indptr, self._offset, self._far
         _project(*rows, self._slots, self._most, *into, values.reshape(-1, 9), free, sums)
         _finish_diagonal(self.pattern.indptr, sums)
+        # products with the interpolation, and of its transpose with these
+        PETSc.Log.logFlops(18.0 * (len(self._slots) + len(self._offset)))
         self._shared.add(sums[n:], sums[:n])
         _fill_diagonal(self.pattern.indptr, sums, coarse_free)
         return sums[:n].reshape(-1, 3, 3), coarse_free

@@ -18,6 +18,9 @@ from lyra_petsc.mesh.points import Points
 
 Array = NDArray[np.float64]
 
+SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)
+"""In which PETSc shows a matrix without its entries."""
+
 FILLED = ("aij", "baij", "sbaij")
 """Matrix types with entries that block rows are put into."""
 
@@ -39,6 +42,7 @@ class _Product:
 
     def __init__(self, points: Points, pattern: BlockPattern, rows: Array) -> None:
         self._points = points if points.comm.size > 1 else None
+        self._all_points, self._pattern, self._rows = points, pattern, rows
         self._multiply = HalfStored(pattern, rows)
         self._operations = 2.0 * 9.0 * pattern.n_couplings
         n_local = points.n_local if self._points is not None else 0
@@ -56,6 +60,16 @@ class _Product:
         PETSc.Log.logFlops(self._operations)
 
     multTranspose = mult  # it is symmetric
+
+    def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer) -> None:
+        """Show the entries, as ``-ksp_view_mat`` asks, or for ``-ksp_view`` how they are kept; collective."""
+        if viewer.getType() == PETSc.Viewer.Type.ASCII and viewer.getFormat() in SUMMARIES:
+            viewer.printfASCII("  block rows of the program, of which one half is stored\n")
+            return
+        whole = AssembledMatrix(self._all_points, self._pattern, "aij")
+        whole.set(self._rows)
+        whole.mat.view(viewer)
+        whole.destroy()
 
 
 class BlockMatrix:

@@ -46,7 +46,8 @@ def check_options() -> None:
             _check_class(name, value)
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
-            if name != "mat_type" and not is_set(f"{stem}python_type"):
+            # -pc_type python alone is the program's multigrid
+            if name not in ("pc_type", "mat_type") and not is_set(f"{stem}python_type"):
                 raise InputError(f"python needs -{stem}python_type package.module.Class", key=f"-{name}")
     if is_set("ts_init_time"):
         raise InputError(

@@ -22,6 +22,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.linear import gauss_seidel as sweeps
 from lyra_petsc.linear.hierarchy import Hierarchy, Level
 from lyra_petsc.linear.matrix import AssembledMatrix
+from lyra_petsc.phases import SWEEP, TRANSFER
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -50,7 +51,7 @@ class Smoother:
 
     def __init__(self, level: Level) -> None:
         pattern, points = level.pattern, level.points
-        self.points = points
+        self.points, self.n_couplings = points, pattern.n_couplings
         n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
@@ -63,6 +64,8 @@ class Smoother:
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
         self._parents = start, parents, weights.astype(np.float32)
+        # of blocks, and of three coordinates of each parent
+        self._sweep_flops, self._transfer_flops = 18.0 * self.n_couplings, 6.0 * len(parents)
         self._free = np.ones_like(self.x)
         self._lagged = np.empty(0, dtype=np.int64)
         self._increase = np.empty((0, 3, 3), dtype=np.float32)
@@ -116,11 +119,15 @@ class Smoother:
             self.r[:, :3] = self.b[: len(self.r)]
             self._seen = np.zeros((len(self._lagged), 3), dtype=np.float32)
         seen = self.x[self.points.n_owned :].copy()
-        sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
+        with PETSc.Log.Event(SWEEP):
+            sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
+            PETSc.Log.logFlops(self._sweep_flops)
         self._subtract_ghosts(seen)
         start, *parents = self._parents
-        sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
-        self._coarse.add_to_owners(coarse)
+        with PETSc.Log.Event(TRANSFER):
+            sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
+            PETSc.Log.logFlops(self._transfer_flops)
+            self._coarse.add_to_owners(coarse)
 
     def _subtract_ghosts(self, seen: Floats) -> None:
         """Let the residual follow the ghosts, of which it has seen these values; collective."""
@@ -143,11 +150,15 @@ class Smoother:
 
         Ghosts are interpolated here as by their owners, without a message: ``before`` left them up to date.
         """
-        self._coarse.update_ghosts(coarse)
-        sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+        with PETSc.Log.Event(TRANSFER):
+            self._coarse.update_ghosts(coarse)
+            sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+            PETSc.Log.logFlops(self._transfer_flops)
         right, self._seen = self.b[self._lagged], self.x[self._lagged]
         self.b[self._lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
-        sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
+        with PETSc.Log.Event(SWEEP):
+            sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
+            PETSc.Log.logFlops(self._sweep_flops)
         self.b[self._lagged] = right
 
 
@@ -167,7 +178,7 @@ class Coarsest:
     """The last level, solved by a KSP of its own (``-mg_coarse_``)."""
 
     def __init__(self, level: Level) -> None:
-        self.points = level.points
+        self.points, self.n_couplings = level.points, level.pattern.n_couplings
         self.matrix = AssembledMatrix(level.points, level.pattern, "aij", prefix="mg_coarse_")
         self.x, self.b = (np.zeros((level.points.n_local, 3), dtype=np.float32) for _ in range(2))
         self._solution, self._rhs = self.matrix.mat.createVecs()
@@ -187,6 +198,10 @@ class Coarsest:
         self._rhs.getArray()[:] = self.b[:n].ravel()
         self._ksp.solve(self._rhs, self._solution)
         self.x[:n] = self._solution.getArray().reshape(-1, 3)
+
+    def view(self, viewer: PETSc.Viewer) -> None:
+        """Show the solver; collective."""
+        self._ksp.view(viewer)
 
     def destroy(self) -> None:
         """Free the PETSc objects; collective."""
@@ -253,9 +268,36 @@ class VCycle:
 
     def view(self, pc: PETSc.PC, viewer: PETSc.Viewer) -> None:
         """For ``-ksp_view`` and ``-snes_view``."""
-        sizes = [level.points.n_global for level in self._levels]
-        again = f", {TWICE} of them twice from the {self._twice_from}. on" if self._twice_from > 0 else ""
-        viewer.printfASCII(f"  V cycle on {len(sizes)} levels of {sizes} vertices{again}\n")
+        if not self._levels:
+            viewer.printfASCII("  no levels yet\n")
+            return
+        comm = self._levels[0].points.comm
+        couplings = [comm.allreduce(level.n_couplings) for level in self._levels]
+        twice = range(self._twice_from, min(self._twice_from + TWICE, len(self._levels) - 1))
+        visited = [number for number in twice if self._twice_from > 0]
+        kind = f"W (visits below {', '.join(map(str, visited))} twice)" if visited else "V"
+        between = "" if comm.size == 1 else ", between ranks Jacobi with an increased diagonal"
+        lines = [
+            f"type is MULTIPLICATIVE, levels={len(couplings)} cycles={kind}, 0 is the finest",
+            "Using Galerkin computed coarse grid matrices, in double precision",
+            f"operator complexity = {sum(couplings) / couplings[0]:.4g}",
+        ]
+        for number, (level, n) in enumerate(zip(self._levels, couplings, strict=True)):
+            unknowns = 3 * level.points.n_global
+            lines.append(f"level {number}: rows={unknowns}, cols={unknowns}, bs=3, nonzeros={9 * n}")
+            if isinstance(level, Smoother):
+                lines += [
+                    "  down: one backward sweep of block Gauss-Seidel, up: one forward sweep" + between,
+                    "  one half of the matrix in single precision",
+                ]
+        for line in lines:
+            viewer.printfASCII(f"  {line}\n")
+        viewer.printfASCII("  coarse grid solver, in double precision:\n")
+        viewer.pushASCIITab()
+        coarsest = self._levels[-1]
+        assert isinstance(coarsest, Coarsest)
+        coarsest.view(viewer)
+        viewer.popASCIITab()
 
     def destroy(self, pc: PETSc.PC) -> None:
         """Free the PETSc objects; collective."""

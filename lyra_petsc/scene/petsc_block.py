@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import PlainValidator
 
-from lyra_petsc.scene.values import number, problem, shown
+from lyra_petsc.scene.values import FINITE, number, problem, shown
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -31,6 +31,7 @@ def _petsc_value(value: Any) -> Any:
     if value is None or isinstance(value, (str, bool)):
         return value
     if isinstance(value, int):
+        number(value)  # it must not be beyond all numbers
         return value
     if isinstance(value, float):
         return number(value)
@@ -76,7 +77,7 @@ def _of_any_case(pattern: re.Pattern[str]) -> str:
 
 
 def _or_no_text(pattern: str) -> dict[str, Any]:
-    return {"anyOf": [{"type": "string", "pattern": pattern}, {"type": ["number", "boolean", "null"]}]}
+    return {"anyOf": [{"type": "string", "pattern": pattern}, FINITE, {"type": ["boolean", "null"]}]}
 
 
 _SHOWING = _of_any_case(_SHOWS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.reasons import NOT_A_NUMBER
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -77,6 +78,7 @@ class Convergence:
         self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
+        self._balanced = False
 
     def test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
         """SNES's reason to stop after so many linear iterations ``spent``, or None."""
@@ -97,7 +99,10 @@ class Convergence:
         if self.usual > self._linear_limit:
             self.too_slow = True
             return int(Reason.DIVERGED_LINEAR_SOLVE)
-        rtol, atol, stol, _ = snes.getTolerances()
+        rtol, atol, stol = (
+            value if is_set(f"snes_{name}") else 0.0
+            for name, value in zip(("rtol", "atol", "stol"), snes.getTolerances()[:3], strict=True)
+        )
         if residual > atol and iteration == 0:
             self._first_norm = residual
             return None
@@ -108,8 +113,10 @@ class Convergence:
         if residual <= rtol * self._first_norm:
             self.stopped_by = "" if balanced else "-snes_rtol"
             return int(Reason.CONVERGED_FNORM_RELATIVE)
+        was_balanced, self._balanced = self._balanced, balanced
         if balanced and self.left <= self._tolerances.step_tolerance * self._spacing:
-            return int(Reason.CONVERGED_FNORM_RELATIVE)
+            # which came last
+            return int(Reason.CONVERGED_SNORM_RELATIVE if was_balanced else Reason.CONVERGED_FNORM_RELATIVE)
         if 0.0 < self.left <= stol * self._spacing:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)

@@ -151,7 +151,9 @@ class Stepper:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(newton.globalisation.objective)
-            snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=scene.solver.max_iterations)
+            tolerances = scene.solver.force_tolerance, self._floor, scene.solver.step_tolerance
+            rtol, atol, stol = tolerances  # to be seen; those of options are looked at besides
+            snes.setTolerances(rtol=rtol, atol=atol, stol=stol, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(newton.converged)
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step

@@ -39,9 +39,11 @@ OPTIONS = {
     "ts_adapt_type": "`none`: fixed steps; `basic`: steps by `time.tolerance` (1e-3).",
     "ts_theta_endpoint": "Refused: it has no meaning for the stage equations.",
     "vec_type": "Type of every vector.",
+    "ts_init_time": "Refused: a run begins at 0.",
+    "snes_type": "`newtonls`, or `ksponly`: one linear solve a step.",
     "snes_max_it": "Newton iterations of a step instead of `solver.max_iterations`.",
     "snes_rtol": "Relative residual at which a step stops, where given, before `solver` says so.",
-    "snes_atol": "Residual [N] at which a step stops, likewise.",
+    "snes_atol": "Residual [N] at which a step stops, likewise; it fails above `solver.force_tolerance`.",
     "snes_stol": "Relative increment at which a step stops, likewise.",
     "ksp_rtol": "Relative tolerance of linear solves; without it 1e-2, and down to 1e-6 where Newton is "
     "slow; "

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from launch import SCENE, Left, done, lyra, write_scene
+from mpi4py import MPI
+from petsc4py import PETSc
 
 
 def summary(folder: Path) -> dict[str, Any]:
@@ -132,6 +135,26 @@ def test_an_absolute_tolerance_does_not_replace_that_of_the_scene(
 def test_a_loose_relative_tolerance_is_noted(tmp_path: Path) -> None:
     left = ran(tmp_path, "-snes_rtol", "0.5")
     assert "note: step 1 (t = 0.01 s): -snes_rtol stopped Newton's method at a residual of" in left.err
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_views_show_what_solves(tmp_path: Path, ranks: int) -> None:
+    scene = SCENE.replace("nx: 4, ny: 4", "nx: 12, ny: 12").replace("end: 0.05", "end: 0.01")
+    options = ["-pc_type", "mg", "-snes_view", "-ksp_view_mat", "binary:matrix", "-log_view"]
+    out = ran(tmp_path, *options, scene=scene, ranks=ranks).out
+    assert re.search(r"tolerances: relative=1e-06, absolute=[1-9].*, solution=1e-06", out)
+    for words in ("levels=2 cycles=V", "operator complexity = 1.", "backward sweep of block Gauss-Seidel"):
+        assert words in out
+    assert "level 0: rows=507, cols=507" in out
+    assert "KSP Object: (mg_coarse_)" in out
+    for event in ("MGSweep", "MGTransfer", "MGGalerkin"):
+        flops = re.search(rf"^{event} +(\d+) \S+ \S+ \S+ (\S+)", out, re.MULTILINE)
+        assert flops, event
+        assert float(flops[2]) > 0.0
+    matrix = PETSc.Mat().load(PETSc.Viewer().createBinary(str(tmp_path / "matrix"), "r", MPI.COMM_SELF))
+    assert matrix.size == (507, 507)
+    assert matrix.isSymmetric(1e-9)
+    assert matrix.getInfo()["nz_used"] > 10_000
 
 
 def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ REFUSED = [
     ["-pc_type", "mg", "-ksp_type", "nosuch"],
     ["--set", "petsc.pc_type=mg", "--set", "petsc.ksp_type=nosuch"],
     ["-ksp_type", "python"],
-    ["-pc_type", "python"],
     ["-pc_type", "python", "-pc_python_type", "nosuch"],
     ["-ksp_type", "python", "-ksp_python_type", "nosuch.Thing"],
     ["-pc_type", "python", "-pc_python_type", "os.path.join"],
@@ -53,6 +52,7 @@ SOLVED = [
     ["-ksp_initial_guess_nonzero"],
     ["-pc_type", "mg", "-ksp_initial_guess_nonzero"],
     ["-pc_type", "svd"],
+    ["-pc_type", "python"],
     ["-snes_test_jacobian"],
     ["-snes_mf", "false"],
 ]
