@@ -90,7 +90,8 @@ class Cloth:
     def mark(self, vertex: int | None) -> None:
         """Mark a vertex of the state shown by a pin through it, which is seen from both sides; or none."""
         if vertex is None:
-            _put(self._mark, np.empty((0, 3)), np.empty((0, 2), dtype=np.int64))
+            # pages would never learn the look of what is empty at first: a line without length instead
+            _put(self._mark, self._positions[[0, 0]], np.array([[0, 1]]), points=False)
             return
         size = np.linalg.norm(self._positions.max(axis=0) - self._positions.min(axis=0))
         pin = 0.02 * size * self._normals[vertex]
