@@ -47,7 +47,8 @@ def test_cases_pass_and_leave_table_and_page(tmp_path: Path, ranks: int) -> None
     assert content["passed"] is content["complete"] is True
     assert content["ranks"] == ranks
     assert set(content["cases"][1]["verdicts"]) == {
-        "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit"
+        "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit",
+        "whole run"
     }  # fmt: skip
     report = (tmp_path / "out" / "report.md").read_text()
     assert "2 of 2 cases passed" in report

@@ -41,6 +41,8 @@ class Record:
     stopped : str
         Why it did not reach its end; empty if it did.
     integrator : str
+    balance : dict
+        The whole run's energy balance, as in summary.json; empty where nothing ran.
     busy : list of float
         CPU time of each step [s], of the rank that took most.
     last : (V, 3) array or None
@@ -60,6 +62,7 @@ class Record:
     notes: list[str] = field(default_factory=list)
     stopped: str = ""
     integrator: str = "beuler"
+    balance: dict[str, Any] = field(default_factory=dict)
     busy: list[float] = field(default_factory=list)
     last: NDArray[np.float64] | None = None
     triangles: NDArray[np.int64] | None = None
@@ -108,6 +111,11 @@ class Record:
     def median_newton(self) -> float:
         """Median Newton iterations of a step; NaN without any."""
         return float(statistics.median(self.newton)) if self.reports else math.nan
+
+    @property
+    def lost(self) -> float:
+        """Numerical dissipation over the largest energy at work; NaN without a step."""
+        return float(self.balance.get("numerical_dissipation", math.nan)) if self.reports else math.nan
 
     @property
     def times(self) -> list[float]:

@@ -18,7 +18,7 @@ from lyra_petsc.experiments.stress.balance import Accountant
 from lyra_petsc.experiments.stress.case import Case, Level, NotHere, Setting
 from lyra_petsc.experiments.stress.record import Record
 from lyra_petsc.experiments.stress.stage import StageAccountant
-from lyra_petsc.experiments.stress.verdicts import of_physics, speed
+from lyra_petsc.experiments.stress.verdicts import LITTLE_LOST, of_physics, speed
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,13 @@ class Outcome(experiments.Outcome[Case]):
     record: Record = field(default_factory=Record)
     ratio: float = math.nan
     busy_ratio: float = math.nan
+
+    @property
+    def verdict(self) -> str:
+        """In a word: what is solved need not be right, where the integrator takes much of the energy away."""
+        if not self.passed:
+            return "FAILED"
+        return "right" if self.record.lost <= LITTLE_LOST else "solved"
 
 
 class BaseClock:
@@ -186,6 +193,7 @@ def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
         raise
     finally:
         record.notes = list(simulation.notes)
+        record.balance = simulation.guard.content() if simulation.guard is not None else {}
     # gathered to be drawn: once in a case, and freed by later cases
     record.last = _drawn(trial)
 

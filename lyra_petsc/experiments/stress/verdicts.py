@@ -9,10 +9,17 @@ from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.stress.balance import Balance
 from lyra_petsc.experiments.stress.record import Record
 from lyra_petsc.show.report.numbers import short
+from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 RESOLVED = 0.1
 """Part of the forces that move a sheet, or of how far they do, below which the rest is negligible."""
+
+LITTLE_LOST = 0.05
+"""Numerical dissipation over the largest energy at work up to which a motion may be called right."""
+
+MUCH_LOST = 0.5
+"""Beyond which one is wrong whose steps nothing else speaks for."""
 
 MOST_NEWTON_MEDIAN, MOST_NEWTON = 10, 30
 """Newton iterations a step of a stiff sheet may take, in the median and at worst."""
@@ -105,6 +112,22 @@ def no_gain(record: Record) -> Verdict:
     return Verdict(True, f"none in the {len(steps)} steps where the elastic energy is convex{more}")
 
 
+def whole(record: Record) -> Verdict:
+    """The run as a whole makes no energy, and where its steps are not solved, does not lose most of it."""
+    gained, lost = (float(record.balance[f"numerical_{what}"]) for what in ("gain", "dissipation"))
+    net = gained - lost
+    words = (
+        f"{100.0 * lost:.2g} % of the largest energy at work lost to the integrator, "
+        f"{100.0 * gained:.2g} % made by it"
+    )
+    if record.balance["repeated"]:
+        words += f", {record.balance['repeated']} attempts repeated for it"
+    good = net <= LARGEST_SUM and (record.integrator != "semi-implicit" or lost <= MUCH_LOST)
+    if good and lost > LITTLE_LOST:
+        words += "; solved, but a smaller Δt moves otherwise"
+    return Verdict(good, words)
+
+
 def momentum(record: Record) -> Verdict:
     """Momentum and angular momentum change by what acts from outside: inner forces add up to nothing."""
     at, line = _worst(record, lambda b: over(b.momentum, b.momentum_tolerance))
@@ -161,6 +184,8 @@ def of_physics(record: Record) -> dict[str, Verdict]:
             verdicts["no gain"] = no_gain(record)
     if record.reports:
         verdicts["softening"] = softening(record)
+        if record.balance:
+            verdicts["whole run"] = whole(record)
     return verdicts
 
 

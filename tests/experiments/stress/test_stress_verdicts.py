@@ -8,7 +8,10 @@ from dataclasses import replace
 import pytest
 
 from lyra_petsc.experiments.stress.balance import Balance
+from lyra_petsc.experiments.stress.case import Case
+from lyra_petsc.experiments.stress.changes import as_it_is
 from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.experiments.stress.runner import Outcome
 from lyra_petsc.experiments.stress.verdicts import of_physics, speed
 from lyra_petsc.stepping.simulation import StepReport
 
@@ -127,3 +130,22 @@ def test_speed_is_judged_by_iterations_and_time(
 
 def test_what_stopped_is_not_fast() -> None:
     assert not speed(record(stopped="at once"), 1.0, 1.0).passed
+
+
+@pytest.mark.parametrize(
+    ("integrator", "lost", "gained", "good", "word"),
+    [
+        ("beuler", 0.01, 0.0, True, "right"),
+        ("beuler", 0.7, 0.0, True, "solved"),
+        ("midpoint", 0.01, 0.2, False, "FAILED"),
+        ("semi-implicit", 0.02, 0.01, True, "right"),
+        ("semi-implicit", 0.95, 0.0, False, "FAILED"),
+    ],
+)
+def test_the_whole_run_is_judged(integrator: str, lost: float, gained: float, good: bool, word: str) -> None:
+    balance = {"numerical_dissipation": lost, "numerical_gain": gained, "repeated": 2}
+    found = replace(record(integrator=integrator), balance=balance)
+    verdicts = of_physics(found)
+    assert verdicts["whole run"].passed is good
+    assert "2 attempts repeated" in verdicts["whole run"].words
+    assert Outcome(Case("a", "b", as_it_is), verdicts, record=found).verdict == word
