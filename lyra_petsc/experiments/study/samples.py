@@ -15,7 +15,7 @@ from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import raise_together
 from lyra_petsc.output.read_run import Columns, read_table
-from lyra_petsc.output.states import read_state, state_files
+from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import open_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.parallel import on_root
@@ -187,9 +187,7 @@ def read_samples(comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: 
 
 def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
     """As ``read_samples``, on one rank and for it alone."""
-    states = []
-    if folder.is_dir():
-        states = [state for path in state_files(folder) if (state := read_state(path)) is not None]
+    states = stored_states(folder) if folder.is_dir() else []
     if not states:
         raise InputError("holds no states of a run", file=folder)
     at = np.array([state.time for state in states])
