@@ -93,15 +93,23 @@ class Phases:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        self._charge()
-        self._seconds.setdefault(name, 0.0)
-        self._open.append(name)
+        self.begin(name)
         try:
             with stage(name):
                 yield
         finally:
-            self._charge()
-            self._open.pop()
+            self.end()
+
+    def begin(self, name: str) -> None:
+        """Charge what follows to a phase, until `end`."""
+        self._charge()
+        self._seconds.setdefault(name, 0.0)
+        self._open.append(name)
+
+    def end(self) -> None:
+        """Charge again to the phase before."""
+        self._charge()
+        self._open.pop()
 
     @property
     def total(self) -> float:

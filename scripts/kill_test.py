@@ -33,6 +33,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lyra_petsc.api.mpirun import environment, find_launcher
+from lyra_petsc.output.read_run import Run
 
 PATIENCE = 20.0
 """Seconds within which the other ranks must be gone."""
@@ -181,7 +182,7 @@ def check_announced(out: Path) -> int:
 
 
 def check_vtkhdf(out: Path, times: list[float]) -> None:
-    """Check that VTK finds the same states, but perhaps the last, which is announced there later."""
+    """Check that VTK finds the same states, but perhaps the last ones, which come later."""
     path = out / "states.vtkhdf"
     found: list[float] = []
     if path.exists():
@@ -190,7 +191,7 @@ def check_vtkhdf(out: Path, times: list[float]) -> None:
             for name in ("Points", "PointData/velocity", "PointData/rest"):
                 if not np.isfinite(file[f"VTKHDF/{name}"][()]).all():
                     raise Wrong(f"{path.name}: {name} is not finite")
-    if found not in (times, times[:-1]):
+    if found != times[: len(found)] or len(times) - len(found) > 1 + 0.1 * len(times):
         raise Wrong(f"{path.name} has the times {found}, not {times}")
 
 
@@ -204,10 +205,8 @@ def table(path: Path) -> np.ndarray:
 
 
 def last_state(out: Path) -> tuple[float, np.ndarray]:
-    newest = max(out.glob("states-*.h5"))
-    with h5py.File(newest, "r") as file:
-        (group,) = file["states"].values()
-        return float(group.attrs["time"]), group["position"][()]
+    run = Run(out)
+    return float(run.times[-1]), run.positions[-1]
 
 
 def compare(out: Path, whole: Path) -> None:

@@ -6,6 +6,7 @@
 # RANKS says on how many ranks (2 for run, else 1).
 set -euo pipefail
 source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
+source "$root/scripts/share_cores.sh"
 ranks=${RANKS:-1}
 extras=()
 case ${1:-} in
@@ -18,6 +19,7 @@ esac
 for argument in "$@"; do
     [[ $argument != --live ]] || extras+=(view)
 done
+share_cores "$ranks"
 set_up "${extras[@]}"
 start=("${python[@]}" -m lyra_petsc)
 ((ranks == 1)) || start=("${launcher[@]}" -n "$ranks" "${start[@]}")

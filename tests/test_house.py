@@ -110,3 +110,35 @@ def test_terms_have_never_heard_of_petsc_mpi_or_files() -> None:
             elif isinstance(node, ast.ImportFrom) and node.module:
                 names.add(node.module.split(".")[0])
         assert not names & {"petsc4py", "mpi4py", "h5py", "os", "io", "pathlib"}, path.name
+
+
+def kernels(tree: ast.AST) -> list[ast.FunctionDef]:
+    """Functions that numba compiles."""
+    return [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and any(ast.unparse(one).partition("(")[0] in ("cached", "njit") for one in node.decorator_list)
+    ]
+
+
+def linear_algebra(kernel: ast.AST) -> list[int]:
+    """Lines that numba compiles to calls of the BLAS or LAPACK, which it takes from SciPy."""
+    return [
+        node.lineno
+        for node in ast.walk(kernel)
+        if (isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult))
+        or (isinstance(node, ast.Attribute) and node.attr in ("dot", "vdot", "linalg"))
+    ]
+
+
+def test_kernels_need_no_scipy() -> None:
+    """It is in an extra; a kernel that was compiled with it ends a process without it."""
+    count = 0
+    for path in MODULES:
+        for kernel in kernels(ast.parse(path.read_text(encoding="utf-8"))):
+            count += 1
+            assert linear_algebra(kernel) == [], f"{path}: {kernel.name}"
+    assert count > 30
+    assert linear_algebra(ast.parse("def f(a):\n    return np.dot(a, a)\n")) == [2]
+    assert linear_algebra(ast.parse("a @ b")) == [1]

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from typing_extensions import Self
 
+FEWEST_STEPS = 3
+LEAST_SECONDS, LEAST_PART = 2.0, 0.05
+"""Steps, and seconds or part of the run, that have to be over for an estimate of the time left."""
+
 REDRAW_SECONDS = 0.1
 LINE_SECONDS = 2.0  # plain lines never come faster than this,
 LINE_FRACTION = 0.05  # and then one for each 5 % of the run
@@ -102,6 +106,7 @@ class Progress(ProgressBar):
         self._unit = f" {unit}" if unit else ""
         self._start, self._end = start, end
         self._first: tuple[float, float] | None = None
+        self._steps = 0
         self._last_shown: float | None = None
         self._fraction_shown = 0.0
         self._latest: str | None = None
@@ -127,15 +132,19 @@ class Progress(ProgressBar):
         now = self._clock()
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
-        began, done = self._first or (self._began, 0.0)
-        left = (now - began) * (1 - fraction) / (fraction - done) if fraction > done else math.nan
-        # the first step compiles kernels, so the time left is estimated from the others
-        self._first = self._first or (now, fraction)
+        # the first step does what later ones need not, so the time left is estimated from the others
+        self._first, self._steps = self._first or (now, fraction), self._steps + 1
+        began, done = self._first
+        enough = self._steps > FEWEST_STEPS and (
+            now - began >= LEAST_SECONDS or fraction - done >= LEAST_PART
+        )
+        left = (now - began) * (1 - fraction) / (fraction - done) if enough and fraction > done else math.nan
         state = (
             f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
-            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J  "
-            f"{duration(left)} left"
+            f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"
         )
+        if math.isfinite(left):
+            state += f"  {duration(left)} left"
         since = math.inf if self._last_shown is None else now - self._last_shown
         if self._bar is not None:
             with suppress(OSError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
+from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
@@ -26,6 +28,9 @@ from lyra_petsc.stepping.simulation import Simulation, StepReport
 if TYPE_CHECKING:
     from lyra_petsc.cli.view import Served
     from lyra_petsc.show.view.live import LivePage
+
+
+NO_PLACE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 
 
 def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str], *, trust_mesh: bool = False) -> Scene:
@@ -90,6 +95,9 @@ class TerminalProgress(ProgressCallbacks):
     def __init__(self, comm: MPI.Comm, served: Served | None = None, usual: Path | None = None) -> None:
         self._comm, self._usual = comm, usual
         self._progress: Progress | None = None
+        self._told_of_place = False
+        if comm.rank == 0:
+            COMPILATION.first = self._tell_of_compilation
         self._page: LivePage | None = None
         if served is not None and comm.rank == 0:
             from lyra_petsc.show.view.live import LivePage
@@ -105,6 +113,18 @@ class TerminalProgress(ProgressCallbacks):
         if self._progress is not None:
             self._progress.say(text)
 
+    def _tell_of_compilation(self) -> None:
+        """Say why nothing moves, before the bar stands or above it."""
+        text = "compiling kernels, once, about 15 s"
+        if not COMPILATION.kept:
+            self._told_of_place = True
+            text = f"compiling kernels, about 15 s in every run: {NO_PLACE}"
+        if self._progress is not None:
+            self._progress.say(text)
+            return
+        with suppress(OSError):
+            print(text, file=sys.stderr, flush=True)
+
     def begin(self, simulation: Simulation, folder: Path) -> None:
         """Start the progress bar, and show the run on the page."""
         self._progress = Progress(
@@ -112,6 +132,7 @@ class TerminalProgress(ProgressCallbacks):
             simulation.control.end,
             start=simulation.time,
             plain=_petsc_speaks(),
+            clock=lambda: time.monotonic() - COMPILATION.seconds,
             unit="s" if simulation.problem.system.integrator.moves else "",
         )
         if self._usual is not None and folder != self._usual:
@@ -143,6 +164,8 @@ class TerminalProgress(ProgressCallbacks):
         if not simulation.at_end:
             now = f"step {simulation.step_number}, t = {simulation.time:g} of {simulation.control.end:g} s"
             outcome = f"stopped at {now}, by -ts_max_steps; --resume goes on"
+        if not COMPILATION.kept and not self._told_of_place:
+            self._say(f"note: the next run compiles kernels anew: {NO_PLACE}")
         closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._page is not None:
             print(f"look again   lyra-petsc view {folder}", flush=True)

@@ -20,6 +20,8 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.registry import cpu_target
 from numba.core.sigutils import normalize_signature
 
+from lyra_petsc.kernels.compilation import COMPILATION
+
 Index = np.uintp
 """Kernels look entries up by it: no number is negative then, which numba would count from the end."""
 
@@ -79,8 +81,10 @@ class KernelCache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep it, if the disk can."""
-        with suppress(OSError):
+        try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except OSError:
+            COMPILATION.kept = False
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -88,8 +92,10 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = njit(**options)(function)
-        with suppress(RuntimeError):  # numba's word for no place to keep it
+        try:
             dispatcher._cache = KernelCache(function)
+        except RuntimeError:  # numba's word for no place to keep it
+            COMPILATION.kept = False
         return dispatcher
 
     return compiled

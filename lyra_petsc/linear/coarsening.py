@@ -204,14 +204,20 @@ def _nearest(x, start, neighbours, label):  # type: ignore[no-untyped-def]
 
 
 @cached()
+def _dot(u, v):  # type: ignore[no-untyped-def]
+    """Of vectors of three; numpy's would call the BLAS through SciPy, which need not be there."""
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@cached()
 def _barycentric(p, a, b, c):  # type: ignore[no-untyped-def]
     """Coordinates of p in the plane of the triangle; −∞ where it has no area."""
     u, v, w = b - a, c - a, p - a
-    uu, uv, vv = np.dot(u, u), np.dot(u, v), np.dot(v, v)
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
     det = uu * vv - uv * uv
     if not det > 1e-12 * uu * vv:
         return -np.inf, -np.inf, -np.inf
-    uw, vw = np.dot(u, w), np.dot(v, w)
+    uw, vw = _dot(u, w), _dot(v, w)
     s, t = (vv * uw - uv * vw) / det, (uu * vw - uv * uw) / det
     return 1.0 - s - t, s, t
 
@@ -255,7 +261,7 @@ def _between(x, start, neighbours, label, vertices, v, parents, weights):  # typ
             if i < 0 or j < 0:
                 continue
             a, u = x[vertices[i]], x[vertices[j]] - x[vertices[i]]
-            s = np.dot(x[v] - a, u) / max(np.dot(u, u), 1e-300)
+            s = _dot(x[v] - a, u) / max(_dot(u, u), 1e-300)
             if min(s, 1.0 - s) > best:
                 best = min(s, 1.0 - s)
                 parents[v, 0], parents[v, 1], parents[v, 2] = i, j, -1

@@ -43,8 +43,9 @@ Piece: TypeAlias = tuple[int, NDArray[Any]]
 TURNS_VARIABLE = "LYRA_PETSC_WRITE_IN_TURN"
 """Set to 1 for rank 0 where MPI-IO opens files, but fails to write them."""
 
-# bytes that a file with a few dozen datasets needs beyond their data and attributes
+# bytes that a file needs beyond its data and attributes, and more for each dataset
 LARGEST_OVERHEAD = 1 << 16
+OF_A_DATASET = 1 << 10
 
 
 def _nothing() -> None:
@@ -67,21 +68,32 @@ class NewFile:
         of others on any rank.
     publish : callable
         What rank 0 does when all files have their names.
+    places : sequence of int or None
+        Where its datasets stand [bytes] in a file that is there already, and is written in place.
+    prepare : callable
+        What rank 0 does when all rows are written, before the file is synced.
     """
 
     path: Path
     datasets: Mapping[str, NDArray[Any]]
     attributes: Attributes
     publish: Callable[[], None] = _nothing
+    places: Sequence[int] | None = None
+    prepare: Callable[[], None] = _nothing
 
     @property
     def part(self) -> Path:
         """What it is called until all files are complete."""
-        return self.path.with_name(self.path.name + ".part")
+        return self.path if self.places is not None else self.path.with_name(self.path.name + ".part")
+
+    def discard(self) -> None:
+        """Remove what is not complete."""
+        if self.places is None:
+            self.part.unlink(missing_ok=True)
 
 
 def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Background | None = None) -> None:
-    """Write distributed arrays to new HDF5 files; they get their names, in this order, when all are complete.
+    """Write distributed arrays to HDF5 files; new ones get their names, in this order, when all are complete.
 
     Parameters
     ----------
@@ -111,6 +123,8 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
 
     def laid_out(number: int) -> list[int]:
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
+        if file.places is not None:
+            return list(file.places)
         return _guarded(file.path, lambda: lay_out(file.part, slabs[number], rows, file.attributes))
 
     try:
@@ -124,7 +138,7 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
             write_slabs(file.path, file.part, pieces, comm)
     except LyraError:
         for number in mine:
-            files[number].part.unlink(missing_ok=True)
+            files[number].discard()
         raise
     if background is not None:
         background.begin(partial(_complete, files))
@@ -136,12 +150,14 @@ def _complete(files: Sequence[NewFile]) -> None:
     """Sync the files, then give them their names. Call on one rank."""
     try:
         for file in files:
+            file.prepare()
             _guarded(file.path, partial(_sync, file.part))
         for file in files:
-            _guarded(file.path, partial(os.replace, file.part, file.path))
+            if file.places is None:
+                _guarded(file.path, partial(os.replace, file.part, file.path))
     except LyraError:
         for file in files:
-            file.part.unlink(missing_ok=True)
+            file.discard()
         raise
     for file in files:
         file.publish()
@@ -228,7 +244,7 @@ def lay_out(
     data = sum(math.prod(shape) * slab.itemsize for shape, slab in zip(shapes, slabs.values(), strict=True))
     texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
     with open(part, "wb") as raw:
-        os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD)
+        os.posix_fallocate(raw.fileno(), 0, data + texts + LARGEST_OVERHEAD + OF_A_DATASET * len(slabs))
     file = h5py.h5f.create(os.fsencode(part), h5py.h5f.ACC_TRUNC, fapl=access)
     try:
         owners = {"/": file}

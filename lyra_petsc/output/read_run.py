@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import math
+import time as wall
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -39,6 +40,9 @@ ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"})
 """Columns of whole numbers."""
 
+RECENT = 0.05
+"""Seconds; clocks of file systems are coarser than those of processors."""
+
 COLUMNS = {"velocity": (3,), "green_strain": (3,), "stress": (3,)}
 """Shape of a row of the fields that are no plain numbers."""
 
@@ -71,6 +75,9 @@ class Run:
 
     def _look(self) -> None:
         self._stamp = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
+        # else it may change again at the same time of the file system's clock
+        written = self._stamp[0][0] * 1e-9 if self._stamp[0] else 0.0
+        self._settled = abs(wall.time() - written) > RECENT
         self._states: list[StoredState] = announced_states(self.folder)
         self.times: Array = np.array([state.time for state in self._states])
         first = self._states[0].fields
@@ -95,10 +102,11 @@ class Run:
         states, mesh = _stamp(self.folder / XDMF_FILE), _stamp(self.folder / MESH_FILE)
         if mesh != self._stamp[1]:  # replaced by another run
             self.__dict__.pop("mesh", None)
-        if (states, mesh) == self._stamp:
+        if (states, mesh) == self._stamp and self._settled:
             return False
+        before, same = self._states, mesh == self._stamp[1]
         self._look()
-        return True
+        return not same or self._states != before
 
     @property
     def name(self) -> str:
@@ -252,7 +260,7 @@ class Run:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """What changes when a file is replaced."""
+    """What changes when a file is replaced or changed."""
     try:
         status = path.stat()
     except OSError:

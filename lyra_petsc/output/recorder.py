@@ -354,6 +354,7 @@ class Recorder:
             If it could not be; what was announced before stands.
         """
         self._background.settle()
+        self._states.finish()
 
     def close(self) -> None:
         """Close the tables; for one rank. What of the rest goes wrong now, only `settle` tells."""

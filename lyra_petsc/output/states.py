@@ -1,10 +1,18 @@
-"""states-NNNN.h5, one file for each written state, and the XDMF file that announces them."""
+"""states-NNNN.h5, files with room for states from number NNNN on, and the XDMF file that announces them.
+
+A file is laid out with the places of all its states. To write one is to write its rows there, and then its
+row in the file's table; nothing of HDF5 changes, so that the file can be read at any moment. The next file
+has room for as many states as there are, within bounds: so there are few files, and little room is left over.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +20,25 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import OutputError
+from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.background import Background
-from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.growing_xdmf import GrowingXdmf
+from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import open_own
-from lyra_petsc.output.stored import text_of
+from lyra_petsc.output.stored import TABLE, check_sum, open_stored, text_of
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
 from lyra_petsc.parallel import on_root
+
+FEWEST, MOST = 4, 512
+"""States that a file has room for,"""
+
+LARGEST = 1 << 26
+"""and their bytes, unless one alone has more."""
+
+MORE = 0.1
+"""States that ``states.vtkhdf`` may lack while a run goes on, over those it has."""
 
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
@@ -69,7 +85,10 @@ class StateWriter:
         self.vertices = vertices
         self.triangles = triangles
         self.n_triangles = n_triangles
-        self._states: list[WrittenState] = []  # kept on rank 0
+        self._room: _Room | None = None
+        self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
+        self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
+        self._in_vtk = 0
         self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
@@ -117,7 +136,6 @@ class StateWriter:
         OutputError
             On every rank; the states announced before stand. With a background, of the state before.
         """
-        number, group = self._next, group_name(self._next)
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
         slabs |= {name: self.vertices.to_slab(rows) for name, rows in (vertex_fields or {}).items()}
         fields = self._describe(slabs, "vertex", self.vertices)
@@ -128,16 +146,64 @@ class StateWriter:
             fields += self._describe(on_triangles, "triangle", self.triangles)
             slabs |= on_triangles
 
-        stamp: dict[str, int | float | str] = {"time": float(time), "step": int(step)}
-        attributes = {group: stamp, f"{group}/position": {**stamp, "on": "vertex"}}
-        attributes |= {f"{group}/{field.name}": {"on": field.on} for field in fields}
-        name = f"states-{number:04d}.h5"
-        state = WrittenState(number, int(step), float(time), name, fields)
-        datasets = {f"{group}/{key}": slab for key, slab in slabs.items()}
-        file = NewFile(self.folder / name, datasets, attributes, publish=lambda: self._announce(state))
+        number = self._next
+        room = self._room
+        if room is None or room.fields != fields or number >= room.first + len(room.places):
+            room = self._room = self._lay_out(slabs, fields)
+        state = WrittenState(number, int(step), float(time), room.path.name, fields)
+        row = _Row(room, number - room.first, state, _sums(slabs.values(), self._comm))
+        datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
+        places = room.places[row.index].tolist()
+        file = NewFile(room.path, datasets, {}, lambda: self._announce(state), places, row.write)
         write_collective([file, *beside], self._comm, self._background)
         self._next += 1
         return number
+
+    def finish(self) -> None:
+        """Announce also in ``states.vtkhdf`` what is announced already; collective, with nothing under way.
+
+        Raises
+        ------
+        OutputError
+            On every rank, if it could not be written.
+        """
+        if self._vtkhdf:
+            on_root(self._comm, lambda: self._announce_to_vtk(late=True))
+
+    def _lay_out(self, slabs: Fields, fields: tuple[StoredField, ...]) -> _Room:
+        """A file with room for the next states; collective."""
+        first, names = self._next, list(slabs)
+        on = {"position": "vertex"} | {field.name: field.on for field in fields}
+        n_of = {"vertex": self.vertices.n_global, "triangle": self.n_triangles}
+        rows = [n_of[on[name]] for name in names]
+        widths = [slab.itemsize * int(np.prod(slab.shape[1:], dtype=int)) for slab in slabs.values()]
+        size = sum(n * width for n, width in zip(rows, widths, strict=True))
+        slots = max(1, min(max(first, FEWEST), MOST, LARGEST // max(size, 1)))
+        path = self.folder / f"states-{first:04d}.h5"
+        table: dict[str, NDArray[Any]] = {
+            f"{TABLE}/step": np.empty(0, np.int64),
+            f"{TABLE}/time": np.empty(0, np.float64),
+            f"{TABLE}/sums": np.empty((0, len(names)), np.uint64),
+        }
+        planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
+        told = json.dumps([[name, on[name]] for name in names])
+        attributes: Attributes = {TABLE: {"first": first, "columns": told}}
+
+        def work() -> list[int]:
+            part = path.with_name(path.name + ".part")
+            try:
+                places = lay_out(part, table | planned, [slots] * len(table) + rows * slots, attributes)
+                with open(part, "r+b", buffering=0) as file:
+                    os.pwrite(file.fileno(), np.full(slots, -1, np.int64).tobytes(), places[0])
+                    os.fsync(file.fileno())
+                os.replace(part, path)
+            except HDF5_ERRORS as error:
+                part.unlink(missing_ok=True)
+                raise cannot_write(path, error) from error
+            return places
+
+        places = np.array(on_root(self._comm, work), dtype=np.int64)
+        return _Room(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
 
     @staticmethod
     def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[StoredField, ...]:
@@ -147,48 +213,150 @@ class StateWriter:
             if name != "position"
         )
 
-    def _announce(self, state: WrittenState | None) -> None:
-        states = self._states if state is None else [*self._states, state]
-        replace_text(self.folder / XDMF_FILE, self._series.text(states))
+    def _announce(self, state: WrittenState) -> None:
+        """Announce a state (rank 0)."""
+        grid = self._series.grid(state)
+        try:
+            if state.number == 0:
+                self._document.replace([grid])
+            else:
+                self._document.append(grid)
+        except FileNotFoundError:  # removed or changed: made anew from the files of the states
+            if not self.folder.is_dir():
+                raise cannot_write(self._document.path, FileNotFoundError()) from None
+            self._document.replace(map(self._series.grid, stored_states(self.folder)))
         if self._vtkhdf:
-            write_vtkhdf(self.folder, states, self.vertices.n_global, self.n_triangles, MESH_FILE)
-        self._states = states
+            self._states.append(state)
+            self._announce_to_vtk()
+
+    def _announce_to_vtk(self, *, late: bool = False) -> None:
+        """Write ``states.vtkhdf``, which is written as a whole: the more states the less often."""
+        new = len(self._states) - self._in_vtk
+        if new == 0 or not (late or new >= MORE * self._in_vtk):
+            return
+        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles, MESH_FILE)
+        self._in_vtk = len(self._states)
 
     def _truncate(self, last_step: int) -> int:
         """Announce the states up to ``last_step``, only then remove the others."""
-        found = {path: read_state(path) for path in state_files(self.folder)}
-        keep = {path: state for path, state in found.items() if state is not None and state.step <= last_step}
-        self._states = list(keep.values())
-        self._announce(None)
+        found = stored_states(self.folder)
+        keep = [state for state in found if state.step <= last_step]
+        self._document.replace(map(self._series.grid, keep))
+        if self._vtkhdf:
+            self._states = keep
+            self._announce_to_vtk(late=True)
         stale = [] if self._vtkhdf else [self.folder / VTKHDF_FILE, self.folder / CELLS_FILE]
+        kept = {state.file for state in keep}
         try:
-            for path in [*(found.keys() - keep.keys()), *stale]:
+            for path in state_files(self.folder):
+                if path.name not in kept:
+                    path.unlink()
+                else:
+                    _forget(path, last_step)
+            for path in stale:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: a later state cannot be removed: {reason(error)}") from error
-        return max((state.number for state in self._states), default=-1) + 1
+        return max((state.number for state in keep), default=-1) + 1
+
+
+@dataclass(frozen=True)
+class _Room:
+    """A file with room for states: its first state, what each holds, and where [bytes] these stand.
+
+    ``table`` has the places of the table's columns, ``places`` (slots, datasets) those of each state.
+    """
+
+    path: Path
+    first: int
+    fields: tuple[StoredField, ...]
+    table: NDArray[np.int64]
+    places: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A state's row of the table in its file."""
+
+    room: _Room
+    index: int
+    state: WrittenState
+    sums: NDArray[np.uint64]
+
+    def write(self) -> None:
+        """Say that the state is written (rank 0)."""
+        entries = np.int64(self.state.step), np.float64(self.state.time), self.sums
+        try:
+            with open(self.room.path, "r+b", buffering=0) as file:
+                for place, entry in zip(self.room.table.tolist(), entries, strict=True):
+                    os.pwrite(file.fileno(), entry.tobytes(), place + self.index * entry.nbytes)
+        except OSError as error:
+            raise cannot_write(self.room.path, error) from error
+
+
+def _sums(slabs: Iterable[NDArray[Any]], comm: MPI.Comm) -> NDArray[np.uint64]:
+    """Check sums of distributed arrays; collective."""
+    mine = np.array([check_sum(slab) for slab in slabs], dtype=np.uint64)
+    total = np.empty_like(mine)
+    comm.Allreduce(mine, total, MPI.SUM)
+    return total
+
+
+def _forget(path: Path, last_step: int) -> None:
+    """Say that a file holds no states behind ``last_step``."""
+    with open_stored(path) as file:
+        if TABLE not in file:
+            return
+        steps, place = file[TABLE]["step"][()], file[TABLE]["step"].id.get_offset()
+    steps[steps > last_step] = -1
+    with open(path, "r+b", buffering=0) as raw:
+        os.pwrite(raw.fileno(), steps.tobytes(), place)
 
 
 def state_files(folder: str | os.PathLike[str]) -> list[Path]:
-    """The state files of a run's folder, by number."""
+    """The files of states of a run's folder, by number."""
     numbered = [(STATE_FILE.fullmatch(path.name), path) for path in Path(folder).iterdir()]
     return [path for _, path in sorted((int(match[1]), path) for match, path in numbered if match)]
 
 
-def read_state(path: Path) -> WrittenState | None:
-    """What a state file holds, or ``None`` if it cannot be read."""
-    match = STATE_FILE.fullmatch(path.name)
-    try:
-        with open_own(path) as file:
-            number = int(match[1]) if match else 0
-            group = file[group_name(number)]
-            fields = tuple(
-                StoredField(name, text_of(data, "on"), data.shape, data.dtype.name)
-                for name, data in group.items()
-                if name != "position"
-            )
-            return WrittenState(
-                number, int(group.attrs["step"]), float(group.attrs["time"]), path.name, fields
-            )
-    except HDF5_ERRORS:
-        return None
+def stored_states(folder: Path) -> list[WrittenState]:
+    """The states in a run's folder, by number; files that cannot be read are passed over."""
+    found: list[WrittenState] = []
+    for path in state_files(folder):
+        with suppress(InputError):
+            found += _states_of(path)
+    return sorted(found, key=lambda state: state.number)
+
+
+def _states_of(path: Path) -> list[WrittenState]:
+    """The states of a file, which in older folders is one.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    with open_stored(path) as file:
+        if TABLE not in file:
+            (name,) = file["states"]
+            group = file["states"][name]
+            on = {key: text_of(data, "on") for key, data in group.items()}
+            step, time = int(group.attrs["step"]), float(group.attrs["time"])
+            return [WrittenState(int(name), step, time, path.name, _fields(group, on))]
+        table = file[TABLE]
+        first, on = int(table.attrs["first"]), dict(json.loads(text_of(table, "columns")))
+        fields = _fields(file[group_name(first)], on)
+        rows = zip(table["step"][()].tolist(), table["time"][()].tolist(), strict=True)
+        return [
+            WrittenState(first + i, step, time, path.name, fields)
+            for i, (step, time) in enumerate(rows)
+            if step >= 0
+        ]
+
+
+def _fields(group: Any, on: Mapping[str, str]) -> tuple[StoredField, ...]:
+    return tuple(
+        StoredField(name, place, group[name].shape, group[name].dtype.name)
+        for name, place in on.items()
+        if name != "position"
+    )

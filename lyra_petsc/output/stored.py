@@ -6,6 +6,7 @@ changed raise nothing at all: datasets have check sums, beside them or in the ta
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,7 +24,8 @@ SUM = "sum"
 """Attribute of a dataset: its check sum, as text."""
 
 TABLE = "written"
-"""Group of a file of states with a row for each that it has room for: ``step``, ``time`` and ``sums``."""
+"""Group of a file of states with a row for each that it has room for: ``step`` (−1: not written), ``time``
+and ``sums``, whose columns are named by the attribute ``columns``; row 0 is of the state ``first``."""
 
 STATE = re.compile(r"/?states/(\d+)/[^/]+")
 
@@ -111,4 +113,5 @@ def _expected(file: Any, stored: Any, dataset: str) -> int | None:
         return None
     table = file[TABLE]
     row = int(state[1]) - int(table.attrs["first"])
-    return int(table["sums"][row, int(stored.attrs["column"])])
+    columns = [name for name, _ in json.loads(text_of(table, "columns"))]
+    return int(table["sums"][row, columns.index(dataset.rpartition("/")[2])])

@@ -64,13 +64,20 @@ ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", 6: "Tensor6", 9: "Tensor"}
 CENTERS = {"vertex": "Node", "triangle": "Cell"}
 
 
+DOCUMENT_START = (
+    '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n'
+    '  <Grid Name="states" GridType="Collection" CollectionType="Temporal">\n'
+)
+DOCUMENT_END = "  </Grid>\n </Domain>\n</Xdmf>\n"
+
+
 def group_name(number: int) -> str:
     """The HDF5 group of a state in its file."""
     return f"states/{number:06d}"
 
 
 class TimeSeries:
-    """The document that shows states of one mesh; each state's part of it is made once.
+    """The document that shows states of one mesh.
 
     Parameters
     ----------
@@ -88,25 +95,13 @@ class TimeSeries:
         )
         rest = StoredField("rest", "vertex", (n_vertices, 3), "float64")
         self._after = _attribute(rest, f"{mesh_file}:/mesh/rest")
-        self._grids: dict[int, tuple[WrittenState, str]] = {}
 
     def text(self, states: Sequence[WrittenState]) -> str:
         """The whole document, states in the order given."""
-        grids = "".join(map(self._known, states))
-        return (
-            '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n'
-            '  <Grid Name="states" GridType="Collection" CollectionType="Temporal">\n'
-            f"{grids}  </Grid>\n </Domain>\n</Xdmf>\n"
-        )
+        return DOCUMENT_START + "".join(map(self.grid, states)) + DOCUMENT_END
 
-    def _known(self, state: WrittenState) -> str:
-        made, text = self._grids.get(state.number, (None, ""))
-        if made is not state:  # a number is used again when its state could not be announced
-            text = self._grid(state)
-            self._grids[state.number] = state, text
-        return text
-
-    def _grid(self, state: WrittenState) -> str:
+    def grid(self, state: WrittenState) -> str:
+        """A state's part of it."""
         group = f"{state.file}:/{group_name(state.number)}"
         position = _item((self._n_vertices, 3), "float64", f"{group}/position")
         return (

@@ -28,6 +28,7 @@ from petsc4py import PETSc  # noqa: E402
 from lyra_petsc import phases  # noqa: E402
 from lyra_petsc.errors import LyraError  # noqa: E402
 from lyra_petsc.linear.matrix import AssembledMatrix  # noqa: E402
+from lyra_petsc.output.read_run import Run  # noqa: E402
 from lyra_petsc.output.recorder import Recorder  # noqa: E402
 from lyra_petsc.output.summary import versions  # noqa: E402
 from lyra_petsc.scene.schema import Scene  # noqa: E402
@@ -235,7 +236,9 @@ def output(comm: Comm, job: Result) -> Result:
         recorder.write_state()
         recorder.settle()
         ours.append(now(comm) - began)
-        written = [(folder / name).stat().st_size for name in (f"states-{number:04d}.h5", "checkpoint.h5")]
+        run = Run(folder)
+        state = run.positions[number].nbytes + sum(run.field(name)[number].nbytes for name in run.fields)
+        written = [state, (folder / "checkpoint.h5").stat().st_size]
         blocks = [os.urandom(size) for size in written] if comm.rank == 0 else []
         began = now(comm)
         for block in blocks:

@@ -18,6 +18,7 @@ import pytest
 from launch import SCENE, command, done, environment, write_scene
 
 from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.output.states import stored_states
 from lyra_petsc.scene.load import load_scene
 
 pytestmark = pytest.mark.quick
@@ -48,12 +49,11 @@ def test_the_files_have_their_names(full: Path) -> None:
 
 def states(run: Path) -> dict[float, dict[str, np.ndarray]]:
     found = {}
-    for path in sorted(run.glob("states-*.h5")):
-        with h5py.File(path, "r") as file:
-            for name, group in file["states"].items():
-                assert len(name) == 6
-                assert int(name) >= 0
-                found[float(group.attrs["time"])] = {key: np.array(data) for key, data in group.items()}
+    for number, state in enumerate(stored_states(run)):
+        assert state.number == number
+        with h5py.File(run / state.file, "r") as file:
+            group = file[f"states/{number:06d}"]
+            found[state.time] = {key: np.array(data) for key, data in group.items()}
     return found
 
 

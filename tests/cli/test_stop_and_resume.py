@@ -8,11 +8,13 @@ import signal
 import time
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from launch import DIRECT, Left, done, finish, lyra, start, write_scene
 from numpy.typing import NDArray
+
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.states import stored_states
 
 LONG = """\
 mesh: {grid: {width: 1.0, height: 1.0, nx: 6, ny: 6}}
@@ -38,18 +40,13 @@ def history(folder: Path, name: str = "history.csv") -> list[dict[str, str]]:
 
 
 def final_state(folder: Path) -> tuple[float, NDArray[np.float64]]:
-    newest = max(folder.glob("states-*.h5"))
-    with h5py.File(newest, "r") as file:
-        group = file["states"][max(file["states"])]
-        return float(group.attrs["time"]), np.array(group["position"])
+    run = Run(folder)
+    return float(run.times[-1]), run.positions[-1]
 
 
 def state_times(folder: Path) -> list[float]:
     """Times [s] of all states, rounded; none is there twice."""
-    times = []
-    for path in sorted(folder.glob("states-*.h5")):
-        with h5py.File(path, "r") as file:
-            times += [round(float(group.attrs["time"]), 9) for group in file["states"].values()]
+    times = [round(state.time, 9) for state in stored_states(folder)]
     assert times == sorted(set(times))
     return times
 
@@ -154,6 +151,8 @@ FAILING = """
 import sys
 from mpi4py import MPI
 import lyra_petsc.{module} as module
+from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.states import stored_states
 from lyra_petsc.cli.app import run_command_line
 
 right = module.{name}

@@ -271,19 +271,18 @@ def complaint(outcome: Outcome, inside: Path, before: Mapping[str, float]) -> st
 
 def _unreadable(out: Path) -> str:
     """What is wrong with the states of a run."""
-    import h5py
     import numpy as np
+
+    from lyra_petsc.errors import InputError
+    from lyra_petsc.output.read_run import Run
 
     if not (out / "states.xdmf").exists():
         return "no states.xdmf"
-    states = 0
-    for path in sorted(out.glob("states-*.h5")):
-        with h5py.File(path) as file:
-            for name in file["states"]:
-                states += 1
-                if not np.isfinite(file["states"][name]["position"][()]).all():
-                    return f"state {name} holds positions that are not finite"
-    return "" if states else "no states"
+    try:
+        np.asarray(Run(out).positions)
+    except InputError as error:
+        return str(error)
+    return ""
 
 
 def listing(folder: Path) -> dict[str, float]:

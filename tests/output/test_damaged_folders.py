@@ -97,7 +97,7 @@ def test_flipped_bits(run, name):
 def test_flipped_bits_of_numbers_are_seen(run):
     """In a sheet's positions and triangles none goes unseen."""
     mesh = run / "mesh.h5"
-    for path, array in ((mesh, TRIANGLES), (mesh, REST)):
+    for path, array in ((states_file(run), position(1)), (mesh, TRIANGLES), (mesh, REST)):
         content = path.read_bytes()
         place = content.find(array.tobytes())
         assert place > 0

@@ -32,7 +32,8 @@ def run(stream, seconds_per_step, steps=100, comm=FIRST, **options):
 
 def test_plain_lines_tell_everything():
     lines = run(io.StringIO(), 0.5).splitlines()
-    assert lines[0] == "  1%  t 0.04 of 4 s  step 1  Newton 3  linear 17  energy 0.25 J  0:50 left"
+    assert lines[0] == "  1%  t 0.04 of 4 s  step 1  Newton 3  linear 17  energy 0.25 J"
+    assert lines[1] == "  6%  t 0.24 of 4 s  step 6  Newton 3  linear 17  energy 0.25 J  0:47 left"
     assert lines[-1].startswith("100%  t 4 of 4 s  step 100")
     assert lines[-1].endswith("0:00 left")
 
@@ -72,24 +73,26 @@ def test_other_ranks_are_silent():
     assert stream.getvalue() == ""
 
 
-def test_time_left_forgets_the_first_step_which_compiles():
+def test_time_left_is_told_after_some_steps_and_forgets_the_first():
     stream, clock = io.StringIO(), Clock()
-    with Progress(FIRST, 4.0, stream=stream, clock=clock) as progress:
-        for now, time in ((60.0, 1.0), (70.0, 2.0), (100.0, 3.0)):
+    with Progress(FIRST, 10.0, stream=stream, clock=clock) as progress:
+        for now, time in ((60.0, 1.0), (70.0, 2.0), (80.0, 3.0), (90.0, 4.0), (100.0, 5.0)):
             clock.now = now
             progress.update(1, time, 1, 1, 0.0)
-    assert [line.split("  ")[-1] for line in stream.getvalue().splitlines()] == [
-        "3:00 left", "0:20 left", "0:20 left"
-    ]  # fmt: skip
+    told = [line.split("  ")[-1] for line in stream.getvalue().splitlines()]
+    assert told == ["energy 0 J"] * 3 + ["1:00 left", "0:50 left"]
 
 
 def test_time_left_on_resume_counts_from_where_it_goes_on():
     stream, clock = io.StringIO(), Clock()
     with Progress(FIRST, 4.0, start=3.0, stream=stream, clock=clock) as progress:
-        clock.now = 10.0
-        progress.update(90, 3.5, 1, 1, 0.0)
-    assert stream.getvalue().splitlines()[0].startswith(" 50%")
-    assert stream.getvalue().splitlines()[0].endswith("0:10 left")
+        for step in range(6):
+            clock.now += 10.0
+            progress.update(90 + step, 3.25 + 0.05 * step, 1, 1, 0.0)
+    lines = stream.getvalue().splitlines()
+    assert lines[0].startswith(" 25%")
+    assert lines[-1].startswith(" 50%")
+    assert lines[-1].endswith("1:40 left")
 
 
 @pytest.mark.parametrize("stream", [io.StringIO(), Terminal()], ids=["file", "terminal"])

@@ -29,13 +29,13 @@ def test_states_are_read_as_they_were_written(tmp_path):
 
 
 def test_a_slice_of_states_reads_nothing_yet(tmp_path):
-    run = Run(written(tmp_path, states=5))
-    chosen = run.positions[1:-1:2]
-    (tmp_path / "states-0003.h5").unlink()
+    run = Run(written(tmp_path, states=6))
+    chosen = run.positions[1:-1:3]
+    (tmp_path / "states-0004.h5").unlink()
 
     assert len(chosen) == 2
     np.testing.assert_array_equal(chosen[0], position(1))
-    with pytest.raises(InputError, match=r"states-0003\.h5: .*: no such file$"):
+    with pytest.raises(InputError, match=r"states-0004\.h5: .*: no such file$"):
         chosen[1]
     with pytest.raises(IndexError):
         chosen[2]

@@ -1,3 +1,4 @@
+import os
 import xml.etree.ElementTree as ElementTree
 
 import meshio
@@ -6,11 +7,11 @@ import pytest
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.output import hdf5
+from lyra_petsc.output import growing_xdmf, hdf5
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateWriter
+from lyra_petsc.output.states import StateWriter, stored_states
 from lyra_petsc.output.xdmf import XDMF_FILE
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -107,11 +108,10 @@ def test_states_read_back_as_a_time_series(comm, shared_tmp, monkeypatch, one_ma
             np.testing.assert_array_equal(mesh.point_data["rest"], REST)
             np.testing.assert_array_equal(mesh.cell_data["rank"][0], np.arange(3))
             np.testing.assert_array_equal(mesh.cell_data["green_strain"][0], strain(step))
-        with h5py.File(shared_tmp / "states-0001.h5", "r") as file:
-            group = file["states/000001"]
-            assert dict(group.attrs) == {"time": 0.4, "step": 4}
-            assert (group["position"].attrs["time"], group["position"].attrs["step"]) == (0.4, 4)
-            assert group["position"].dtype == np.float64
+        with h5py.File(shared_tmp / "states-0000.h5", "r") as file:
+            assert file["written/step"][()].tolist() == [0, 4, 9, -1]
+            assert file["written/time"][:3].tolist() == [0.0, 0.4, 0.9]
+            assert file["states/000001/position"].dtype == np.float64
 
     on_first(comm, check)
 
@@ -161,7 +161,7 @@ def test_a_state_cut_short_is_never_announced(comm, shared_tmp, monkeypatch):
 
     with monkeypatch.context() as broken:
         broken.setattr(hdf5, "_write_rows", write_and_fail)
-        with pytest.raises(OutputError, match=r"states-0001\.h5: cannot be written: No space left"):
+        with pytest.raises(OutputError, match=r"states-0000\.h5: cannot be written: No space left"):
             run.write(1)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0]))
     assert run.write(2) == 1
@@ -184,24 +184,98 @@ def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp):
     resumed = Run(comm, shared_tmp, resume_after=5)
     assert resumed.writer.count == 2
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.3]))
-    assert not (shared_tmp / "states-0002.h5").exists()
+    assert [state.number for state in stored_states(shared_tmp)] == [0, 1]
     comm.Barrier()
     resumed.write(7)
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.3, 0.7]))
     on_first(comm, lambda: np.testing.assert_array_equal(announced(shared_tmp)[1][1].points, position(3)))
 
 
-def test_resume_passes_over_a_damaged_state(comm, shared_tmp):
+def test_resume_passes_over_a_damaged_file(comm, shared_tmp):
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     run = Run(comm, shared_tmp)
-    for step in (0, 1, 2):
+    for step in range(11):
         run.write(step)
+    assert sorted(path.name for path in shared_tmp.glob("states-*.h5")) == [
+        "states-0000.h5",
+        "states-0004.h5",
+        "states-0008.h5",
+    ]
     comm.Barrier()
     if comm.rank == 0:
-        (shared_tmp / "states-0001.h5").write_bytes(b"")
+        (shared_tmp / "states-0004.h5").write_bytes(b"")
     comm.Barrier()
-    assert Run(comm, shared_tmp, resume_after=2).writer.count == 3
-    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.2]))
+    assert Run(comm, shared_tmp, resume_after=9).writer.count == 10
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3, 0.8, 0.9]))
+
+
+def old_file(folder, number, step):
+    """A state as older versions wrote it: in a file of its own."""
+    with h5py.File(folder / f"states-{number:04d}.h5", "w") as file:
+        group = file.create_group(f"states/{number:06d}")
+        group.attrs.update({"time": 0.1 * step, "step": step})
+        for name, on, rows in (
+            ("position", "vertex", position(step)),
+            ("velocity", "vertex", -position(step)),
+            ("green_strain", "triangle", strain(step)),
+        ):
+            group[name] = rows
+            group[name].attrs["on"] = on
+
+
+def test_an_older_folder_goes_on(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    on_first(comm, lambda: [old_file(shared_tmp, i, 3 * i) for i in range(4)])
+    resumed = Run(comm, shared_tmp, resume_after=6)
+    assert resumed.writer.count == 3
+    resumed.write(8)
+
+    def check():
+        assert_times(shared_tmp, [0.0, 0.3, 0.6, 0.8])
+        for step, (_, mesh) in zip((0, 3, 6, 8), announced(shared_tmp), strict=True):
+            np.testing.assert_array_equal(mesh.points, position(step))
+            np.testing.assert_array_equal(mesh.cell_data["green_strain"][0], strain(step))
+
+    on_first(comm, check)
+
+
+def test_few_files_and_a_document_that_grows(comm, shared_tmp, monkeypatch):
+    """Files double; the document is copied now and then only, and is whole after every write to it."""
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run, copies, whole = Run(comm, shared_tmp), [], []
+    make, pwrite = growing_xdmf.GrowingXdmf._make, os.pwrite
+
+    def counted(self, *arguments, **keywords):
+        copies.append(1)
+        return make(self, *arguments, **keywords)
+
+    def checked(descriptor, content, offset):
+        done = pwrite(descriptor, content, offset)
+        if (shared_tmp / XDMF_FILE).exists():
+            whole.append(len(ElementTree.parse(shared_tmp / XDMF_FILE).findall("./Domain/Grid/Grid")))
+        return done
+
+    monkeypatch.setattr(growing_xdmf.GrowingXdmf, "_make", counted)
+    monkeypatch.setattr(growing_xdmf.os, "pwrite", checked)
+    for step in range(90):
+        run.write(step)
+    assert len(list(shared_tmp.glob("states-*.h5"))) == 6
+    if comm.rank == 0:
+        assert len(copies) <= 9
+        assert whole == sorted(whole)
+        assert set(whole) == set(range(1, 91))
+    on_first(comm, lambda: assert_times(shared_tmp, 0.1 * np.arange(90)))
+    assert [state.step for state in stored_states(shared_tmp)] == list(range(90))
+
+
+def test_a_document_that_was_removed_is_made_anew(comm, shared_tmp):
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    run = Run(comm, shared_tmp)
+    for step in range(3):
+        run.write(step)
+    on_first(comm, (shared_tmp / XDMF_FILE).unlink)
+    run.write(3)
+    on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3]))
 
 
 def test_more_than_9999_states(comm, shared_tmp):

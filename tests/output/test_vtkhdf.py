@@ -10,7 +10,7 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output import states as states_module
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateWriter, state_files
+from lyra_petsc.output.states import StateWriter, stored_states
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE
 
 pytestmark = pytest.mark.parallel
@@ -120,7 +120,7 @@ def test_a_disk_that_fails_leaves_the_states_before(folder, comm, monkeypatch):
     on_rank_0(comm, lambda: check(folder / VTKHDF_FILE, [0, 1]))
     again = Writer(comm, folder, resume_after=1)
     assert again.states.count == 2
-    assert len(state_files(folder)) == 2
+    assert len(stored_states(folder)) == 2
 
 
 def test_the_folder_may_be_moved(folder, comm, tmp_path_factory):
@@ -140,5 +140,5 @@ def test_thousand_states_are_announced_quickly(folder, comm):
     for i in range(3):
         writer.write(i)
     began = MPI.Wtime()
-    states_module.write_vtkhdf(folder, writer.states._states * 333, 8, 8, "mesh.h5")
+    states_module.write_vtkhdf(folder, stored_states(folder) * 333, 8, 8, "mesh.h5")
     assert MPI.Wtime() - began < 2.0

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
 from original_lyra import simulate
 
 from lyra_petsc.cli.run import run
+from lyra_petsc.output.read_run import Run
 
 SIDE = 16
 CONF = """{
@@ -52,10 +52,9 @@ def test_hanging_square_follows_the_original(
 
     run(MPI.COMM_SELF, tmp_path / "conf.json", [], out=None, force=False, resume=False)
 
-    with h5py.File(tmp_path / "runs" / "conf" / "states-0005.h5") as file:
-        state = file["states/000005"]
-        assert state.attrs["time"] == pytest.approx(0.2, abs=1e-12)
-        ours = state["position"][:]
+    found = Run(tmp_path / "runs" / "conf")
+    assert found.times[5] == pytest.approx(0.2, abs=1e-12)
+    ours = found.positions[5]
     theirs = simulate(
         np.column_stack([uv, np.zeros(len(uv))]),
         uv,

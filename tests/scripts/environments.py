@@ -25,6 +25,7 @@ NEEDED = {
     "scipy": "1.14",
 }
 """What the program and its studies need."""
+YIELD = "OMPI_MCA_mpi_yield_when_idle"
 MODULES = {"pillow": "PIL", "usd-core": "pxr"}
 
 
@@ -55,7 +56,7 @@ def make(folder: Path) -> None:
 
 def surroundings(folder: Path) -> dict[str, str]:
     """Variables without those that tell a script of ours about this environment; nothing is fetched."""
-    names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
+    names = ("PYTHON", "RANKS", "MPIRUN", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME", YIELD)
     clean = {name: value for name, value in os.environ.items() if name not in names}
     return {**clean, "LYRA_VENV": str(folder / "laid over"), "PIP_NO_INDEX": "1"}
 

@@ -8,7 +8,7 @@ import venv
 from pathlib import Path
 
 import pytest
-from environments import ROOT, activated, call, make, site_packages
+from environments import ROOT, YIELD, activated, call, make, site_packages
 
 HELPER = ROOT / "scripts" / "environment.py"
 
@@ -42,6 +42,19 @@ def test_python_variable_ranks_and_exit_code(environment, tmp_path):
     done = call("run.sh", cwd=tmp_path, PYTHON=python, RANKS="5", LAUNCHER_EXIT="3")
     assert f"-n 5 {python} -m lyra_petsc run" in done.stdout
     assert done.returncode == 3
+
+
+def test_waiting_ranks_give_cores_away_only_where_there_are_more_of_them(environment, tmp_path):
+    """Beside busy programs a run of as many ranks as cores would hardly get on otherwise."""
+    (environment / "bin" / "mpirun").write_text(f'#!/bin/sh\necho "${YIELD}"\n')
+    cores = len(os.sched_getaffinity(0))
+    for script, words in (("run.sh", []), ("lyra.sh", ["run"])):
+        for ranks, expected in ((cores, "0"), (cores + 1, "1")):
+            if ranks > 1 or script == "run.sh":
+                done = call(script, *words, cwd=tmp_path, RANKS=str(ranks), **activated(environment))
+                assert done.stdout.strip() == expected, (script, ranks, done.stderr)
+    kept = call("run.sh", cwd=tmp_path, RANKS="1", **{YIELD: "1"}, **activated(environment))
+    assert kept.stdout.strip() == "1"
 
 
 def test_python_variable_without_the_stack_is_refused(tmp_path):

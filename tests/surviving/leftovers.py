@@ -12,6 +12,8 @@ import h5py
 import meshio
 import numpy as np
 
+from lyra_petsc.output.states import stored_states
+
 SHEET = """\
 mesh: {grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}
 material: {density: 0.15, membrane: {c11: 800, c22: 800, c12: 160, c33: 240}, bending: 2.0e-5, damping: 0.005}
@@ -69,6 +71,6 @@ def ranks_in(folder: Path) -> list[int]:
 def wait_for_states(out: Path, number: int, patience: float = 60.0) -> None:
     """Until that many states are on disk."""
     deadline = time.monotonic() + patience
-    while len(list(out.glob("states-*.h5"))) < number:
+    while not out.is_dir() or len(stored_states(out)) < number:
         assert time.monotonic() < deadline, "the run does not get on"
         time.sleep(0.01)

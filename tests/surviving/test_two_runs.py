@@ -11,6 +11,8 @@ import pytest
 from launch import done, finish, lyra, start, write_scene
 from leftovers import ENDLESS, SHEET, announced, wait_for_states
 
+from lyra_petsc.output.states import stored_states
+
 SLOW_SET_UP = """
 import sys, time
 from pathlib import Path
@@ -39,7 +41,7 @@ def test_a_second_run_is_refused_while_the_first_steps(tmp_path: Path) -> None:
         assert left.code == 2, left.err
         (line,) = left.ours
         assert "another run is at work in this folder (process " in line or not words
-    before = len(list((tmp_path / "out").glob("states-*.h5")))
+    before = len(stored_states(tmp_path / "out"))
     wait_for_states(tmp_path / "out", before + 2)
     os.killpg(first.pid, signal.SIGKILL)
     first.communicate()

@@ -16,7 +16,7 @@ from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import raise_together
 from lyra_petsc.output.read_run import Columns, read_table
 from lyra_petsc.output.self_contained import check_folder
-from lyra_petsc.output.states import read_state, state_files
+from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import open_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.parallel import on_root
@@ -191,7 +191,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
     states = []
     if folder.is_dir():
         check_folder(folder)
-        states = [state for path in state_files(folder) if (state := read_state(path)) is not None]
+        states = stored_states(folder)
     if not states:
         raise InputError("holds no states of a run", file=folder)
     at = np.array([state.time for state in states])
