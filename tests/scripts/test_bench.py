@@ -115,7 +115,7 @@ def test_json_holds_every_measurement(measured):
     assert tuple(meshes["meshes"]) == MESHES
     for found in meshes["meshes"].values():
         assert min(step["cpu"] for step in found["steps"]) > 0.0
-        assert found["vertices"] < 2 * 36
+        assert 25 <= found["vertices"] < 5 * 36  # few vertices do not make edges 1:20
     (apart,) = results["apart"]
     assert 2 * 2 <= len(apart["step_seconds"]) <= 2 * 3
     assert apart["vertices"] == square_number(18)
