@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.step_control import StepControl
 from lyra_petsc.terms.term import Step
 
 Array = NDArray[np.float64]
@@ -128,3 +129,9 @@ def test_a_load_that_switches_begins_the_scheme_anew() -> None:
             shapes.append(gathered(simulation.problem.points, simulation.problem.system.x))
     coarse, fine = (np.abs(shape - shapes[-1]).max() for shape in shapes[:2])
     assert coarse / fine == pytest.approx(4.06, abs=0.3)  # 3.2 where it is not
+
+
+def test_round_off_makes_no_tiny_step() -> None:
+    control = StepControl(0.1, 0.3, None, [], 1e-5)
+    assert control.next_end(0.2 - 1e-9) == 0.3
+    assert control.next_end(0.1 - 1e-9) == pytest.approx(0.2 - 1e-9, abs=1e-15)
