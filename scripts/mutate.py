@@ -265,7 +265,7 @@ CHANGES: list[Change] = [
         STEPPING + "prescribed.py",
         "self.velocity = (self.goal - x_h.take(self.at)) / reach",
         "self.velocity = 0.5 * (self.goal - x_h.take(self.at)) / reach",
-        ("tests/stepping/test_handles.py",),
+        ("tests/stepping/test_budgets.py",),
     ),
     Change(
         STEPPING + "damping.py",
