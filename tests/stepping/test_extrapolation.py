@@ -78,3 +78,23 @@ def test_a_falling_sheet_takes_fewer_linear_iterations(
     more, same = iterations()
     assert fewer < 0.9 * more
     np.testing.assert_allclose(x, same, rtol=0.0, atol=1e-6)
+
+
+def test_a_resumed_run_expects_the_same() -> None:
+    times = [0.0, 0.1, 0.25, 0.3, 0.5]
+    whole = Extrapolation(MPI.COMM_SELF)
+    for before, after in pairwise(times):
+        whole.to(after, before, curved(before))
+    whole.learn(0.5, curved(0.5))
+    arrays, numbers = whole.memory()
+    resumed = Extrapolation(MPI.COMM_SELF)
+    resumed.restore(arrays, numbers, 0.5, curved(0.5))
+    assert numbers["degree"] > 0
+    for before, after in pairwise([0.5, 0.6, 0.75, 0.8]):
+        guess = whole.to(after, before, curved(before))
+        np.testing.assert_array_equal(resumed.to(after, before, curved(before)), guess)
+
+
+def curved(t: float) -> np.ndarray:
+    """Velocities (2, 3) [m/s] that no polynomial hits."""
+    return np.array([[1.0, t, t * t], [np.sin(t), np.exp(t), t**3]])
