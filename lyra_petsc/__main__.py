@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -19,6 +20,9 @@ def main() -> None:
             stream.flush()
         except OSError:  # the reader is gone; Python would try again and complain
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    # Python would look through all objects, and destroy them, after the last line: half a second of processor
+    # time, many on a busy machine; PETSc's in an order that need not be the same on all ranks
+    gc.freeze()
     sys.exit(code)
 
 

@@ -19,9 +19,19 @@ Result = TypeVar("Result")
 
 # registered here, as PETSc adds up the stages of all ranks by number: the order must not depend on the way
 # a rank takes
-STAGES = {
-    name: PETSc.Log.Stage(name) for name in ("mesh", "partition", "assembly", "solve", "balance", "output")
-}
+STAGES: dict[str, PETSc.Log.Stage] = {}
+
+
+def _register(name: str) -> None:
+    """Make a stage that the profile leaves out until it is pushed; PETSc would call it "Unknown"."""
+    STAGES[name] = PETSc.Log.Stage(name)
+    STAGES[name].setVisible(False)
+
+
+for _name in ("mesh", "partition", "assembly", "solve", "balance", "output"):
+    _register(_name)
+# PETSc registers this one itself, for a server of linear solvers that we never start
+PETSc.Log.Stage("PCMPI").setVisible(False)
 
 RESIDUAL, JACOBIAN = "AssembleResidual", "AssembleJacobian"
 """Events, the latter once a Newton iteration; PETSc's table has room for names of 16 letters."""
@@ -35,12 +45,16 @@ FROZEN = "AssembleFrozen"
 SWEEP, TRANSFER, GALERKIN = "MGSweep", "MGTransfer", "MGGalerkin"
 """Of the multigrid: a level's Gauss-Seidel sweep, transfers between levels, coarser matrices."""
 
+COMPILE = PETSc.Log.Event("CompileKernels")
+"""Once for each kernel that is compiled and not loaded from the disk, with those that it calls."""
+
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
     """Let PETSc charge what happens in the block to the stage ``name``; ended also by an exception."""
     if name not in STAGES:
-        STAGES[name] = PETSc.Log.Stage(name)
+        _register(name)
+    STAGES[name].setVisible(True)
     STAGES[name].push()
     try:
         yield
@@ -110,6 +124,16 @@ class Phases:
         """Charge again to the phase before."""
         self._charge()
         self._open.pop()
+
+    def begin_compilation(self) -> None:
+        """Charge what follows to the compilation of a kernel, until `end_compilation`."""
+        self.begin("compilation")
+        COMPILE.begin()
+
+    def end_compilation(self) -> None:
+        """Charge again to the phase that needed the kernel."""
+        COMPILE.end()
+        self.end()
 
     @property
     def total(self) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from lyra_petsc.api.waiting import Waiting
 from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.h5py_loader import import_ahead
@@ -107,6 +108,7 @@ class _RunLoop:
         self._simulation, self._recorder, self._folder = simulation, recorder, folder
         self._callbacks, self._comm = callbacks, simulation.comm
         self._versions = versions()
+        self._waiting = Waiting(self._comm)
         self._notes_shown = simulation.earlier_notes
         self._first_step = simulation.step_number
         self._resumed: list[dict[str, Any]] = []
@@ -132,11 +134,14 @@ class _RunLoop:
             self._show_notes()
             simulation.stepper.monitor()
             while not simulation.finished:
-                report = simulation.step()
+                with self._waiting.step():
+                    report = simulation.step()
                 with simulation.phases("output"):
                     recorder.record(report)
                 self._show_notes()
                 callbacks.step(simulation, report)
+                if note := self._waiting.look(last=simulation.finished):
+                    callbacks.note(note)
                 if number := stop():
                     recorder.write_checkpoint()
                     recorder.settle()
@@ -216,7 +221,7 @@ class _RunLoop:
             **simulation.stability,
             "resumed": self._resumed,
             "wall_seconds": simulation.phases.seconds(),
-            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats])],
+            "notes": [*simulation.notes, *filter(None, [simulation.note_of_repeats, self._waiting.note])],
             **({"failure": simulation.failure.content()} if simulation.failure else {}),
         }
         write_summary(self._folder / "summary.json", content, self._comm)

@@ -6,7 +6,6 @@ import math
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -112,7 +111,7 @@ class Simulation:
     def __init__(self, comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> None:
         self.comm, self.scene = comm, scene
         self.phases = phases or Phases()
-        COMPILATION.begins, COMPILATION.ends = partial(self.phases.begin, "compilation"), self.phases.end
+        COMPILATION.begins, COMPILATION.ends = self.phases.begin_compilation, self.phases.end_compilation
         self._filled = fill_gaps(scene.petsc)
         try:
             check_options()

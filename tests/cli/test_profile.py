@@ -41,6 +41,46 @@ def test_stages_and_events(tmp_path: Path, integrator: str, ranks: int) -> None:
     (residuals,) = counts(left.out, "AssembleResidual")
     assert residuals >= sum(newton)
     assert counts(left.out, "AssembleAgain") == []
+    assert "Event Stage" in left.out
+    assert not re.search(r"Event Stage \d+: Unknown", left.out)
+
+
+def test_compilation_is_an_event(tmp_path: Path) -> None:
+    program = f"""
+from pathlib import Path
+from mpi4py import MPI
+from petsc4py import PETSc
+from lyra_petsc.kernels.cache import cached
+from lyra_petsc.phases import COMPILE, STAGES, Phases
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.stepping.simulation import Simulation
+PETSc.Log.begin()
+
+@cached()
+def inner(x):
+    return x + 1.0
+
+@cached()
+def outer(x):
+    return inner(x) * 2.0
+
+phases = Phases()
+simulation = Simulation(MPI.COMM_SELF, load_scene(Path({str(write_scene(tmp_path))!r}), []), phases)
+stage = STAGES["solve"].id
+before = COMPILE.getPerfInfo(stage)["count"], phases.seconds().get("compilation", 0.0)
+with phases("solve"):
+    outer(1.0)
+    outer(2.0)
+after = COMPILE.getPerfInfo(stage)["count"], phases.seconds()["compilation"]
+print(after[0] - before[0], after[1] > before[1])
+"""
+    path = tmp_path / "program.py"
+    path.write_text(program)
+    told = subprocess.run(
+        [sys.executable, path], env=environment(), capture_output=True, text=True, timeout=100
+    )
+    # the kernel that is called is compiled within the other one
+    assert told.stdout.split() == ["1", "True"], told.stderr
 
 
 def test_stages_are_balanced_when_exceptions_pass(tmp_path: Path) -> None:

@@ -1,0 +1,39 @@
+"""After the last line a process has ended: Python does not take its objects apart first."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from launch import environment
+
+PROGRAM = """
+import atexit
+from lyra_petsc.cli import app
+
+class Held:
+    def __del__(self):
+        print("looked through")
+
+def command_line(words):
+    held = Held()
+    held.itself = held
+    print("last line")
+    return 3
+
+app.run_command_line = command_line
+atexit.register(print, "handlers run")
+from lyra_petsc.__main__ import main
+main()
+"""
+
+
+def test_objects_are_not_looked_through_at_the_end(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    ended = subprocess.run(
+        [sys.executable, program], env=environment(), capture_output=True, text=True, timeout=60
+    )
+    assert (ended.returncode, ended.stderr) == (3, "")
+    assert ended.stdout.split("\n") == ["last line", "handlers run", ""]
