@@ -22,6 +22,12 @@ def _velocity(problem: Problem) -> Array:
     return problem.system.written_velocity()[: problem.points.n_vertices]
 
 
+def _displacement(problem: Problem) -> Array:
+    assert problem.start is not None  # see `check_field`
+    moved: Array = problem.system.x[: problem.points.n_vertices] - problem.start
+    return moved
+
+
 def _green_strain(problem: Problem) -> Array:
     return problem.membrane.strain_and_stress(problem.system.x)[0][: problem.membrane.n_owned]
 
@@ -86,6 +92,7 @@ FIELDS = {
     field.name: field
     for field in (
         Field("velocity", "vertex", "m/s, (V, 3)", _velocity),
+        Field("displacement", "vertex", "from the positions at t = 0, m, (V, 3)", _displacement),
         Field("green_strain", "triangle", "E_uu, E_vv, E_uv in material axes, (F, 3)", _green_strain),
         Field("stress", "triangle", "second Piola-Kirchhoff S_uu, S_vv, S_uv, N/m, (F, 3)", _stress),
         Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
@@ -117,12 +124,18 @@ def chosen(problem: Problem) -> list[Field]:
 
 
 def check_field(field: Field, problem: Problem) -> None:
-    """Refuse a field of a term that the scene does not have.
+    """Refuse a field of a term that the scene does not have, or of a start that was not kept.
 
     Raises
     ------
     InputError
     """
+    if field.name == "displacement" and problem.start is None:
+        raise InputError(
+            "'displacement' needs the start positions, which are kept where output.fields names it",
+            file=problem.scene.source,
+            key="output.fields",
+        )
     if field.term not in problem.terms:
         raise InputError(
             f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",

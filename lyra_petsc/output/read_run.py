@@ -43,7 +43,7 @@ COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"
 RECENT = 0.05
 """Seconds; clocks of file systems are coarser than those of processors."""
 
-COLUMNS = {"velocity": (3,), "green_strain": (3,), "stress": (3,)}
+COLUMNS = {"velocity": (3,), "displacement": (3,), "green_strain": (3,), "stress": (3,)}
 """Shape of a row of the fields that are no plain numbers."""
 
 

@@ -12,7 +12,7 @@ from lyra_petsc.extras import require
 if TYPE_CHECKING:
     from lyra_petsc.output.read_run import Run
 
-WIDTHS = {"velocity": "axis"}
+WIDTHS = {"velocity": "axis", "displacement": "axis"}
 """What the last axis of a field with three columns counts; else components in the material axes."""
 
 

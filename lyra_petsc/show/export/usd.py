@@ -79,7 +79,7 @@ def _fill(stage: Any, states: ExportedStates) -> None:
         single = np.ascontiguousarray(position, dtype=np.float32)
         points.Set(Vt.Vec3fArray.FromNumpy(single), code)
         extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([single.min(axis=0), single.max(axis=0)])), code)
-    for field in run.fields:
+    for field in states.fields:
         _sample(mesh, primvars, states, field, codes)
 
 
@@ -95,7 +95,7 @@ def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes:
                 attribute = mesh.CreateVelocitiesAttr()
             else:
                 kind = Sdf.ValueTypeNames.Float3Array if vector else Sdf.ValueTypeNames.FloatArray
-                on_vertices = states.run.field_on(field) == "vertex"
+                on_vertices = states.field_on(field) == "vertex"
                 place = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
                 attribute = primvars.CreatePrimvar(field, kind, place).GetAttr()
             attribute.SetCustomDataByKey("unit", states.run.field_units(field))
