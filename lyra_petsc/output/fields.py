@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.tensors import six_components
 from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
@@ -29,11 +30,13 @@ def _displacement(problem: Problem) -> Array:
 
 
 def _green_strain(problem: Problem) -> Array:
-    return problem.membrane.strain_and_stress(problem.system.x)[0][: problem.membrane.n_owned]
+    strain, _ = problem.membrane.strain_and_stress(problem.system.x)
+    return six_components(strain[: problem.membrane.n_owned])
 
 
 def _stress(problem: Problem) -> Array:
-    return problem.membrane.strain_and_stress(problem.system.x)[1][: problem.membrane.n_owned]
+    _, stress = problem.membrane.strain_and_stress(problem.system.x)
+    return six_components(stress[: problem.membrane.n_owned])
 
 
 def _membrane_energy(problem: Problem) -> Array:
@@ -93,8 +96,8 @@ FIELDS = {
     for field in (
         Field("velocity", "vertex", "m/s, (V, 3)", _velocity),
         Field("displacement", "vertex", "from the positions at t = 0, m, (V, 3)", _displacement),
-        Field("green_strain", "triangle", "E_uu, E_vv, E_uv in material axes, (F, 3)", _green_strain),
-        Field("stress", "triangle", "second Piola-Kirchhoff S_uu, S_vv, S_uv, N/m, (F, 3)", _stress),
+        Field("green_strain", "triangle", "in material axes, (F, 6): see `tensors`", _green_strain),
+        Field("stress", "triangle", "second Piola-Kirchhoff, N/m, likewise, (F, 6)", _stress),
         Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
         Field(
             "bending_energy",

@@ -24,6 +24,7 @@ from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
 from lyra_petsc.output.stored import read_stored
+from lyra_petsc.output.tensors import plane_components
 from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, changes, dump_scene
@@ -308,6 +309,9 @@ class Recorder:
             return
         problem = simulation.problem
         values = {field: field.compute(problem) for field in self._fields}
+        for field in values:
+            if field.name in self._states.in_plane:
+                values[field] = plane_components(values[field])
         with self._checkpoint(last_state=simulation.step_number) as checkpoint:
             self._states.write(
                 simulation.step_number,

@@ -67,8 +67,10 @@ def test_strain_and_stress_of_a_stretch() -> None:
     with Simulation(ALL, MPI.COMM_SELF) as simulation:
         simulation.set_state(x=simulation.x * [1.1, 1.0, 1.0])
         strain, stress = value(simulation, "green_strain"), value(simulation, "stress")
-    np.testing.assert_allclose(strain, np.tile([0.105, 0.0, 0.0], (len(strain), 1)), atol=1e-12)
-    np.testing.assert_allclose(stress, np.tile([10.5, 2.1, 0.0], (len(stress), 1)), atol=1e-10)
+    np.testing.assert_allclose(
+        strain, np.tile([0.105, 0.0, 0.0, 0.0, 0.0, 0.0], (len(strain), 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(stress, np.tile([10.5, 0.0, 0.0, 2.1, 0.0, 0.0], (len(stress), 1)), atol=1e-10)
 
 
 def test_displacement_is_from_the_disturbed_start() -> None:

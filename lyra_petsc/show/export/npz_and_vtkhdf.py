@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.tensors import in_vtk_order
 from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, describe
 from lyra_petsc.show.export.exported_states import ExportedStates
 
@@ -94,7 +95,7 @@ def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
             for place, arrays in moving.items():
                 stored = file[f"VTKHDF/{place}"]
                 for i, array in enumerate(arrays):
-                    stored[i * len(array) : (i + 1) * len(array)] = array
+                    stored[i * len(array) : (i + 1) * len(array)] = in_vtk_order(array)
     except InputError:
         raise
     except HDF5_ERRORS as error:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import OutputError
+from lyra_petsc.output.tensors import is_tensor
 from lyra_petsc.show.export.exported_states import ExportedStates, turned_up
 
 ROOT = "/run"
@@ -89,7 +90,7 @@ def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes:
 
     attribute: Any = None
     for code, rows in zip(codes, states.field(field), strict=True):
-        vector = rows.ndim == 2
+        vector = rows.ndim == 2 and not is_tensor(rows.shape)
         if attribute is None:
             if field == "velocity":
                 attribute = mesh.CreateVelocitiesAttr()
@@ -97,7 +98,12 @@ def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes:
                 kind = Sdf.ValueTypeNames.Float3Array if vector else Sdf.ValueTypeNames.FloatArray
                 on_vertices = states.field_on(field) == "vertex"
                 place = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
-                attribute = primvars.CreatePrimvar(field, kind, place).GetAttr()
+                primvar = primvars.CreatePrimvar(field, kind, place)
+                if is_tensor(rows.shape):
+                    primvar.SetElementSize(rows.shape[1])
+                attribute = primvar.GetAttr()
             attribute.SetCustomDataByKey("unit", states.run.field_units(field))
         values: NDArray[np.float32] = np.ascontiguousarray(rows, dtype=np.float32)
-        attribute.Set((Vt.Vec3fArray if vector else Vt.FloatArray).FromNumpy(values), code)
+        attribute.Set(
+            Vt.Vec3fArray.FromNumpy(values) if vector else Vt.FloatArray.FromNumpy(values.ravel()), code
+        )
