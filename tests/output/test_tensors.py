@@ -69,6 +69,15 @@ def test_exports(tmp_path: Path) -> None:
     steps = reader.read(export_run(run, "vtkhdf").folder / "run.vtkhdf")
     for i, (*_, arrays) in enumerate(steps):
         np.testing.assert_array_equal(arrays["triangle"]["stress"], in_vtk_order(tensor(i)))
+    vtk = pytest.importorskip("vtk")
+    source, principal = vtk.vtkHDFReader(), vtk.vtkTensorPrincipalInvariants()
+    source.SetFileName(str(run / "vtkhdf" / "run.vtkhdf"))
+    principal.SetInputConnection(source.GetOutputPort())
+    principal.UpdateInformation()
+    principal.GetCellDataArraySelection().EnableArray("stress")
+    principal.Update()
+    largest = principal.GetOutput().GetCellData().GetArray("stress - Sigma 1")
+    np.testing.assert_allclose(largest, quantity(Run(run), "stress").values(0), atol=1e-12)
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
