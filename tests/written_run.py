@@ -50,6 +50,13 @@ def stress(state: int) -> np.ndarray:
     return np.outer(np.arange(len(TRIANGLES)), [1.0, -2.0, 1.0 / 3.0]) * (1 + state)
 
 
+def tensor(state: int) -> np.ndarray:
+    """The stress with six components, as it is written now: uu, uv, uw, vv, vw, ww."""
+    uu, vv, uv = stress(state).T
+    none = np.zeros_like(uu)
+    return np.stack([uu, uv, none, vv, none, none], axis=1)
+
+
 def scene(**output: object) -> Scene:
     return Scene.model_validate(
         {
@@ -64,14 +71,14 @@ def scene(**output: object) -> Scene:
 class Writer:
     """A run that writes state after state, 0.1 s apart."""
 
-    def __init__(self, folder: Path, vt: str = "each vertex", fields: bool = True) -> None:
+    def __init__(self, folder: Path, vt: str = "each vertex", fields: bool = True, six: bool = False) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         comm = MPI.COMM_SELF
         write_mesh(folder, ring(vt), comm)
         replace_text(
             folder / "scene.yaml", dump_scene(scene(fields=["velocity", "stress"] if fields else []))
         )
-        self.fields = fields
+        self.fields, self.stress = fields, tensor if six else stress
         self.states = StateWriter(
             folder,
             FileOrder(comm, np.arange(len(REST)), len(REST)),
@@ -90,13 +97,15 @@ class Writer:
             0.1 * i,
             position(i),
             {"velocity": velocity(i)} if self.fields else {},
-            {"stress": stress(i)} if self.fields else {},
+            {"stress": self.stress(i)} if self.fields else {},
         )
 
 
-def written(folder: Path, states: int = 3, vt: str = "each vertex", fields: bool = True) -> Path:
-    """The folder of a run with some states."""
-    writer = Writer(folder, vt, fields)
+def written(
+    folder: Path, states: int = 3, vt: str = "each vertex", fields: bool = True, six: bool = False
+) -> Path:
+    """The folder of a run with some states; without ``six``, stresses are as older versions wrote them."""
+    writer = Writer(folder, vt, fields, six)
     for _ in range(states):
         writer.write()
     writer.history.close()

@@ -22,6 +22,9 @@ from lyra_petsc.cli.signals import watched
 )
 @click.option("--times", metavar="T,T,…", help="The states nearest to these times [s].")
 @click.option("--every", type=int, metavar="N", help="Every Nth state.")
+@click.option(
+    "--displacement", is_flag=True, help="Add the displacement from the start, as for Warp By Vector."
+)
 @click.option("--force", is_flag=True, help="Replace a former export in DIR.")
 @click.pass_obj
 def export(comm: Any, /, run: Path, **asked: Any) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.output.tensors import six_components
 from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
@@ -22,12 +23,20 @@ def _velocity(problem: Problem) -> Array:
     return problem.system.written_velocity()[: problem.points.n_vertices]
 
 
+def _displacement(problem: Problem) -> Array:
+    assert problem.start is not None  # see `check_field`
+    moved: Array = problem.system.x[: problem.points.n_vertices] - problem.start
+    return moved
+
+
 def _green_strain(problem: Problem) -> Array:
-    return problem.membrane.strain_and_stress(problem.system.x)[0][: problem.membrane.n_owned]
+    strain, _ = problem.membrane.strain_and_stress(problem.system.x)
+    return six_components(strain[: problem.membrane.n_owned])
 
 
 def _stress(problem: Problem) -> Array:
-    return problem.membrane.strain_and_stress(problem.system.x)[1][: problem.membrane.n_owned]
+    _, stress = problem.membrane.strain_and_stress(problem.system.x)
+    return six_components(stress[: problem.membrane.n_owned])
 
 
 def _membrane_energy(problem: Problem) -> Array:
@@ -86,8 +95,9 @@ FIELDS = {
     field.name: field
     for field in (
         Field("velocity", "vertex", "m/s, (V, 3)", _velocity),
-        Field("green_strain", "triangle", "E_uu, E_vv, E_uv in material axes, (F, 3)", _green_strain),
-        Field("stress", "triangle", "second Piola-Kirchhoff S_uu, S_vv, S_uv, N/m, (F, 3)", _stress),
+        Field("displacement", "vertex", "from the positions at t = 0, m, (V, 3)", _displacement),
+        Field("green_strain", "triangle", "in material axes, (F, 6): see `tensors`", _green_strain),
+        Field("stress", "triangle", "second Piola-Kirchhoff, N/m, likewise, (F, 6)", _stress),
         Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
         Field(
             "bending_energy",
@@ -117,12 +127,18 @@ def chosen(problem: Problem) -> list[Field]:
 
 
 def check_field(field: Field, problem: Problem) -> None:
-    """Refuse a field of a term that the scene does not have.
+    """Refuse a field of a term that the scene does not have, or of a start that was not kept.
 
     Raises
     ------
     InputError
     """
+    if field.name == "displacement" and problem.start is None:
+        raise InputError(
+            "'displacement' needs the start positions, which are kept where output.fields names it",
+            file=problem.scene.source,
+            key="output.fields",
+        )
     if field.term not in problem.terms:
         raise InputError(
             f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",

@@ -23,6 +23,7 @@ from lyra_petsc.output.self_contained import check_file, check_folder, check_nam
 from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.summary import read_summary
+from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
 
 if TYPE_CHECKING:
@@ -43,8 +44,8 @@ COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"
 RECENT = 0.05
 """Seconds; clocks of file systems are coarser than those of processors."""
 
-COLUMNS = {"velocity": (3,), "green_strain": (3,), "stress": (3,)}
-"""Shape of a row of the fields that are no plain numbers."""
+COLUMNS = {"velocity": (3,), "displacement": (3,)}
+"""Shape of a row of the fields that are vectors."""
 
 
 class Run:
@@ -160,7 +161,10 @@ class Run:
         return self.field("velocity")
 
     def field(self, name: str) -> StateArrays:
-        """What the states hold under a name: (V,), (V, 3), (F,) or (F, 3) for each.
+        """What the states hold under a name: (V,), (V, 3), (F,) or (F, 6) for each.
+
+        ``stress`` and ``green_strain`` are (F, 6), uu, uv, uw, vv, vw, ww in material axes (u along the warp,
+        w normal to the sheet); in older folders (F, 3), uu, vv, uv.
 
         Raises
         ------
@@ -174,7 +178,8 @@ class Run:
             )
         places = [state.fields[name] for state in self._states]
         rows = self.rest if self.field_on(name) == "vertex" else self.triangles
-        return StateArrays(self.folder, name, places, (len(rows), *COLUMNS.get(name, ())))
+        columns = self._states[0].tensors.get(name, COLUMNS.get(name, ()))
+        return StateArrays(self.folder, name, places, (len(rows), *columns))
 
     def field_units(self, name: str) -> str:
         """Unit of a field, as in ``N/m``; ``1`` for plain numbers."""
@@ -282,12 +287,15 @@ class StoredState:
         Where what else the state holds is.
     on : mapping of str to str
         ``vertex`` or ``triangle``: what the rows of each field belong to.
+    tensors : mapping of str to tuple of int
+        Shape of a row of those of the fields that are tensors.
     """
 
     time: float
     position: Place
     fields: Mapping[str, Place]
     on: Mapping[str, str]
+    tensors: Mapping[str, tuple[int, ...]]
 
 
 def announced_states(folder: Path) -> list[StoredState]:
@@ -340,7 +348,16 @@ def _state(grid: Element) -> StoredState:
         _place(geometry),
         {name: _place(field) for name, field in fields.items()},
         {name: "triangle" if field.get("Center") == "Cell" else "vertex" for name, field in fields.items()},
+        {name: _row_of_tensor(fields[name]) for name in TENSORS & fields.keys()},
     )
+
+
+def _row_of_tensor(element: Element) -> tuple[int]:
+    item = element.find("DataItem")
+    width = int(item.attrib["Dimensions"].split()[-1]) if item is not None else 0
+    if width not in COMPONENTS:
+        raise ValueError
+    return (width,)
 
 
 def _place(element: Element) -> Place:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,14 @@ from lyra_petsc.output.background import Background
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
 from lyra_petsc.output.failure_files import Moment, remove_failure, write_failure
 from lyra_petsc.output.fields import Field, chosen
-from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
+from lyra_petsc.output.stored import read_stored
+from lyra_petsc.output.tensors import plane_components
+from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, changes, dump_scene
 from lyra_petsc.scene.schema import Scene
@@ -118,12 +121,29 @@ class Recorder:
         if checkpoint.note:
             simulation.notes.append(checkpoint.note)
         self._note_changes(folder / "scene.yaml")
+        if problem.start is not None:
+            problem.start = self._first_positions(folder, otherwise=problem.start)
         self._open(folder, simulation.step_number)
         kept, last = self._history.kept_until, simulation.step_number
         if kept != last:
             simulation.notes.append(f"{self._history.path}: the rows of steps {kept + 1} to {last} are lost")
         on_root(self._comm, lambda: replace_text(folder / "scene.yaml", dump_scene(scene)))
         self._last_state = int(checkpoint.scalars["last_state"])
+
+    def _first_positions(self, folder: Path, *, otherwise: Array) -> Array:
+        """Positions [m] of this rank's vertices in state 0; the scene's start where that cannot be read."""
+        file, name, order = folder / "states-0000.h5", f"{group_name(0)}/position", self._vertices
+
+        def readable() -> bool:
+            with suppress(InputError):
+                read_stored(file, name, (order.n_global, 3), kinds="f")
+                return True
+            return False
+
+        if not on_root(self._comm, readable):
+            return otherwise
+        first: Array = order.from_slab(read_slab(file, name, order))
+        return first
 
     def _put(self, checkpoint: Checkpoint) -> None:
         """Put a checkpoint into the simulation."""
@@ -289,6 +309,9 @@ class Recorder:
             return
         problem = simulation.problem
         values = {field: field.compute(problem) for field in self._fields}
+        for field in values:
+            if field.name in self._states.in_plane:
+                values[field] = plane_components(values[field])
         with self._checkpoint(last_state=simulation.step_number) as checkpoint:
             self._states.write(
                 simulation.step_number,

@@ -27,6 +27,7 @@ from lyra_petsc.output.growing_xdmf import GrowingXdmf
 from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import TABLE, check_sum, open_stored, text_of
+from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
 from lyra_petsc.parallel import on_root
@@ -64,6 +65,11 @@ class StateWriter:
     vtkhdf : bool
         Announce the states in ``states.vtkhdf``, too.
 
+    Attributes
+    ----------
+    in_plane : frozenset of str
+        Tensors that the states before hold by three components, as older versions wrote them; they go on so.
+
     Raises
     ------
     OutputError
@@ -94,8 +100,11 @@ class StateWriter:
         self._vtkhdf, self._background = vtkhdf, background
         if vtkhdf:
             on_root(self._comm, lambda: write_cells(self.folder))
+        self.in_plane: frozenset[str] = frozenset()
         if resume_after is not None:
-            self._next = on_root(self._comm, lambda: self._truncate(resume_after)) or 0
+            found = on_root(self._comm, lambda: self._truncate(resume_after))
+            assert found is not None
+            self._next, self.in_plane = found
 
     @property
     def _comm(self) -> MPI.Comm:
@@ -237,8 +246,11 @@ class StateWriter:
         write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles, MESH_FILE)
         self._in_vtk = len(self._states)
 
-    def _truncate(self, last_step: int) -> int:
-        """Announce the states up to ``last_step``, only then remove the others."""
+    def _truncate(self, last_step: int) -> tuple[int, frozenset[str]]:
+        """Announce the states up to ``last_step``, only then remove the others.
+
+        Returns the next number, and which tensors have three components.
+        """
         found = stored_states(self.folder)
         keep = [state for state in found if state.step <= last_step]
         self._document.replace(map(self._series.grid, keep))
@@ -257,7 +269,9 @@ class StateWriter:
                 path.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(f"{self.folder}: a later state cannot be removed: {reason(error)}") from error
-        return max((state.number for state in keep), default=-1) + 1
+        fields = [field for state in keep for field in state.fields]
+        older = frozenset(field.name for field in fields if field.name in TENSORS and field.shape[1:] == (3,))
+        return max((state.number for state in keep), default=-1) + 1, older
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.atomic import replace_bytes
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
 from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
@@ -170,7 +171,10 @@ def _virtual(
     places: Mapping[int, tuple[str, str]],
     rows: int,
 ) -> None:
-    """A dataset whose rows ``i rows`` to ``(i + 1) rows`` are the dataset ``places[i]`` of another file."""
+    """A dataset whose rows ``i rows`` to ``(i + 1) rows`` are the dataset ``places[i]`` of another file.
+
+    Tensors of six components get VTK's order.
+    """
     h5py = import_h5py()
     stored = h5py.h5t.py_create(kind, logical=True)
     space, target = (h5py.h5s.create_simple(shape) for _ in range(2))
@@ -179,9 +183,19 @@ def _virtual(
     if kind.kind == "f":
         plan.set_fill_value(np.array(np.nan, dtype=kind))
     for i, (file, dataset) in places.items():
-        target.select_hyperslab((i * rows,) + (0,) * (len(shape) - 1), (rows, *shape[1:]))
-        plan.set_virtual(target, file.encode(), dataset.encode(), source)
+        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else [(None, None)]:
+            _select(target, i * rows, rows, shape, ours)
+            _select(source, 0, rows, shape, theirs)
+            plan.set_virtual(target, file.encode(), dataset.encode(), source)
     h5py.h5d.create(root.id, name.encode(), stored, space, plan)
+
+
+def _select(space: Any, first: int, rows: int, shape: tuple[int, ...], pair: tuple[int, int] | None) -> None:
+    """Select rows from ``first`` on, with all columns or a pair of them."""
+    if pair is None:
+        space.select_hyperslab((first,) + (0,) * (len(shape) - 1), (rows, *shape[1:]))
+    else:
+        space.select_hyperslab((first, pair[0]), (rows, 2), (1, pair[1] - pair[0]))
 
 
 def _in_memory() -> Any:

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lyra_petsc.extras import require
+from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 
 if TYPE_CHECKING:
     from lyra_petsc.output.read_run import Run
 
-WIDTHS = {"velocity": "axis"}
-"""What the last axis of a field with three columns counts; else components in the material axes."""
+WIDTHS = {"velocity": "axis", "displacement": "axis"}
+"""What the last axis of a vector counts; that of a tensor: components in the material axes."""
 
 
 def dataset(run: Run, states: Sequence[int]) -> Any:
@@ -33,10 +34,11 @@ def dataset(run: Run, states: Sequence[int]) -> Any:
         content[name] = _variable(run, name, ("state", run.field_on(name), *last), arrays)
     content["rest"] = (("vertex", "axis"), run.rest, {"units": "m"})
     content["triangles"] = (("triangle", "corner"), run.triangles, {})
+    axes = {"axis": list("xyz")}
+    if tensors := [content[name][1] for name in run.fields if name in TENSORS]:
+        axes["component"] = list(COMPONENTS[tensors[0].shape[-1]])
     time = ("state", run.times[chosen], {"units": "s"})
-    return xarray.Dataset(content, {"time": time, "axis": list("xyz")}, {"title": run.scene.title}).swap_dims(
-        state="time"
-    )
+    return xarray.Dataset(content, {"time": time, **axes}, {"title": run.scene.title}).swap_dims(state="time")
 
 
 def _variable(run: Run, name: str, dimensions: tuple[str, ...], arrays: list[Any]) -> tuple[Any, ...]:

@@ -548,6 +548,7 @@ SPECTRAL_RADIUS = 0.5
 LOAD_STEP = 0.25
 FIELD_UNITS = {
     "velocity": "m/s",
+    "displacement": "m",
     "green_strain": "1",
     "stress": "N/m",
     "membrane_energy": "J/m²",

@@ -75,6 +75,8 @@ class Problem:
     mesh : Mesh or None
         The whole mesh, on rank 0, until ``release``.
     partitioner : str
+    start : (n_vertices, 3) or None
+        Positions [m] of the owned vertices at t = 0, where a field of the states needs them.
     tags : (n_vertices,) or None
         Node tags that a .msh file gives the owned vertices, 0 for others, as float64.
     """
@@ -89,6 +91,7 @@ class Problem:
     mesh: Mesh | None
     partitioner: str
     tags: Array | None
+    start: Array | None = None
 
     def release(self) -> None:
         """Free the whole mesh; from here on no rank holds a global array."""
@@ -259,6 +262,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         mesh,
         part.partitioner,
         data.get("tag"),
+        system.x[rows].copy() if "displacement" in scene.output.fields else None,
     )
 
 

@@ -23,7 +23,9 @@ from lyra_petsc.scene.load import load_scene
 
 pytestmark = pytest.mark.quick
 
-ALL_FIELDS = "[velocity, green_strain, stress, membrane_energy, bending_energy, curvature, rank]"
+ALL_FIELDS = (
+    "[velocity, displacement, green_strain, stress, membrane_energy, bending_energy, curvature, rank]"
+)
 FULL = SCENE.replace("{every: 0.02}", "{every: 0.02, reactions: true, fields: " + ALL_FIELDS + "}")
 FULL += "probes: {corner: {nodes: [20]}, edge: {nodes: [20, 24]}}\n"
 
@@ -68,8 +70,9 @@ def test_states_stand_at_the_start_at_multiples_and_at_the_end(full: Path) -> No
     assert shapes == {
         "position": (25, 3),
         "velocity": (25, 3),
-        "green_strain": (32, 3),
-        "stress": (32, 3),
+        "displacement": (25, 3),
+        "green_strain": (32, 6),
+        "stress": (32, 6),
         "membrane_energy": (32,),
         "bending_energy": (25,),
         "curvature": (25,),

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from physics import Simulation, grid
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.fields import FIELDS, chosen
+from lyra_petsc.output.fields import FIELDS, check_field, chosen
 from lyra_petsc.scene import schema as control
 from lyra_petsc.terms.bending import Bending
 
@@ -67,8 +67,26 @@ def test_strain_and_stress_of_a_stretch() -> None:
     with Simulation(ALL, MPI.COMM_SELF) as simulation:
         simulation.set_state(x=simulation.x * [1.1, 1.0, 1.0])
         strain, stress = value(simulation, "green_strain"), value(simulation, "stress")
-    np.testing.assert_allclose(strain, np.tile([0.105, 0.0, 0.0], (len(strain), 1)), atol=1e-12)
-    np.testing.assert_allclose(stress, np.tile([10.5, 2.1, 0.0], (len(stress), 1)), atol=1e-10)
+    np.testing.assert_allclose(
+        strain, np.tile([0.105, 0.0, 0.0, 0.0, 0.0, 0.0], (len(strain), 1)), atol=1e-12
+    )
+    np.testing.assert_allclose(stress, np.tile([10.5, 0.0, 0.0, 2.1, 0.0, 0.0], (len(stress), 1)), atol=1e-10)
+
+
+def test_displacement_is_from_the_disturbed_start() -> None:
+    moved = [0.1, -0.2, 0.3]
+    with Simulation(ALL | {"initial": {"noise": 0.01}}, MPI.COMM_SELF) as simulation:
+        assert not value(simulation, "displacement").any()
+        simulation.set_state(x=simulation.x + moved)
+        found = value(simulation, "displacement")
+    np.testing.assert_allclose(found, np.tile(moved, (len(found), 1)), atol=1e-14)
+
+
+def test_a_scene_that_does_not_name_it_keeps_no_start() -> None:
+    with Simulation(ALL | {"output": {}}, MPI.COMM_SELF) as simulation:
+        assert simulation.problem.start is None
+        with pytest.raises(InputError, match=r"displacement.*output.fields"):
+            check_field(FIELDS["displacement"], simulation.problem)
 
 
 def test_a_field_of_an_absent_term_is_refused() -> None:

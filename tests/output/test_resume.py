@@ -193,3 +193,21 @@ def test_resuming_twice_at_every_step(tmp_path: Path) -> None:
     for step in (2, 3, 4, 7, None):
         journey(MPI.COMM_SELF, scene, tmp_path / "halted", step, resume=True)
     same_files(tmp_path / "halted", tmp_path / "straight", 1e-11)
+
+
+@pytest.mark.parallel
+def test_displacement_is_from_the_first_state_also_after_resuming(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Whatever start the scene says by then."""
+    scene = scene_with({"end": 0.02, "step": 0.004}) | {
+        "output": {"every": 0.004, "fields": ["displacement"]},
+        "initial": {"noise": 1e-3},
+    }
+    journey(comm, scene, shared_tmp / "run", 2)
+    journey(comm, scene | {"initial": {"noise": 2e-3}}, shared_tmp / "run", None, resume=True)
+    if comm.rank == 0:
+        run = Run(shared_tmp / "run")
+        assert len(run) == 6
+        moved = np.asarray(run.positions) - run.positions[0]
+        np.testing.assert_array_equal(run.field("displacement"), moved)
+        assert run.field_units("displacement") == "m"
+    comm.Barrier()

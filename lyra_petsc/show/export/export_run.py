@@ -8,7 +8,7 @@ import re
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -33,16 +33,19 @@ class ExportFormat:
         The module of this package whose function ``write_<name>`` writes it.
     packages : tuple of str
         What it needs of the extra ``export``.
+    fields : bool
+        Whether it holds more than positions.
     """
 
     module: str
     packages: tuple[str, ...] = ()
+    fields: bool = True
 
 
 FORMATS = {
-    "obj": ExportFormat("obj_and_ply"),
+    "obj": ExportFormat("obj_and_ply", fields=False),
     "ply": ExportFormat("obj_and_ply", ("meshio",)),
-    "gltf": ExportFormat("gltf", ("pygltflib",)),
+    "gltf": ExportFormat("gltf", ("pygltflib",), fields=False),
     "usd": ExportFormat("usd", ("pxr",)),
     "vtkhdf": ExportFormat("npz_and_vtkhdf"),
     "npz": ExportFormat("npz_and_vtkhdf"),
@@ -74,6 +77,7 @@ def export_run(
     *,
     times: str | None = None,
     every: int | None = None,
+    displacement: bool = False,
     force: bool = False,
 ) -> Exported:
     """Write states of a run in another format.
@@ -90,6 +94,8 @@ def export_run(
         Numbers [s] with commas between: the states nearest to them.
     every : int, optional
         Every nth state.
+    displacement : bool
+        Add the displacement from the run's first state as a field.
     force : bool
         Replace a former export.
 
@@ -102,11 +108,14 @@ def export_run(
     """
     if to not in FORMATS:
         raise InputError(f"unknown format {to!r}, {nearest(to, FORMATS)}", key="--to")
+    if displacement and not FORMATS[to].fields:
+        able = ", ".join(name for name, form in FORMATS.items() if form.fields)
+        raise InputError(f"{to} holds positions alone; take --to {able}", key="--displacement")
     require(f"export --to {to}", FORMATS[to].packages, "export")
     found = Run(run)
     folder = out if out is not None else found.folder / to
     check_folder(folder, force=force)
-    states = choose(found, times, every)
+    states = replace(choose(found, times, every), displacement=displacement)
     # without characters that Windows or a shell treats specially; letters of any script stay
     name = re.sub(r"[^\w.+-]", "_", found.name).strip(".") or "run"
 

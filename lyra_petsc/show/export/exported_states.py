@@ -29,10 +29,13 @@ class ExportedStates:
     run : Run
     chosen : tuple of int
         Numbers of the states, ascending.
+    displacement : bool
+        Whether the displacement from the run's first state is among the fields, if it was not written.
     """
 
     run: Run
     chosen: tuple[int, ...]
+    displacement: bool = False
 
     def __len__(self) -> int:
         return len(self.chosen)
@@ -47,8 +50,26 @@ class ExportedStates:
         """(V, 3) positions [m] of each state."""
         return (self.run.positions[i] for i in self.chosen)
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """What is exported besides positions."""
+        written = self.run.fields
+        return (*written, "displacement") if self._adds_displacement else written
+
+    @property
+    def _adds_displacement(self) -> bool:
+        return self.displacement and "displacement" not in self.run.fields
+
+    def field_on(self, name: str) -> str:
+        """``vertex`` or ``triangle``."""
+        added = name == "displacement" and self._adds_displacement
+        return "vertex" if added else self.run.field_on(name)
+
     def field(self, name: str) -> Iterator[NDArray[np.float64]]:
         """The values of a field in each state."""
+        if name == "displacement" and self._adds_displacement:
+            start = self.run.positions[0]
+            return (position - start for position in self.positions)
         return (self.run.field(name)[i] for i in self.chosen)
 
     @property

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.tensors import in_vtk_order
 from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, describe
 from lyra_petsc.show.export.exported_states import ExportedStates
 
@@ -36,8 +37,8 @@ def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     elif run.corner_uv is not None:
         fixed["corner_uv"] = run.corner_uv
     units = {"time": "s", "triangles": "1", "rest": "m", "uv": "m", "corner_uv": "m", "position": "m"}
-    units |= {field: run.field_units(field) for field in run.fields}
-    moving = {"position": states.positions} | {field: states.field(field) for field in run.fields}
+    units |= {field: run.field_units(field) for field in states.fields}
+    moving = {"position": states.positions} | {field: states.field(field) for field in states.fields}
     names = [*fixed, *moving]
     fixed |= {"names": np.array(names), "units": np.array([units[one] for one in names])}
     with zipfile.ZipFile(folder / f"{name}.npz", "w", zipfile.ZIP_STORED) as archive:
@@ -71,7 +72,7 @@ def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
     """
     run, n = states.run, len(states)
     path = folder / f"{name}.vtkhdf"
-    samples = {field: run.field(field)[states.chosen[0]] for field in run.fields}
+    samples = {field: next(states.field(field)) for field in states.fields}
     size = sum(array.nbytes for array in (run.positions[states.chosen[0]], *samples.values())) * n
     try:
         _reserve(path, size + 2 * run.rest.nbytes + 2 * run.triangles.nbytes + 64 * n + OVERHEAD)
@@ -84,7 +85,7 @@ def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
             moving = {"Points": states.positions}
             _allocate(root, "Points", (n * len(run.rest), 3), np.dtype(np.float64))
             for field, first in samples.items():
-                on = run.field_on(field)
+                on = states.field_on(field)
                 place = f"{GROUPS[on]}/{field}"
                 _allocate(root, place, (n * len(first), *first.shape[1:]), first.dtype)
                 add_offsets(root, on, field, n, len(first))
@@ -94,7 +95,7 @@ def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
             for place, arrays in moving.items():
                 stored = file[f"VTKHDF/{place}"]
                 for i, array in enumerate(arrays):
-                    stored[i * len(array) : (i + 1) * len(array)] = array
+                    stored[i * len(array) : (i + 1) * len(array)] = in_vtk_order(array)
     except InputError:
         raise
     except HDF5_ERRORS as error:

@@ -46,7 +46,7 @@ def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
     import meshio
 
     run = states.run
-    fields = {field: states.field(field) for field in run.fields if run.field_on(field) == "vertex"}
+    fields = {field: states.field(field) for field in states.fields if states.field_on(field) == "vertex"}
     texture = {} if run.uv is None else {"s": run.uv[:, 0], "t": run.uv[:, 1]}
     triangles = run.triangles.astype(np.int32)
     for number, position in enumerate(states.positions):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import OutputError
+from lyra_petsc.output.tensors import is_tensor
 from lyra_petsc.show.export.exported_states import ExportedStates, turned_up
 
 ROOT = "/run"
@@ -79,7 +80,7 @@ def _fill(stage: Any, states: ExportedStates) -> None:
         single = np.ascontiguousarray(position, dtype=np.float32)
         points.Set(Vt.Vec3fArray.FromNumpy(single), code)
         extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([single.min(axis=0), single.max(axis=0)])), code)
-    for field in run.fields:
+    for field in states.fields:
         _sample(mesh, primvars, states, field, codes)
 
 
@@ -89,15 +90,20 @@ def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes:
 
     attribute: Any = None
     for code, rows in zip(codes, states.field(field), strict=True):
-        vector = rows.ndim == 2
+        vector = rows.ndim == 2 and not is_tensor(rows.shape)
         if attribute is None:
             if field == "velocity":
                 attribute = mesh.CreateVelocitiesAttr()
             else:
                 kind = Sdf.ValueTypeNames.Float3Array if vector else Sdf.ValueTypeNames.FloatArray
-                on_vertices = states.run.field_on(field) == "vertex"
+                on_vertices = states.field_on(field) == "vertex"
                 place = UsdGeom.Tokens.vertex if on_vertices else UsdGeom.Tokens.uniform
-                attribute = primvars.CreatePrimvar(field, kind, place).GetAttr()
+                primvar = primvars.CreatePrimvar(field, kind, place)
+                if is_tensor(rows.shape):
+                    primvar.SetElementSize(rows.shape[1])
+                attribute = primvar.GetAttr()
             attribute.SetCustomDataByKey("unit", states.run.field_units(field))
         values: NDArray[np.float32] = np.ascontiguousarray(rows, dtype=np.float32)
-        attribute.Set((Vt.Vec3fArray if vector else Vt.FloatArray).FromNumpy(values), code)
+        attribute.Set(
+            Vt.Vec3fArray.FromNumpy(values) if vector else Vt.FloatArray.FromNumpy(values.ravel()), code
+        )

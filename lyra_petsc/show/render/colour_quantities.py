@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.tensors import TENSORS, plane_components
 
 Array = NDArray[np.float64]
 
@@ -167,7 +168,7 @@ def quantity(run: Run, name: str) -> ColourQuantity:
             key="--field",
         )
     stored = run.field(name)
-    principal = name in _PRINCIPAL
+    principal = name in TENSORS
     reduce = _largest_principal if principal else _magnitude
     label = _label(f"largest principal {name}" if principal else name, run.field_units(name))
     on_triangles = run.field_on(name) == "triangle"
@@ -175,7 +176,6 @@ def quantity(run: Run, name: str) -> ColourQuantity:
     return ColourQuantity(label, values, on_triangles, name in _SIGNED, name not in _NAMES)
 
 
-_PRINCIPAL = {"green_strain", "stress"}
 _SIGNED = {"curvature"}
 _NAMES = {"rank"}
 
@@ -229,8 +229,8 @@ def _edges(corners: Array) -> Array:
 
 
 def _largest_principal(symmetric: Array) -> Array:
-    """(F,) larger eigenvalue of symmetric 2 × 2 tensors with components uu, vv, uv (F, 3)."""
-    uu, vv, uv = symmetric.T
+    """(F,) larger eigenvalue in the plane of tensors uu, vv, uv (F, 3), or with six components (F, 6)."""
+    uu, vv, uv = plane_components(symmetric).T
     largest: Array = (uu + vv) / 2.0 + np.hypot((uu - vv) / 2.0, uv)
     return largest
 

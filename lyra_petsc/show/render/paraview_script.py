@@ -40,10 +40,10 @@ states.UpdatePipeline(states.TimestepValues[-1])
 
 # the displacement from the rest shape, and that many times more of it
 displaced = simple.Calculator(registrationName="displacement", Input=states)
-displaced.ResultArrayName = "displacement"
+displaced.ResultArrayName = "from rest"
 displaced.Function = "coords - rest"
 warped = simple.WarpByVector(registrationName="exaggerated", Input=displaced)
-warped.Vectors = ["POINTS", "displacement"]
+warped.Vectors = ["POINTS", "from rest"]
 warped.ScaleFactor = EXAGGERATION
 surface = simple.ExtractSurface(registrationName="surface", Input=warped)
 # in ParaView 5.12 the filter got another name

@@ -148,7 +148,7 @@ def first_speed(run: Run) -> float:
 def names(run: Run) -> list[str]:
     """Names of the quantities by which a run's states can be coloured."""
     derived = [name for name in DERIVED if name != "speed" or "velocity" in run.fields]
-    return derived + [name for name in run.fields if name != "velocity"]
+    return derived + [name for name in run.fields if name not in {"velocity", *derived}]
 
 
 class Probe:

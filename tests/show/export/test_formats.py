@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from written_run import REST, TRIANGLES, position, scene, stress, velocity, written
 
+from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.obj_file import read_obj
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.read_run import Run
@@ -61,6 +62,44 @@ def test_ply(tmp_path):
         np.testing.assert_array_equal(np.stack([data["s"], data["t"]], axis=1), REST[:, :2] / 3.0)
         found = np.stack([data[f"velocity_{axis}"] for axis in "xyz"], axis=1)
         np.testing.assert_array_equal(found, velocity(state))
+
+
+@pytest.mark.parametrize("to", ["npz", "vtkhdf", "ply", "usd"])
+def test_displacement_is_added_where_it_is_asked_for(tmp_path, to):
+    """From the run's first state, whichever states are chosen."""
+    run = written(tmp_path / "run", states=4)
+    moved = position(3) - position(0)
+    for asked in (False, True):
+        done = export_run(run, to, tmp_path / f"{asked}", times="0.3", displacement=asked)
+        file = done.folder / done.files[0]
+        if to == "npz":
+            found = dict(np.load(file))
+            found = found.get("displacement", [None])[0]
+        elif to == "vtkhdf":
+            ((*_, arrays),) = pytest.importorskip("vtkhdf_reader").read(file)
+            found = arrays["vertex"].get("displacement")
+        elif to == "ply":
+            data = pytest.importorskip("meshio").read(file).point_data
+            found = np.stack([data[f"displacement_{i}"] for i in "xyz"], 1) if asked else None
+        else:
+            pytest.importorskip("pxr")
+            from pxr import Usd, UsdGeom
+
+            stage = Usd.Stage.Open(str(file))
+            mesh = stage.GetDefaultPrim().GetChild("cloth")
+            primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("displacement")
+            found = primvar.Get(Usd.TimeCode.EarliestTime()) if primvar else None
+        if asked:
+            np.testing.assert_allclose(np.asarray(found), moved, rtol=1e-6)
+        else:
+            assert found is None
+
+
+@pytest.mark.parametrize("to", ["obj", "gltf"])
+def test_formats_of_positions_alone_refuse_displacement(tmp_path, to):
+    run = written(tmp_path / "run")
+    with pytest.raises(InputError, match=r"--displacement: .*positions alone; take --to ply, usd, vtkhdf"):
+        export_run(run, to, displacement=True)
 
 
 def read_glb(path):

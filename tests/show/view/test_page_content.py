@@ -58,6 +58,9 @@ def test_numbers_of_the_bar_are_short(value, span, text):
 def test_without_velocities_there_is_no_speed(tmp_path):
     run = Run(written(tmp_path, fields=False))
     assert names(run) == ["displacement", "strain"]
+    run.fields = ("displacement", "stress")
+    assert names(run) == ["displacement", "strain", "stress"]
+    run.fields = ()
     assert Palette(run, "displacement").colours(0)[0].shape == (8, 3)
 
 
