@@ -40,7 +40,7 @@ def reference(name: str) -> dict[str, Any]:
 
 def scene_of(content: dict[str, Any]) -> Scene:
     """A checked scene; ``time`` and tight tolerances are filled in."""
-    defaults = {"time": {"end": 1e9, "step": 0.01}, "material": dict(CLOTH), "solver": dict(TIGHT)}
+    defaults = {"time": {"end": 1e3, "step": 0.01}, "material": dict(CLOTH), "solver": dict(TIGHT)}
     return Scene.model_validate(defaults | content)
 
 

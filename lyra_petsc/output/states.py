@@ -11,7 +11,6 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from lyra_petsc.output.background import Background
 from lyra_petsc.output.growing_xdmf import GrowingXdmf
 from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.self_contained import LeadsOutError
 from lyra_petsc.output.stored import TABLE, check_sum, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
@@ -334,11 +334,21 @@ def state_files(folder: str | os.PathLike[str]) -> list[Path]:
 
 
 def stored_states(folder: Path) -> list[WrittenState]:
-    """The states in a run's folder, by number; files that cannot be read are passed over."""
+    """The states in a run's folder, by number; damaged files are passed over.
+
+    Raises
+    ------
+    InputError
+        For files that lead out of the folder.
+    """
     found: list[WrittenState] = []
     for path in state_files(folder):
-        with suppress(InputError):
+        try:
             found += _states_of(path)
+        except LeadsOutError:
+            raise
+        except InputError:
+            continue
     return sorted(found, key=lambda state: state.number)
 
 
@@ -354,7 +364,7 @@ def _states_of(path: Path) -> list[WrittenState]:
         if TABLE not in file:
             (name,) = file["states"]
             group = file["states"][name]
-            on = {key: text_of(data, "on") for key, data in group.items()}
+            on = {key: text_of(data, "on") for key, data in group.items() if key != "position"}
             step, time = int(group.attrs["step"]), float(group.attrs["time"])
             return [WrittenState(int(name), step, time, path.name, _fields(group, on))]
         table = file[TABLE]

@@ -34,7 +34,6 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
-from lyra_petsc.terms.load_stiffness import following_stiffness
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.remembered import Remembered
@@ -473,6 +472,8 @@ class StageEquations:
 
         And the symmetric part of the stiffness of loads that follow it; prescribed unknowns are decoupled.
         """
+        from lyra_petsc.terms.load_stiffness import following_stiffness  # of no use in motions
+
         rows = self.discretisation.rows
         for term in self.elastic:
             rows.add_stiffness(term, self.x, self.frozen[term], 0.0, 1.0, values)

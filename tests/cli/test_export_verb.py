@@ -79,11 +79,11 @@ def test_a_signal_leaves_nothing(tmp_path: Path, number: signal.Signals, code: i
 def test_data_of_other_files_are_refused_in_one_line(tmp_path: Path, ranks: int) -> None:
     written(tmp_path / "run", states=2)
     (tmp_path / "secret").write_bytes(bytes(192))
-    with h5py.File(tmp_path / "run" / "states-0001.h5", "r+") as file:
+    with h5py.File(tmp_path / "run" / "states-0000.h5", "r+") as file:
         del file["states/000001/position"]
         storage = [(str(tmp_path / "secret"), 0, 192)]
         file.create_dataset("states/000001/position", (8, 3), "f8", external=storage)
     left = lyra(["export", "run", "--to", "npz"], tmp_path, ranks)
     assert left.code == 2, left.err
-    assert "states-0001.h5: '/states/000001/position' takes its data from other files" in left.err
+    assert "states-0000.h5: '/states/000001/position' takes its data from other files" in left.err
     assert not (tmp_path / "run" / "npz").exists()

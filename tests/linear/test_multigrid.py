@@ -44,7 +44,7 @@ def hanging(cells: int, **time: Any) -> dict[str, Any]:
 def stepped(
     comm: MPI.Comm, content: dict[str, Any], steps: int, pc_type: str, **petsc: Any
 ) -> tuple[np.ndarray, list[int]]:
-    """Positions in mesh order and linear iterations of each step."""
+    """Positions in mesh order, and linear iterations of each step, or the mean of its attempts."""
     options = PETSc.Options()
     given, filled = {"pc_type": pc_type, **petsc}, []
     for name, value in given.items():
@@ -52,7 +52,8 @@ def stepped(
     try:
         simulation = Simulation(comm, Scene.model_validate(content))
         filled = simulation.stepper.our_options
-        counts = [simulation.step().linear_iterations for _ in range(steps)]
+        reports = [simulation.step() for _ in range(steps)]
+        counts = [report.linear_iterations // (1 + report.rejected) for report in reports]
         x = gathered(simulation.problem.points, simulation.problem.system.x)
         simulation.destroy()
     finally:

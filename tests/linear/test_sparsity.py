@@ -82,8 +82,8 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert not system.held
         assert not system.viscous
         assert not system.loads
-        assert not system._damping.acts
-        assert system._damping._values is None
+        assert not system.damping.acts
+        assert system.damping._values is None
         assert len(system.prescribed.goal) == len(system.prescribed.rows) == 0
         assert simulation.problem.probes == {}
 

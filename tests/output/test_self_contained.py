@@ -19,32 +19,32 @@ from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.output.self_contained import open_own
-from lyra_petsc.output.states import read_state
+from lyra_petsc.output.stored import open_stored
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 POSITION = "states/000001/position"
 
 
 def _external_storage(folder: Path, secret: Path) -> None:
-    with h5py.File(folder / "states-0001.h5", "r+") as file:
+    with h5py.File(folder / "states-0000.h5", "r+") as file:
         del file[POSITION]
         file.create_dataset(POSITION, (8, 3), "f8", external=[(str(secret), 0, 192)])
 
 
 def _external_link(folder: Path, secret: Path) -> None:
-    with h5py.File(folder / "states-0001.h5", "r+") as file:
+    with h5py.File(folder / "states-0000.h5", "r+") as file:
         del file[POSITION]
         file[POSITION] = h5py.ExternalLink(str(secret), "/secret")
 
 
 def _external_link_above(folder: Path, secret: Path) -> None:
-    with h5py.File(folder / "states-0001.h5", "r+") as file:
+    with h5py.File(folder / "states-0000.h5", "r+") as file:
         del file["states"]
         file["states"] = h5py.ExternalLink(str(secret), "/states")
 
 
 def _soft_link_over_an_external_one(folder: Path, secret: Path) -> None:
-    with h5py.File(folder / "states-0001.h5", "r+") as file:
+    with h5py.File(folder / "states-0000.h5", "r+") as file:
         del file[POSITION]
         file["aside"] = h5py.ExternalLink(str(secret), "/")
         file[POSITION] = h5py.SoftLink("/aside/secret")
@@ -53,23 +53,23 @@ def _soft_link_over_an_external_one(folder: Path, secret: Path) -> None:
 def _virtual(folder: Path, secret: Path) -> None:
     layout = h5py.VirtualLayout((8, 3), "f8")
     layout[:] = h5py.VirtualSource(str(secret), "secret", (8, 3))
-    with h5py.File(folder / "states-0001.h5", "r+") as file:
+    with h5py.File(folder / "states-0000.h5", "r+") as file:
         del file[POSITION]
         file.create_virtual_dataset(POSITION, layout)
 
 
 def _symbolic_link(folder: Path, secret: Path) -> None:
-    shutil.move(folder / "states-0001.h5", secret.parent / "other.h5")
-    os.symlink(secret.parent / "other.h5", folder / "states-0001.h5")
+    shutil.move(folder / "states-0000.h5", secret.parent / "other.h5")
+    os.symlink(secret.parent / "other.h5", folder / "states-0000.h5")
 
 
 def _named(name: str) -> Callable[[Path, Path], None]:
     def change(folder: Path, secret: Path) -> None:
-        shutil.copy(folder / "states-0001.h5", folder.parent / "outside.h5")
+        shutil.copy(folder / "states-0000.h5", folder.parent / "outside.h5")
         (folder / "deeper").mkdir()
         text = (folder / "states.xdmf").read_text()
         place = name.format(folder=folder.parent)
-        (folder / "states.xdmf").write_text(text.replace("states-0001.h5", place))
+        (folder / "states.xdmf").write_text(text.replace("states-0000.h5", place))
 
     return change
 
@@ -110,7 +110,7 @@ def test_states_elsewhere_are_refused(tmp_path: Path, way: str) -> None:
 def test_studies_and_resumed_runs_refuse_them_too(tmp_path: Path, way: str) -> None:
     folder = attacked(tmp_path, way)
     with pytest.raises(InputError, match="all of its results"):
-        read_state(folder / "states-0001.h5")
+        open_stored(folder / "states-0000.h5").__enter__()
     with pytest.raises(InputError, match="all of its results"):
         read_here(folder, (0.0, 0.1), 0.1)
 
