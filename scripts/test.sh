@@ -3,8 +3,8 @@
 #
 #   bash scripts/test.sh [--quick] [pytest arguments]
 #
-# First all tests in as many processes as there are cores (at most four), then those marked `parallel`
-# under mpirun on two and on three ranks. With --quick only those marked `quick`, on one and two ranks: some
+# First all tests in two processes a core (at most four), as many of them wait for programs that they started,
+# then those marked `parallel` under mpirun on two and on three ranks. With --quick only those marked `quick`, on one and two ranks: some
 # of each kind, within a minute. The tests of a file that is named run in one process, and so does everything
 # with -s or -n 0.
 # The last line is pytest's closing line of the first part, the exit code that of the first failure.
@@ -14,7 +14,7 @@ source "$(dirname -- "${BASH_SOURCE[0]}")/environment.sh"
 
 arguments=() kinds=() marks=() paths=() counts=(1 2 3) previous=
 workers=$(env -u OMP_NUM_THREADS nproc 2>/dev/null || echo 1) # the variable would make it 1
-workers=$((workers > 4 ? 4 : workers))
+workers=$((workers > 2 ? 4 : 2 * workers))
 for argument in "$@"; do
     file=${argument%%::*}
     if [[ $argument == --quick ]]; then

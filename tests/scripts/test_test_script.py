@@ -78,7 +78,7 @@ def parallel_part(done: subprocess.CompletedProcess[str], ranks: int) -> str:
 def test_all_tests_on_one_rank_and_the_parallel_ones_on_two_and_three(tests: Tests) -> None:
     done = tests("-x", "-k", "some or other")
     assert done.returncode == 0, done.stderr
-    assert first_part(done).startswith("2 workers, interrupts heeded: True")
+    assert first_part(done).startswith("4 workers, interrupts heeded: True")
     assert "'-n', 'auto'" in first_part(done)
     assert "'tests', '-x', '-k', 'some or other', '-m', ''" in first_part(done)
     for ranks in (2, 3):
@@ -123,10 +123,10 @@ def test_a_failure_on_some_ranks_is_a_failure(tests: Tests) -> None:
 @pytest.mark.parametrize(
     ("words", "variables", "workers"),
     [
-        ((), {"CORES": "1"}, 1),
+        ((), {"CORES": "1"}, 2),
         ((), {"CORES": "64"}, 4),
         (("-s",), {}, 0),
-        (("tests/docs",), {}, 2),
+        (("tests/docs",), {}, 4),
         (("tests/test_house.py::test_imports_point_one_way",), {}, 0),
     ],
 )
