@@ -61,7 +61,7 @@ class ProgressBar:
         """Print a line for the user, above the bar."""
         if not self._shown:
             return
-        with suppress(OSError):  # a run goes on also if its messages cannot be written
+        with suppress(OSError, ValueError):  # a run goes on also if its messages cannot be written
             if self._bar is not None:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:

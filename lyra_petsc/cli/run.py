@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.cli.progress import Progress, closing_table
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.kernels.compilation import COMPILATION
+from lyra_petsc.kernels.compilation import COMPILATION, nothing
 from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
@@ -152,6 +152,7 @@ class TerminalProgress(ProgressCallbacks):
 
     def close(self) -> None:
         """Leave the terminal as it was, and tell the page that the run has ended."""
+        COMPILATION.first = nothing
         if self._page is not None:
             self._page.end()
         if self._progress is not None:

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from numba.core import event
 
 
-def _nobody() -> None:
-    pass
+def nothing() -> None:
+    """Called where no run is to hear of it."""
 
 
 class Compilation(event.Listener):
@@ -26,9 +26,9 @@ class Compilation(event.Listener):
     """
 
     def __init__(self) -> None:
-        self.begins: Callable[[], None] = _nobody
-        self.ends: Callable[[], None] = _nobody
-        self.first: Callable[[], None] = _nobody
+        self.begins: Callable[[], None] = nothing
+        self.ends: Callable[[], None] = nothing
+        self.first: Callable[[], None] = nothing
         self.kept = True
         self._done = self._since = 0.0
         self._depth = 0
@@ -44,7 +44,7 @@ class Compilation(event.Listener):
         if self._depth == 1:
             self._since = time.perf_counter()
             self.begins()
-            first, self.first = self.first, _nobody
+            first, self.first = self.first, nothing
             first()
 
     def on_end(self, event: event.Event) -> None:

@@ -151,9 +151,9 @@ class Stepper:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
             snes.setObjective(newton.globalisation.objective)
-            tolerances = scene.solver.force_tolerance, self._floor, scene.solver.step_tolerance
-            rtol, atol, stol = tolerances  # to be seen; those of options are looked at besides
-            snes.setTolerances(rtol=rtol, atol=atol, stol=stol, max_it=scene.solver.max_iterations)
+            # to be seen; those of options are looked at besides. PETSc takes no rtol from 1 on
+            rtol, stol = min(scene.solver.force_tolerance, 0.99), scene.solver.step_tolerance
+            snes.setTolerances(rtol=rtol, atol=self._floor, stol=stol, max_it=scene.solver.max_iterations)
             snes.setConvergenceTest(newton.converged)
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
