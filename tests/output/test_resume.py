@@ -148,10 +148,12 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
                 within = 0.0 if column in OF_THE_SOLVER else tolerance * unit
                 np.testing.assert_allclose(columns[column], values, rtol=0, atol=within, err_msg=column)
     told, others = summary(resumed), summary(straight)
+    for content in (told, others):  # the machine may be busy in one of them
+        content["notes"] = [note for note in content["notes"] if "without a processor" not in note]
     assert told.keys() == others.keys()
     for key in told.keys() - set(OF_EACH_RUN):
         if key == "energy_balance":  # sums of differences, relative to the scale of the energies
-            mine_of, of_others = flat(told[key]), flat(others[key])
+            mine_of, of_others = flat(told[key] or {}), flat(others[key] or {})
             assert mine_of == pytest.approx(of_others, rel=tolerance, abs=max(tolerance, 1e-12)), key
         elif isinstance(told[key], float):
             assert told[key] == pytest.approx(others[key], rel=tolerance), key
