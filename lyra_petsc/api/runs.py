@@ -34,38 +34,7 @@ def run(
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
 ) -> Run:
-    """Simulate a scene and write its results, as the command ``run`` does; collective.
-
-    An interrupt (the stop button of a notebook, Ctrl-C) lets the step end, writes a checkpoint and raises
-    KeyboardInterrupt; ``resume=True`` goes on from there.
-
-    Parameters
-    ----------
-    scene : Scene, path or mapping
-    out : path, optional
-        Folder of the results; else ``runs/<scene file stem>``, or ``…-2``, ``…-3`` when that exists.
-    force : bool
-        Replace the results in ``out``.
-    resume : bool
-        Go on from the newest checkpoint.
-    trust_mesh : bool
-        Give gmsh this scene's scripts (.geo) whatever they say.
-    on_step : callable, optional
-        Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
-    comm : MPI.Comm, optional
-        COMM_WORLD unless given.
-
-    Returns
-    -------
-    Run
-
-    Raises
-    ------
-    InputError
-        Bad input; nothing is written.
-    SolverError, OutputError
-        The run could not go on; what was written stands.
-    """
+    """What `lyra_petsc.run` does beside showing progress, with its parameters and errors; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
     loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
     assert loaded is not None

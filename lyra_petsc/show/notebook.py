@@ -151,6 +151,7 @@ def run(
     *,
     force: bool = False,
     resume: bool = False,
+    trust_mesh: bool = False,
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
     progress: bool | None = None,
@@ -169,6 +170,8 @@ def run(
         Replace the results in ``out``.
     resume : bool
         Go on from the newest checkpoint.
+    trust_mesh : bool
+        Give gmsh this scene's scripts (.geo) whatever they say.
     on_step : callable, optional
         Called after each step with its report (``step``, ``time``, ``dt``, ``newton_iterations``, …).
     comm : MPI.Comm, optional
@@ -203,7 +206,8 @@ def run(
                 on_step(report)
 
         try:
-            done = simulate(scene, out, force=force, resume=resume, on_step=step, comm=comm)
+            options = {"force": force, "resume": resume, "trust_mesh": trust_mesh}
+            done = simulate(scene, out, **options, on_step=step, comm=comm)
         except (LyraError, KeyboardInterrupt):
             if bar is not None:
                 bar.end("stopped")

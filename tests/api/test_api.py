@@ -161,6 +161,17 @@ def test_a_step_that_fails_is_an_exception(tmp_path):
     lyra_petsc.run(SCENE, tmp_path / "next")  # the next is not touched by it
 
 
+def test_a_mesh_script_is_trusted_where_it_is_asked_for(tmp_path):
+    corners = "Point(1) = {0,0,0,0.5}; Point(2) = {1,0,0,0.5}; Point(3) = {0,1,0,0.5};"
+    sides = "Line(1) = {1,2}; Line(2) = {2,3}; Line(3) = {3,1};"
+    surface = "Curve Loop(1) = {1,2,3}; Plane Surface(1) = {1};"
+    (tmp_path / "m.geo").write_text("\n".join(['a = GetEnv("HOME");', corners, sides, surface, ""]))
+    scene = SCENE | {"mesh": {"file": str(tmp_path / "m.geo")}, "handles": [{"nodes": [0]}]}
+    with pytest.raises(lyra_petsc.InputError, match="GetEnv"):
+        lyra_petsc.run(scene, tmp_path / "out")
+    assert len(lyra_petsc.run(scene, tmp_path / "out", trust_mesh=True)) > 1
+
+
 def test_an_interrupt_ends_the_step_and_leaves_a_checkpoint(tmp_path):
     def interrupt(report):
         if report.step == 2:
