@@ -171,7 +171,7 @@ CHANGES: list[Change] = [
     ),
     Change(
         OUTPUT + "checkpoint.py",
-        "if _sum(slab, order.comm) != expected:",
+        "if int(check_sums([slab], order.comm)[0]) != expected:",
         "if False:",
         ("tests/output/test_checkpoint.py",),
     ),

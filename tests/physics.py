@@ -29,6 +29,15 @@ CLOTH = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0,
 TIGHT = {"force_tolerance": 1e-9, "step_tolerance": 1e-9}
 """What a test asks of Newton: being quadratic, it ends far below."""
 
+SOLVERS: dict[str, dict[str, Any]] = {
+    "block Jacobi": {"pc_type": "pbjacobi"},
+    "incomplete factors": {"pc_type": "bjacobi", "sub_pc_type": "ilu", "mat_type": "baij"},
+    "our multigrid": {"pc_type": "mg", "pc_mg_levels": 2},
+    "algebraic multigrid": {"pc_type": "gamg"},
+    "direct": {"pc_type": "cholesky"},
+}
+"""Linear solvers that a test of a new term runs through, by the options that choose them."""
+
 REFERENCE = Path(__file__).parent / "reference"
 
 

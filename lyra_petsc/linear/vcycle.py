@@ -22,6 +22,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.linear import gauss_seidel as sweeps
 from lyra_petsc.linear.hierarchy import Hierarchy, Level
 from lyra_petsc.linear.matrix import AssembledMatrix
+from lyra_petsc.linear.pattern import begins
 from lyra_petsc.phases import SWEEP, TRANSFER
 
 Array = NDArray[np.float64]
@@ -54,7 +55,10 @@ class Smoother:
         self.points, self.n_couplings = points, pattern.n_couplings
         n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
-        self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._edge = edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        counts = pattern.indptr[edge + 1] - pattern.ends[edge]
+        self._begins = begins(counts)[:-1]  # of each row's among the couplings to ghosts
+        self._to_ghosts = np.arange(counts.sum()) + np.repeat(pattern.ends[edge] - self._begins, counts)
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
@@ -86,18 +90,15 @@ class Smoother:
         A block C couples x and y by at most (xᵀ|C|x + yᵀ|Cᵀ|y) / 2, |C| = (C Cᵀ)^½; where the sum S of
         a row's |C| exceeds its diagonal block D the increase is the positive part of (S − D) / 2.
         """
-        rows, (first, ends, _) = self._edge, self._rows
+        rows = self._edge
         self._lagged, self._increase = rows[:0], self._increase[:0]
         if not len(rows):
             return
-        counts = first[rows + 1].astype(np.int64) - ends[rows]
-        begin = np.cumsum(counts) - counts
-        numbers = np.arange(counts.sum()) + np.repeat(ends[rows] - begin, counts)
-        blocks, diagonal = values[numbers], values[first[rows]]
+        blocks, diagonal = values[self._to_ghosts], values[self._rows[0][rows]]
         if not (np.isfinite(blocks).all() and np.isfinite(diagonal).all()):
             return
         scale = max(float(np.abs(diagonal).max()), float(np.abs(blocks).max()))
-        sizes = np.add.reduceat(_sizes(blocks / scale), begin)
+        sizes = np.add.reduceat(_sizes(blocks / scale), self._begins)
         excess, directions = np.linalg.eigh(sizes - SAFE / scale * diagonal)
         found = excess[:, -1] > 0.0
         if not found.any():
@@ -154,12 +155,15 @@ class Smoother:
             self._coarse.update_ghosts(coarse)
             sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
             PETSc.Log.logFlops(self._transfer_flops)
-        right, self._seen = self.b[self._lagged], self.x[self._lagged]
-        self.b[self._lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
+        lagged = self._lagged
+        if len(lagged):
+            right, self._seen = self.b[lagged], self.x[lagged]
+            self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
         with PETSc.Log.Event(SWEEP):
             sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
             PETSc.Log.logFlops(self._sweep_flops)
-        self.b[self._lagged] = right
+        if len(lagged):
+            self.b[lagged] = right
 
 
 def _product(values: Array, vectors: Array) -> Array:

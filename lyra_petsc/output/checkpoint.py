@@ -13,14 +13,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.hdf5 import NewFile, cannot_write, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
-from lyra_petsc.output.stored import check_sum, open_stored, text_of
+from lyra_petsc.output.stored import check_sums, open_stored, text_of
 from lyra_petsc.parallel import on_root
 
 FORMAT = 2
@@ -86,7 +85,9 @@ def checkpoint_file(
     slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
     if edge_order is not None:
         slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
-    sums = {name: _sum(slab, order.comm) for name, slab in slabs.items()}
+    if any(slab.dtype.itemsize != 8 for slab in slabs.values()):
+        raise ValueError("checkpoints hold float64 and int64")
+    sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
     text = json.dumps(dict(scalars))
     arrays_told = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
     attributes: dict[str, dict[str, int | float | str]] = {
@@ -196,17 +197,8 @@ def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tu
 
 def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:
     slab = read_slab(file, name, order)
-    if _sum(slab, order.comm) != expected:
+    if int(check_sums([slab], order.comm)[0]) != expected:
         raise InputError(
             f"checkpoint is damaged: the check sum of {name.split('/', 1)[1]} does not fit", file=file
         )
     return order.from_slab(slab)
-
-
-def _sum(slab: NDArray[Any], comm: MPI.Comm) -> int:
-    """Sum of all 64-bit words of a distributed array, modulo 2⁶⁴: the same on any number of ranks."""
-    if slab.dtype.itemsize != 8:
-        raise ValueError("checkpoints hold float64 and int64")
-    total = np.empty(1, np.uint64)
-    comm.Allreduce(np.array([check_sum(slab)], np.uint64), total, MPI.SUM)
-    return int(total[0])

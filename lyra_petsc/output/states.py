@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from lyra_petsc.output.growing_xdmf import GrowingXdmf
 from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.self_contained import LeadsOutError
-from lyra_petsc.output.stored import TABLE, check_sum, open_stored, text_of
+from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
@@ -160,7 +160,7 @@ class StateWriter:
         if room is None or room.fields != fields or number >= room.first + len(room.places):
             room = self._room = self._lay_out(slabs, fields)
         state = WrittenState(number, int(step), float(time), room.path.name, fields)
-        row = _Row(room, number - room.first, state, _sums(slabs.values(), self._comm))
+        row = _Row(room, number - room.first, state, check_sums(slabs.values(), self._comm))
         datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
         places = room.places[row.index].tolist()
         file = NewFile(room.path, datasets, {}, lambda: self._announce(state), places, row.write)
@@ -306,14 +306,6 @@ class _Row:
                     os.pwrite(file.fileno(), entry.tobytes(), place + self.index * entry.nbytes)
         except OSError as error:
             raise cannot_write(self.room.path, error) from error
-
-
-def _sums(slabs: Iterable[NDArray[Any]], comm: MPI.Comm) -> NDArray[np.uint64]:
-    """Check sums of distributed arrays; collective."""
-    mine = np.array([check_sum(slab) for slab in slabs], dtype=np.uint64)
-    total = np.empty_like(mine)
-    comm.Allreduce(mine, total, MPI.SUM)
-    return total
 
 
 def _forget(path: Path, last_step: int) -> None:

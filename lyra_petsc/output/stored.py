@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.self_contained import open_own
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 SUM = "sum"
 """Attribute of a dataset: its check sum, as text."""
@@ -34,6 +37,14 @@ def check_sum(array: NDArray[Any]) -> int:
     """Sum of all 64-bit words (of all bytes, where an element has not 8) modulo 2⁶⁴: sums of parts add up."""
     words = np.ascontiguousarray(array).reshape(-1).view(np.uint64 if array.dtype.itemsize == 8 else np.uint8)
     return int(words.sum(dtype=np.uint64))
+
+
+def check_sums(slabs: Iterable[NDArray[Any]], comm: MPI.Comm) -> NDArray[np.uint64]:
+    """Check sums of distributed arrays, the same on any number of ranks; collective."""
+    mine = np.array([check_sum(slab) for slab in slabs], dtype=np.uint64)
+    total = np.empty_like(mine)
+    comm.Allreduce(mine, total)
+    return total
 
 
 @contextmanager

@@ -255,8 +255,7 @@ class EnergyGuard:
     def _stiff(self) -> float:
         """Sum [N/m] of what this rank's elastic forces are proportional to."""
         if self._stiffness is None:
-            terms = [term for term in self._system.elastic if not term.registration.neighbours]
-            self._stiffness = sum(float(term.force_scale(1.0)[: term.n_owned].sum()) for term in terms)
+            self._stiffness = sum(float(each.sum()) for each in self._system.objective.stiffnesses.values())
         return self._stiffness
 
     # -- the verdict -------------------------------------------------------------------------------

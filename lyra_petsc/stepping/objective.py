@@ -61,7 +61,7 @@ class Objective:
         for term in of.elastic:
             each = term.energies(x, of.frozen[term])
             parts.append(rate * float(each.sum()))
-            stiffness = self._stiffnesses.get(term)
+            stiffness = self.stiffnesses.get(term)
             if stiffness is None:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
             square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
@@ -74,6 +74,7 @@ class Objective:
         return float(value), float(size) + float(np.sqrt(square))
 
     @cached_property
-    def _stiffnesses(self) -> dict[Term, Array]:
+    def stiffnesses(self) -> dict[Term, Array]:
+        """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
         fixed = [term for term in self._equations.elastic if not term.registration.neighbours]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}

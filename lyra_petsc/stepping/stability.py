@@ -28,6 +28,9 @@ FIRST_WAY, FARTHEST = 1e-3, 0.25
 
 HALVINGS, DOUBLINGS = 10, 40
 
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+"""Golden ratio, whose multiples fill the fractions evenly."""
+
 BENDS = 0.5
 """Part of a mode that must be on vertices with bending stiffness for it not to be a wrinkle."""
 
@@ -96,10 +99,10 @@ class Examination:
         """The unstable mode (n_owned, 3) of length one with the lowest eigenvalue, if it can be had."""
         assert self._inertia is not None
         points = self._system.points
-        # the same on any number of ranks
-        whole = np.random.default_rng(0).standard_normal((points.n_vertices_global, 3))
+        # spread evenly over (-1/2, 1/2) by the number of the unknown: the same on any number of ranks
         start = np.zeros((points.n_owned, 3))
-        start[: points.n_vertices] = whole[points.original]
+        number = 3 * points.original[:, None] + np.arange(3)
+        start[: points.n_vertices] = (number + 1) * GOLDEN % 1.0 - 0.5
         found = self._inertia.lowest_mode(np.where(self._system.prescribed.free, start, 0.0))
         return None if found is None or not found[0] < 0.0 else found[1]
 
