@@ -1,4 +1,4 @@
-"""Whether ranks wait for processors, and how many ranks there are processors for."""
+"""Whether ranks wait for processors, and for how many ranks there are processors."""
 
 from __future__ import annotations
 

@@ -13,14 +13,14 @@ def nothing() -> None:
 
 
 class Compilation(event.Listener):
-    """What is told of the kernels compiled so far; those that are loaded from the disk do not count.
+    """Times the compilation of kernels by numba; those that are loaded from the disk do not count.
 
     Attributes
     ----------
     begins, ends : callable
-        Called when numba sets out to compile, and when it has ended; not for a kernel that another one calls.
+        Called when numba starts to compile, and when it has ended; not for a kernel that another one calls.
     first : callable
-        Called once, as numba sets out to compile for the first time.
+        Called once, when numba compiles for the first time.
     kept : bool
         Whether all kernels have a place on the disk.
     """

@@ -24,7 +24,7 @@ from lyra_petsc.mesh.msh_file import ElementBlock, MshError, assemble, element_t
 from lyra_petsc.mesh.readers import printable, read_bytes
 from lyra_petsc.scene.values import one_line
 
-# beyond this ratio of the mean edge to the size asked for, the script has had its own way
+# beyond this ratio of the mean edge to the size asked for, the script sets sizes of its own
 _SIZE_RATIO = 1.6
 
 SCRIPT_SECONDS = 60
@@ -177,7 +177,7 @@ def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str]
 
 
 def _outcome(told: BinaryIO) -> dict[str, Any]:
-    """What gmsh's process has told, the last word of each kind."""
+    """What gmsh's process has reported, the latest entry of each kind."""
     outcome: dict[str, Any] = {}
     # not by seeking: the place in the file is that of gmsh's process, too
     for line in os.pread(told.fileno(), os.fstat(told.fileno()).st_size, 0).splitlines():
@@ -203,12 +203,12 @@ def _read_mesh(path: Path, file: BinaryIO) -> Sheet:
         sheet = assemble(tags, points, blocks, names, note_loose=False)  # construction points of the script
     except MshError as error:
         raise InputError(f"the mesh has {error}", file=path) from None
-    sheet.tags = None  # those of a file that nobody sees
+    sheet.tags = None  # those of a temporary file
     return sheet
 
 
 def _ending(stage: str, code: int, errors: bytes, memory: int) -> str:
-    """Why gmsh did not come to its end, in words."""
+    """Why gmsh did not finish, for the message."""
     doing = "meshing" if stage == "mesh" else "reading the script"
     if stage == "memory" or b"bad_alloc" in errors or b"MemoryError" in errors:
         return (

@@ -89,13 +89,13 @@ def checkpoint_file(
         raise ValueError("checkpoints hold float64 and int64")
     sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
     text = json.dumps(dict(scalars))
-    arrays_told = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
+    facts = {name: (slab.dtype.str, slab.shape[1:], sums[name]) for name, slab in slabs.items()}
     attributes: dict[str, dict[str, int | float | str]] = {
         "/": {
             "format": FORMAT,
             "n_vertices": order.n_global,
             "scalars": text,
-            "digest": _digest(FORMAT, order.n_global, text, arrays_told),
+            "digest": _digest(FORMAT, order.n_global, text, facts),
         },
         **{name: {"sum": str(value)} for name, value in sums.items()},
     }
@@ -191,8 +191,13 @@ def _plausible(scalars: Any) -> bool:
 
 def _digest(version: int, n_vertices: int, scalars: str, arrays: Mapping[str, tuple[Any, ...]]) -> str:
     """Check sum of all that a checkpoint holds: of the scalars' text, and of the arrays by their own sums."""
-    told = [version, n_vertices, scalars, sorted((name, *map(str, facts)) for name, facts in arrays.items())]
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    content = [
+        version,
+        n_vertices,
+        scalars,
+        sorted((name, *map(str, facts)) for name, facts in arrays.items()),
+    ]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def _rows(file: Path, name: str, expected: int, order: FileOrder) -> NDArray[Any]:

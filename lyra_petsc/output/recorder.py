@@ -380,7 +380,7 @@ class Recorder:
         self._states.finish()
 
     def close(self) -> None:
-        """Close the tables; for one rank. What of the rest goes wrong now, only `settle` tells."""
+        """Close the tables; for one rank. Errors of what is still being written are raised by `settle`."""
         self._background.close()
         for table in (self._history, self._probes, self._reactions):
             if table is not None:

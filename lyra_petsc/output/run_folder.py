@@ -342,7 +342,7 @@ class FolderLock:
                 os.close(self._descriptor)
                 raise
             os.close(self._descriptor)  # its former holder removed it meanwhile
-        with suppress(OSError):  # on a full disk the lock holds without words
+        with suppress(OSError):  # on a full disk the lock holds without its text
             os.ftruncate(self._descriptor, 0)
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             os.pwrite(

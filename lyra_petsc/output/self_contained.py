@@ -1,7 +1,7 @@
 """A run's folder holds all of its results: files that lead out of it are refused.
 
-Whoever gives away a run's folder could else have its reader show, or change, files of theirs: HDF5 follows
-links to other files and takes data from any file, and a link of the file system leads anywhere.
+Otherwise a folder from somebody else could make a program show or change the user's own files: HDF5 follows
+links to other files and takes data from any file, and a symbolic link may lead anywhere.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def check_folder(folder: Path) -> None:
     """
     try:
         names = sorted(entry.name for entry in os.scandir(folder) if entry.name.endswith(ENDINGS))
-    except OSError:  # told by whoever reads it
+    except OSError:  # reported where it is read
         return
     for name in names:
         check_file(folder / name)

@@ -1,4 +1,4 @@
-"""Whether a step made energy that nothing put in: what no integrator may do unseen.
+"""Spurious energy gain of a step: no integrator may create energy unnoticed.
 
 The gain of a step, with the kinetic energy T of the free coordinates, all elastic energies U (springs and
 clamps too), the potential V of gravity, the heat D of the material damping and the work W of handles, loads

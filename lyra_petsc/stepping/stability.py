@@ -21,7 +21,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 Array = NDArray[np.float64]
 
 MOST_VERTICES = 200_000
-"""Beyond which no factors are made."""
+"""Above it no factors are computed."""
 
 FIRST_WAY, FARTHEST = 1e-3, 0.25
 """Of the way along a mode: the first over the mean edge length, the longest over the mesh's size."""
@@ -81,7 +81,7 @@ class Examination:
         system = self._system
         points = system.points
         if not PETSc.Sys.hasExternalPackage("mumps"):
-            return Stability(reason="this PETSc has no MUMPS, whose factors tell")
+            return Stability(reason="this PETSc has no MUMPS, whose factors give the inertia")
         if points.n_vertices_global > MOST_VERTICES:
             return Stability(
                 reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
