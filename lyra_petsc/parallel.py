@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, overload
 
 from lyra_petsc.errors import LyraError
 
@@ -62,6 +62,10 @@ def _one_machine() -> int:
     return int(MPI.Comm.Create_keyval())
 
 
+@overload
+def on_root(comm: MPI.Comm, work: Callable[[], Result]) -> Result: ...
+@overload
+def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool) -> Result | None: ...
 def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -> Result | None:
     """Run ``work`` on rank 0 only; every rank gets its result or raises its error.
 

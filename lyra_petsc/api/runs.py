@@ -37,7 +37,6 @@ def run(
     """What `lyra_petsc.run` does beside showing progress, with its parameters and errors; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
     loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
-    assert loaded is not None
     refuse_mixed_options(loaded)
     choice = choose(comm, loaded.source.stem if loaded.source else "scene", out, force=force, resume=resume)
     try:

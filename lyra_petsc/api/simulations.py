@@ -101,7 +101,6 @@ class Simulation:
     def __init__(self, scene: SceneLike, comm: MPI.Comm | None = None, *, trust_mesh: bool = False) -> None:
         self.comm: MPI.Comm = MPI.COMM_WORLD if comm is None else comm
         loaded = on_root(self.comm, lambda: load(scene, trust_mesh=trust_mesh))
-        assert loaded is not None
         self.scene: Scene = loaded
         refuse_mixed_options(loaded)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -1,27 +1,38 @@
-"""What the verbs of experiments share: signals, the command that repeats them, the terminal."""
+"""``verify`` and ``stress``, and what ``study`` shares with them: signals, the command that repeats them."""
 
 from __future__ import annotations
 
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 from mpi4py import MPI
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
+from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.progress import duration
 from lyra_petsc.cli.signals import StopRequest
-from lyra_petsc.errors import Interrupted
-from lyra_petsc.experiments.case import Case, Outcome, passed_of
+from lyra_petsc.errors import InputError, Interrupted
+from lyra_petsc.experiments.case import Case, Launcher, Outcome, passed_of
+from lyra_petsc.experiments.results import Results, View, aligned
 from lyra_petsc.linear.petsc_options import unused
+from lyra_petsc.output.run_folder import free_name
+from lyra_petsc.parallel import on_root
 
 FAILED = 1
 """Exit code when a verdict failed."""
+
+FOLDER = Path("stress")
+"""Where results of ``stress`` go unless ``--out`` says otherwise."""
+
+WIDTH = 150
+"""Columns of the terminal at least, so that numbers are never cut."""
 
 
 def watched(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]:
@@ -50,6 +61,19 @@ def command(comm: MPI.Comm, verb: str, words: Sequence[str]) -> list[str]:
     return [*launcher, "python", "-m", "lyra_petsc", verb, *words, *petsc_words()]
 
 
+def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | None:
+    """What starts an mpirun for each case with ``--ranks``; collective.
+
+    Raises
+    ------
+    InputError
+        Where that cannot be.
+    """
+    if ranks is None:
+        return None
+    return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_words())
+
+
 def tell_unused() -> None:
     """Warn of PETSc options that nothing has used. On one rank."""
     left = unused([])
@@ -58,39 +82,28 @@ def tell_unused() -> None:
         print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
 
 
-def plain_table(words: Sequence[str], numbers: Sequence[str]) -> Table:
-    """A table without lines: columns of words, then columns of numbers, by their headings."""
-    table = Table(*words, box=None, header_style="", pad_edge=False, padding=(0, 2, 0, 0))
-    for heading in numbers:
-        table.add_column(Text(heading), justify="right")
-    return table
-
-
 class Terminal:
     """Shows the progress of cases on the terminal; on rank 0 only.
 
     Parameters
     ----------
     comm : MPI.Comm
-    count : int
-        Cases to come.
-    width : int
-        Columns at least, so that numbers are never cut.
+    view : View
+    count, known : int
+        Cases to come, and cases that there are.
     """
 
-    def __init__(self, comm: MPI.Comm, count: int, width: int) -> None:
-        self._speaks, self._count, self._done = comm.rank == 0, count, 0
-        self._console = Console(width=max(width, Console().width), highlight=False, soft_wrap=True)
+    def __init__(self, comm: MPI.Comm, view: View[Any], count: int, known: int) -> None:
+        self._speaks, self._view, self._count, self._done = comm.rank == 0, view, count, 0
+        self._console = Console(width=max(WIDTH, Console().width), highlight=False, soft_wrap=True)
+        self.print(f"{count}{f' of {known}' if known != count else ''} cases")
+        if heading := view.heading():
+            self.print(heading, "bold")
 
-    def print(self, text: str | Table = "", style: str = "") -> None:
-        """A line or a table."""
+    def print(self, text: str = "", style: str = "") -> None:
+        """A line."""
         if self._speaks:
-            self._console.print(Text(text, style=style) if isinstance(text, str) else text)
-
-    def announce(self, known: int) -> None:
-        """Say how many cases will run, of how many that there are."""
-        of = f" of {known}" if known != self._count else ""
-        self.print(f"{self._count}{of} cases")
+            self._console.print(Text(text, style=style))
 
     def begin(self, case: Case) -> None:
         """A case begins: a line on a terminal, until the case has ended."""
@@ -102,16 +115,145 @@ class Terminal:
         """A case has ended."""
         if self._speaks and sys.stderr.isatty():
             print("\x1b[2K", file=sys.stderr, end="\r", flush=True)
+        for line in self._view.lines(outcome):
+            self.print(*line)
 
-    def summary(self, outcomes: Sequence[Outcome[Any]], table: Table, folder: Path | None, note: str) -> None:
+    def close(self, results: Results[Any], note: str) -> None:
         """The end: a table, what passed, where results are, what is missing, options that nothing used."""
-        if not self._speaks:
-            return
-        self.print(table)
-        total = sum(outcome.seconds for outcome in outcomes)
-        self.print(f"{passed_of(outcomes)}, {duration(total)} in all")
-        if folder is not None:
-            self.print(f"results: {folder}")
+        outcomes = results.outcomes
+        self.print()
+        for line in aligned(self._view.summary(outcomes), len(self._view.summary(outcomes)[0]) - 1):
+            self.print(line)
+        total = duration(sum(outcome.seconds for outcome in outcomes))
+        self.print(f"{passed_of(outcomes)}, {total} in all")
+        if results.folder is not None:
+            self.print(f"results: {results.folder}")
         if note:
             self.print(f"note: {note}")
-        tell_unused()
+        if self._speaks:
+            tell_unused()
+
+
+def verify(
+    comm: MPI.Comm, names: Sequence[str], *, quick: bool, listed: bool, out: Path | None, force: bool
+) -> int:
+    """Run cases of ``verify`` (all of them without names) or list them; the exit code; collective.
+
+    Raises
+    ------
+    InputError
+        An unknown case, or a folder that cannot be used; nothing has run then.
+    Interrupted
+        A signal; what had been done is in the folder.
+    """
+    from lyra_petsc.experiments.verification import answers
+    from lyra_petsc.experiments.verification.verification_report import Verification
+
+    if listed:
+        return _list(comm, answers.CASES.all(), f"{len(answers.CASES.modules)} cases")
+    cases = [answers.CASES.load(name) for name in dict.fromkeys(names or answers.CASES.modules)]
+    again, view = command(comm, "verify", [*names, *(["--quick"] if quick else [])]), Verification()
+    results = Results(comm, out, view, ranks=comm.size, command=again, force=force)
+    watch = watched(comm)
+    return _run(
+        comm,
+        results,
+        cases,
+        lambda case: answers.run_case(comm, case, quick=quick, watch=watch),
+        len(answers.CASES.modules),
+    )
+
+
+def stress(
+    comm: MPI.Comm,
+    scene: Path | None,
+    settings: Sequence[str],
+    *,
+    only: Sequence[str],
+    quick: bool,
+    full: bool,
+    listed: bool,
+    out: Path | None,
+    force: bool,
+    ranks: int | None,
+    job: Path | None,
+) -> int:
+    """Run the cases of ``stress`` or list them; the exit code; collective.
+
+    Raises
+    ------
+    InputError
+        A bad scene, an unknown case, or a folder that cannot be used; nothing has run then.
+    Interrupted
+        A signal; what had been done is in the folder.
+    """
+    from lyra_petsc.experiments.stress import trials
+    from lyra_petsc.experiments.stress.stress_report import Stress
+    from lyra_petsc.experiments.stress.stress_scenes import Scope, StressCase, setting_of
+
+    if quick and full:
+        raise InputError("give one of --quick and --full", key="--quick")
+    level = Scope.QUICK if quick else Scope.FULL if full else Scope.USUAL
+    names = [name.strip() for text in only for name in text.split(",") if name.strip()]
+    cases, known = trials.selected(names, level), len(trials.selected((), Scope.FULL))
+    if listed:
+        count = f"{len(cases)} of {known} cases; --full has all"
+        return _list(comm, cases, count, lambda c: f"{c.family}: {trials.FAMILIES.load(c.family).title}")
+    setting = on_root(comm, lambda: setting_of(scene, settings, level))
+    launcher = case_launcher(comm, "stress", ranks)
+    first = FOLDER / (scene.stem if scene is not None else "sheet")
+    folder = out or on_root(comm, lambda: first if force else free_name(first))
+    results: Results[trials.StressOutcome] | None = None
+
+    def kept() -> str:
+        ended = results is not None and results.outcomes
+        return f"; the cases that had ended are in {folder}" if ended else "; no case had ended"
+
+    watch = watched(comm, kept)
+    if launcher is None:
+        # a base scene that does not run is refused before anything is written
+        clock = trials.BaseClock(comm, setting, watch)
+        setting = replace(setting, size=clock.size)
+    asked = [] if scene is None else [str(scene)]
+    asked += [word for text in settings for word in ("--set", text)]
+    asked += [f"--{level.name.lower()}"] if level != Scope.USUAL else []
+
+    def run(case: StressCase) -> trials.StressOutcome:
+        if launcher is not None:
+            return trials.launched(launcher, case, asked, watch)
+        return trials.run_case(comm, case, setting, clock, watch)
+
+    if job is not None:
+        outcome = run(cases[0])
+        on_root(comm, lambda: trials.save(outcome, job))
+        return 0 if outcome.passed else FAILED
+    words = [*asked, *(["--only", ",".join(names)] if names else [])]
+    words += ["--ranks", str(ranks)] if ranks is not None else []
+    again, view = command(comm, "stress", words), Stress(setting, len(cases))
+    results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
+    return _run(comm, results, cases, run, known)
+
+
+def _run(
+    comm: MPI.Comm, results: Results[Any], cases: Sequence[Any], run: Callable[[Any], Any], known: int
+) -> int:
+    """Run cases, of so many that there are, and print what came of each; the exit code."""
+    terminal = Terminal(comm, results.view, len(cases), known)
+    note = results.run(cases, run, terminal)
+    terminal.close(results, note)
+    return 0 if all(outcome.passed for outcome in results.outcomes) else FAILED
+
+
+def _list(
+    comm: MPI.Comm, cases: Sequence[Any], count: str, heading: Callable[[Any], str] | None = None
+) -> int:
+    """Print name and title of cases, below their headings, on rank 0; the exit code."""
+    if comm.rank > 0:
+        return 0
+    width, told = max(len(case.name) for case in cases), ""
+    for case in cases:
+        if heading is not None and heading(case) != told:
+            click.echo(told := heading(case))
+        click.echo(f"{'  ' * (heading is not None)}{case.name:<{width}}  {case.title}")
+    click.echo(count, err=True)
+    return 0

@@ -195,6 +195,66 @@ class FrameProgress(ProgressBar):
             self.say(f"{done / count:4.0%}  {text}")
 
 
+class StudyProgress(ProgressBar):
+    """The progress of a study.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    stop : callable
+        Called after every step on all ranks; may raise to end the study.
+    combinations : int
+        How many there are.
+    **options
+        Of `ProgressBar`.
+    """
+
+    def __init__(self, comm: MPI.Comm, stop: Callable[[], None], combinations: int, **options: Any) -> None:
+        super().__init__(comm, **options)
+        self._stop, self._combinations = stop, combinations
+        self._first: tuple[float, float] | None = None
+        self._label, self._number = "", 0
+        self._last_shown = -math.inf
+
+    def case(self, label: str, *, resumed: bool) -> None:
+        """A case begins, or was found finished."""
+        reference = label.startswith("reference")
+        self._number += not reference
+        self._label = label if reference else f"{self._number}/{self._combinations} {label}"
+        if self._bar is None:
+            self._line(f"{self._label}: finished before" if resumed else self._label)
+
+    def progress(self, done: float, whole: float) -> None:
+        """Work done and in all; may raise, see ``stop``."""
+        self._stop()
+        if not self._shown:
+            return
+        now = self._clock()
+        # what was finished before took no time now
+        began, before = self._first = self._first or (now, done)
+        fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
+        fresh = (done - before) / (whole - before) if whole > before else 1.0
+        left = (now - began) * (1.0 - fresh) / fresh if fresh > 0.0 else math.nan
+        state, since = f"{self._label}  {duration(left)} left", now - self._last_shown
+        if self._bar is None:
+            if since >= LINE_AT_LEAST_SECONDS:
+                self._line(f"{fraction:4.0%}  {state}")
+        elif since >= REDRAW_SECONDS or fraction >= 1.0:
+            self._last_shown = now
+            with suppress(OSError):
+                self._bar.update(self._task, completed=fraction, state=state)
+                self._bar.refresh()
+
+    def note(self, text: str) -> None:
+        """A line for the user, above the bar."""
+        self._line(f"note: {text}")
+
+    def _line(self, text: str) -> None:
+        self.say(text)
+        if self._bar is None:
+            self._last_shown = self._clock()
+
+
 def closing_table(
     comm: MPI.Comm,
     phases: Mapping[str, float],

@@ -68,7 +68,6 @@ def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: A
     from lyra_petsc.show.render.draw import draw
 
     plan = on_root(comm, lambda: make_plan(options))
-    assert plan is not None
     stop = StopRequest(comm)
     with FrameProgress(comm) as progress:
 

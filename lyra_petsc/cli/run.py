@@ -36,7 +36,6 @@ NO_PLACE = "no folder for them can be written; NUMBA_CACHE_DIR names another"
 def read_scene(comm: MPI.Comm, path: Path, settings: Sequence[str], *, trust_mesh: bool = False) -> Scene:
     """The checked scene on all ranks; read on rank 0."""
     scene = on_root(comm, lambda: load_scene(path, settings))
-    assert scene is not None
     return scene.trusting_meshes() if trust_mesh else scene
 
 
@@ -131,7 +130,7 @@ class TerminalProgress(ProgressCallbacks):
             self._comm,
             simulation.control.end,
             start=simulation.time,
-            plain=_petsc_speaks(),
+            plain=petsc_speaks(),
             clock=lambda: time.monotonic() - COMPILATION.seconds,
             unit="s" if simulation.problem.system.integrator.moves else "",
         )
@@ -176,7 +175,7 @@ class TerminalProgress(ProgressCallbacks):
             print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
 
 
-def _petsc_speaks() -> bool:
+def petsc_speaks() -> bool:
     """Whether PETSc prints while the run goes on, which would spoil a progress bar."""
     names = PETSc.Options().getAll()
     return any(word in name for name in names for word in ("monitor", "converged_reason", "_view", "info"))

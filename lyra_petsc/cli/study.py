@@ -10,55 +10,40 @@ from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.api.mpirun import find_launcher
-from lyra_petsc.cli.experiments import command, petsc_words, tell_unused, watched
-from lyra_petsc.cli.run import _petsc_speaks
-from lyra_petsc.cli.study_progress import StudyProgress
+from lyra_petsc.cli.experiments import case_launcher, command, tell_unused, watched
+from lyra_petsc.cli.progress import StudyProgress
+from lyra_petsc.cli.run import petsc_speaks
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments import records
-from lyra_petsc.experiments.launch import Launcher
-from lyra_petsc.experiments.study.case import Job, Result
-from lyra_petsc.experiments.study.conduct import Outcome, conduct
-from lyra_petsc.experiments.study.folder import Lock, StudyFolder, choose_folder
-from lyra_petsc.experiments.study.launch import launched, report_progress
+from lyra_petsc.experiments.case import load_record, save_record
+from lyra_petsc.experiments.study.jobs import (
+    REQUEST_FILE,
+    STUDY,
+    Job,
+    Request,
+    Result,
+    launched,
+    read_request,
+    report_progress,
+    run_case,
+)
 from lyra_petsc.experiments.study.plan import Plan, make_plan
-from lyra_petsc.experiments.study.reference import Chosen, Physics, choose_references
-from lyra_petsc.experiments.study.request import REQUEST_FILE, Request, read_request
-from lyra_petsc.experiments.study.runner import run_case
-from lyra_petsc.experiments.study.work import Work
-from lyra_petsc.extras import require
+from lyra_petsc.experiments.study.references import choose_references
+from lyra_petsc.experiments.study.work import StudyOutcome, Work, conduct
+from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.default import default_scene
 
 
-@dataclasses.dataclass(frozen=True)
-class Asked:
-    """The command line of ``study``; None or empty where nothing was said."""
-
-    scene: Path | None
-    settings: tuple[str, ...] = ()
-    vary: tuple[str, ...] = ()
-    reference: str | None = None
-    quantities: str | None = None
-    repeats: int | None = None
-    ranks: int | None = None
-    out: Path | None = None
-    resume: bool = False
-    force: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class _Ready:
-    """All that is decided before anything is written."""
-
-    folder: StudyFolder
-    plan: Plan
-    chosen: dict[Physics, Chosen]
-    launcher: Launcher | None = None
-
-
-def study(comm: MPI.Comm, asked: Asked) -> None:
+def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said: Any) -> None:
     """Run a study; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    out, resume, force
+        The options of these names.
+    **said
+        Fields of `Request` as the command line gives them; None or empty where nothing was said.
 
     Raises
     ------
@@ -69,62 +54,34 @@ def study(comm: MPI.Comm, asked: Asked) -> None:
     Interrupted
         A signal; the folder can be resumed.
     """
+    scene = said["scene"] or default_scene()
+    stem = out.name if resume and said["scene"] is None and out is not None else scene.stem
+    choice = choose(comm, stem, out, force=force, resume=resume, kind=STUDY)
+    base = Request(str(scene))
+    if resume:
+        base = on_root(comm, lambda: read_request(choice.path))
+    said["scene"] = said["scene"] and str(scene)
+    request = dataclasses.replace(base, **{k: given for k, given in said.items() if given not in (None, ())})
     obey = watched(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
-    ready = on_root(comm, lambda: _prepare(comm, asked))
-    assert ready is not None
-    plan = ready.plan
-    lock = Lock(comm, ready.folder)
-    folder = lock.path
-    on_root(comm, lambda: records.save(folder / REQUEST_FILE, plan.request))
+    launcher = case_launcher(comm, "study", request.ranks)
+    plan = on_root(comm, lambda: make_plan(request))
+    chosen = on_root(comm, lambda: choose_references(plan))
+    with RunDirectory(comm, choice) as directory:
+        folder = directory.path
+        directory.clean()
+        on_root(comm, lambda: save_record(folder / REQUEST_FILE, plan.request))
 
-    def run(job: Job, watch: Callable[[float], None], warm: bool) -> Result:
-        if ready.launcher is not None:
-            # every process warms up by itself
-            return launched(ready.launcher, job, watch, lock.descriptor)
-        return run_case(comm, job, watch, warm=warm)
+        def run(job: Job, watch: Callable[[float], None], warm: bool) -> Result:
+            if launcher is not None:
+                # every process warms up by itself
+                return launched(launcher, job, watch, directory.descriptor)
+            return run_case(comm, job, watch, warm=warm)
 
-    with StudyProgress(comm, obey, len(plan.combinations), plain=_petsc_speaks()) as progress:
-        for note in plan.notes:
-            progress.note(note)
-        outcome = conduct(comm, Work(comm, plan, ready.chosen, folder, run, progress), _command(comm, plan))
-    lock.release()
+        with StudyProgress(comm, obey, len(plan.combinations), plain=petsc_speaks()) as progress:
+            for note in [*plan.notes, *([directory.note] if directory.note else [])]:
+                progress.note(note)
+            outcome = conduct(comm, Work(comm, plan, chosen, folder, run, progress), _command(comm, plan))
     _close(comm, outcome, folder)
-
-
-def _prepare(comm: MPI.Comm, asked: Asked) -> _Ready:
-    """Everything that can be refused, before anything is written (rank 0)."""
-    require("study")
-    if asked.resume and asked.scene is None and asked.out is not None:
-        stem = asked.out.name
-    else:
-        stem = (asked.scene or default_scene()).stem
-    folder = choose_folder(stem, asked.out, force=asked.force, resume=asked.resume)
-    request = _request(asked, read_request(folder.path) if asked.resume else None)
-    launcher = None
-    if request.ranks is not None:
-        if comm.size > 1:
-            raise InputError(
-                "starts one mpirun per case and cannot be used under mpirun; leave one of them out",
-                key="--ranks",
-            )
-        launcher = Launcher(find_launcher(request.ranks), "study", petsc_words())
-    plan = make_plan(request)
-    return _Ready(folder, plan, choose_references(plan), launcher)
-
-
-def _request(asked: Asked, stored: Request | None) -> Request:
-    """What was asked for, and where nothing was said what the study was begun with."""
-    base = stored or Request(str(asked.scene or default_scene()))
-    said: dict[str, Any] = {
-        "scene": str(asked.scene) if asked.scene is not None else None,
-        "settings": asked.settings or None,
-        "vary": asked.vary or None,
-        "reference": asked.reference,
-        "quantities": asked.quantities,
-        "repeats": asked.repeats,
-        "ranks": asked.ranks,
-    }
-    return dataclasses.replace(base, **{key: value for key, value in said.items() if value is not None})
 
 
 def _command(comm: MPI.Comm, plan: Plan) -> str:
@@ -143,7 +100,7 @@ def _command(comm: MPI.Comm, plan: Plan) -> str:
     return shlex.join(command(comm, "study", words))
 
 
-def _close(comm: MPI.Comm, outcome: Outcome, folder: Path) -> None:
+def _close(comm: MPI.Comm, outcome: StudyOutcome, folder: Path) -> None:
     """Words at the end, and the ways in which a study fails as a whole."""
     if comm.rank == 0:
         for advice in outcome.advice.values():
@@ -180,12 +137,11 @@ def run_job(comm: MPI.Comm, path: Path) -> None:
 
     def read() -> Job:
         try:
-            return records.load(path, Job)
+            return load_record(path, Job)
         except (OSError, ValueError):
             raise InputError("is no job of a study", file=path, key="--job") from None
 
     job = on_root(comm, read)
-    assert job is not None
     tell: Callable[[float], None] = report_progress(Path(job.folder))
 
     def watch(fraction: float) -> None:

@@ -128,17 +128,11 @@ def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: 
 @out
 @click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
 @click.pass_obj
-def verify(
-    comm: Any, names: tuple[str, ...], quick: bool, listed: bool, out: Path | None, force: bool
-) -> int:
+def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
     """Run the cases with exact or published answers (default: all); exit code 1 if a verdict fails."""
-    from lyra_petsc.cli.verify import list_cases
-    from lyra_petsc.cli.verify import verify as verify_cases
+    from lyra_petsc.cli.experiments import verify as verify_cases
 
-    if listed:
-        list_cases(comm)
-        return 0
-    return verify_cases(comm, names, quick=quick, out=out, force=force)
+    return verify_cases(comm, names, **asked)
 
 
 @verbs.command(
@@ -169,13 +163,13 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     from lyra_petsc.extras import require
 
     require("study")
-    from lyra_petsc.cli.study import Asked, run_job
+    from lyra_petsc.cli.study import run_job
     from lyra_petsc.cli.study import study as study_scene
 
     if job is not None:
         run_job(comm, job)
     else:
-        study_scene(comm, Asked(**asked))
+        study_scene(comm, **asked)
 
 
 @verbs.command(
@@ -194,15 +188,11 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
 @click.option("--job", type=click.Path(path_type=Path), hidden=True)
 @click.pass_obj
-def stress(comm: Any, /, listed: bool, **asked: Any) -> int:
+def stress(comm: Any, /, **asked: Any) -> int:
     """Run stiff and extreme cases, on a hanging sheet or on SCENE; exit code 1 if a verdict fails."""
-    from lyra_petsc.cli.stress import Asked, list_cases
-    from lyra_petsc.cli.stress import stress as stress_cases
+    from lyra_petsc.cli.experiments import stress as stress_cases
 
-    if listed:
-        list_cases(comm, Asked(**asked))
-        return 0
-    return stress_cases(comm, Asked(**asked))
+    return stress_cases(comm, **asked)
 
 
 @verbs.command(context_settings=SETTINGS, epilog=example("lyra-petsc info"))

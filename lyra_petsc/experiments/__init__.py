@@ -5,14 +5,14 @@ programs and a page, and an exit code that says whether all is as expected.
 
 A `case.Case` is one experiment; a verb adds its scene, what is varied and what is expected. `bench` runs its
 simulations, a verb's runner turns them into a `case.Outcome` with a `case.Verdict` for each claim, and
-`results.Results` runs case after case, on the communicator at hand or through `launch` in an mpirun each,
-and writes what a verb's `results.View` tells. `registry.Registry` finds cases by name and imports their
-modules only then; `records` keeps what outlives a process. Three verbs are views of this:
+`results.Results` runs case after case, on the communicator at hand or through a `case.Launcher` in an mpirun
+each, and writes what a verb's `results.View` tells. `case.Registry` finds cases by name and imports their
+modules only then; `case.save_record` keeps what outlives a process. Three verbs are views of this:
 
 - `verification`: exact and published answers; varied is the resolution, expected a value and an order.
 - `stress`: stiff and extreme scenes; expected are the balances of energy, force and momentum of every step.
-- `study`: a scene of the user; varied are its settings, expected is a reference (of `exact`, of a finer run),
-  and instead of a verdict it tells which setting gives an accuracy in the least time.
+- `study`: a scene of the user; varied are its settings, expected is a reference (of `exact_motions`, of a
+  finer run), and instead of a verdict it tells which setting gives an accuracy in the least time.
 
-A further verb brings its cases, a runner, a `View`, and a module in `cli` that is as short as `cli.verify`.
+A further verb brings its cases, a runner, a `View`, and a function in `cli.experiments`.
 """

@@ -1,10 +1,30 @@
-"""What every experiment is made of: a case, what came of it, and the verdicts on that."""
+"""What every experiment is made of: a case, what came of it, and the verdicts on that.
+
+Dataclasses as JSON files: requests, jobs and results that outlive a process.
+
+Entries by name, whose modules are imported when they are asked for.
+
+``--ranks P``: each case in an mpirun of its own, of this program with the same PETSc options.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
+
+from pydantic import TypeAdapter
+
+from lyra_petsc.api.mpirun import run_launched
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.output.atomic import replace_text
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True)
@@ -69,3 +89,85 @@ def passed_of(outcomes: Sequence[Outcome[C]]) -> str:
     """``3 of 4 cases passed``; cases that were left out do not count."""
     run = [outcome for outcome in outcomes if not outcome.left_out]
     return f"{sum(outcome.passed for outcome in run)} of {len(run)} cases passed"
+
+
+T = TypeVar("T")
+
+
+def save_record(path: Path, record: DataclassInstance) -> None:
+    """Write a record; the file is the old or the new one, never half. Call on one rank."""
+    replace_text(path, json.dumps(asdict(record), indent=2, ensure_ascii=False) + "\n")
+
+
+def load_record(path: Path, kind: type[T]) -> T:
+    """The record in a file; what it holds beside the fields is passed over.
+
+    Raises
+    ------
+    OSError, ValueError
+        If it cannot be read, or holds no such record.
+    """
+    return TypeAdapter(kind).validate_json(path.read_bytes())
+
+
+@dataclass(frozen=True)
+class Registry(Generic[T]):
+    """Names on the command line, in their order, and the modules that define what they stand for.
+
+    Attributes
+    ----------
+    package : str
+        In which the modules are.
+    modules : mapping of name → module
+        Entry ``some-name`` is the variable ``some_name`` of its module.
+    what : str
+        What an entry is, for the message about an unknown name.
+    """
+
+    package: str
+    modules: Mapping[str, str]
+    what: str = "unknown case"
+
+    def load(self, name: str, *, key: str | None = None) -> T:
+        """The entry of that name.
+
+        Raises
+        ------
+        InputError
+            For a name that is not listed, with the nearest that is; ``key`` is the option that gave it.
+        """
+        if name not in self.modules:
+            raise InputError(f"{self.what}, {nearest(name, self.modules)}", key=key or name)
+        module = import_module(f"{self.package}.{self.modules[name]}")
+        return cast(T, getattr(module, name.replace("-", "_")))
+
+    def all(self) -> list[T]:
+        """Every entry, in the order of the names."""
+        return [self.load(name) for name in self.modules]
+
+
+Watch = Callable[[], None]
+"""Called before every step, or again and again while a process runs; may raise to end the work."""
+
+
+@dataclass(frozen=True)
+class Launcher:
+    """Starts the program on several ranks.
+
+    Attributes
+    ----------
+    command : sequence of str
+        From `lyra_petsc.api.mpirun.find_launcher`.
+    verb : str
+    petsc : sequence of str
+        PETSc's options of the command line.
+    """
+
+    command: Sequence[str]
+    verb: str
+    petsc: Sequence[str]
+
+    def __call__(self, words: Sequence[str], watch: Watch, keep_open: Sequence[int] = ()) -> tuple[int, str]:
+        """Run the verb with these words; exit code and what was said on stderr, see `run_launched`."""
+        program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
+        return run_launched([*program, *words, *self.petsc], watch, keep_open)

@@ -24,6 +24,20 @@ O = TypeVar("O", bound=Outcome[Any])  # noqa: E741
 C = TypeVar("C", bound=Case)
 
 
+Line = tuple[str, str]
+"""A line of the terminal and its style, as of rich; empty: none."""
+
+
+def aligned(rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
+    """The lines of a table: so many columns of words, set to the left, then columns of numbers."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = zip(row, widths, strict=True)
+        lines.append("  ".join(f"{text:{'<>'[i >= words]}{width}}" for i, (text, width) in enumerate(cells)))
+    return [line.rstrip() for line in lines]
+
+
 class View(ABC, Generic[O]):
     """How a verb tells of its cases: in a table, in a file for programs, and on a page.
 
@@ -43,6 +57,21 @@ class View(ABC, Generic[O]):
     pictures: ClassVar[str]
     columns: ClassVar[tuple[str, ...]]
 
+    def heading(self) -> str:
+        """What the terminal shows before the first case; empty: nothing."""
+        return ""
+
+    @abstractmethod
+    def lines(self, outcome: O) -> Iterable[Line]:
+        """What the terminal shows when a case has ended."""
+
+    @abstractmethod
+    def summary(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
+        """The table that the terminal shows at the end, its headings first."""
+
+    def ended(self, outcomes: Sequence[O]) -> None:
+        """Another case has ended: what no later use has of the outcomes so far may be freed."""
+
     @abstractmethod
     def rows(self, outcome: O) -> Iterable[Mapping[str, Any]]:
         """Its lines of the CSV, by the columns."""
@@ -60,7 +89,7 @@ class View(ABC, Generic[O]):
         """Fill the page; ``summary`` says how many cases passed, ``drawn`` whether there can be pictures."""
 
 
-class Show(Protocol[C, O]):  # type: ignore[misc]
+class CaseObserver(Protocol[C, O]):  # type: ignore[misc]
     """Receives the cases as they run."""
 
     def begin(self, case: C) -> None:
@@ -89,6 +118,7 @@ class Results(Generic[O]):
     Attributes
     ----------
     outcomes : list of Outcome
+    folder, view
 
     Raises
     ------
@@ -106,13 +136,13 @@ class Results(Generic[O]):
         command: Sequence[str],
         force: bool = False,
     ) -> None:
-        self._comm, self.folder, self._view = comm, folder, view
+        self._comm, self.folder, self.view = comm, folder, view
         self._ranks, self._command = ranks, command
         self.outcomes: list[O] = []
         if folder is not None:
             on_root(comm, lambda: _create(folder, force=force))
 
-    def run(self, cases: Sequence[C], run: Callable[[C], O], show: Show[C, O]) -> str:
+    def run(self, cases: Sequence[C], run: Callable[[C], O], show: CaseObserver[C, O]) -> str:
         """Run the cases; what the page lacks and how to get it, empty if nothing.
 
         Raises
@@ -127,6 +157,7 @@ class Results(Generic[O]):
                 show.begin(case)
                 self.outcomes.append(run(case))
                 show.end(self.outcomes[-1])
+                self.view.ended(self.outcomes)
                 self.write()
         except Interrupted:
             self.finish()
@@ -137,7 +168,7 @@ class Results(Generic[O]):
         """Write the tables of what came of the cases so far."""
         if self.folder is None:
             return
-        view, path = self._view, self.folder / f"{self._view.verb}.csv"
+        view, path = self.view, self.folder / f"{self.view.verb}.csv"
         run = [outcome for outcome in self.outcomes if not outcome.left_out]
         rows = [row for outcome in run for row in view.rows(outcome)]
         on_root(self._comm, lambda: replace_text(path, csv_text(view.columns, rows)))
@@ -155,16 +186,16 @@ class Results(Generic[O]):
 
     def finish(self) -> str:
         """Write the page; what is missing for its pictures, in words."""
-        return on_root(self._comm, self._page) or ""
+        return on_root(self._comm, self._page)
 
     def _page(self) -> str:
         if self.folder is None:
             return ""
-        report = Report(self._view.title)
+        report = Report(self.view.title)
         on = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
         summary = f"{passed_of(self.outcomes)} on {on}."
-        self._view.page(report, self.outcomes, summary, drawn=not lacking())
-        return close(report, self.folder, versions(), self._command, pictures=self._view.pictures)
+        self.view.page(report, self.outcomes, summary, drawn=not lacking())
+        return close(report, self.folder, versions(), self._command, pictures=self.view.pictures)
 
 
 def _create(folder: Path, *, force: bool) -> None:

@@ -131,7 +131,7 @@ def read_checkpoint(
     newest: InputError | None = None
     for file in checkpoint_files(folder, order.comm):
         try:
-            scalars, sums = on_root(order.comm, lambda f=file: _head(f, order)) or ({}, {})  # type: ignore[misc]
+            scalars, sums = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
             arrays, edges = (
                 {
                     name.split("/", 1)[1]: _rows(file, name, sums[name], by)

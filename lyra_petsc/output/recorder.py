@@ -176,7 +176,7 @@ class Recorder:
         """Tell what the scene says otherwise than the one in the folder."""
         scene, notes = self._simulation.scene, self._simulation.notes
         try:
-            self.changes = on_root(self._comm, lambda: changes(before, scene)) or []
+            self.changes = on_root(self._comm, lambda: changes(before, scene))
         except InputError as error:
             notes.append(f"{error}; what has changed since the run was begun is not known")
             return

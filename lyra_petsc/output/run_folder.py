@@ -1,12 +1,14 @@
-"""The folder of a run: chosen before anything is done, then created, locked and cleared of old results."""
+"""The folder of a run or a study: chosen before anything is done, then created, locked and cleared."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import re
+import shutil
 import socket
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +35,6 @@ RESULT = re.compile(
     r"|(history|probes|reactions)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
 )
 
-EXISTS = "exists; name another folder, or give --resume to go on with its run or --force to replace it"
-NO_CHECKPOINT = "holds no checkpoint to resume from; run without --resume"
-
 
 def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = None) -> list[Path]:
     """The checkpoints of a run that exist, newest first; with ``comm`` as rank 0 sees them."""
@@ -45,7 +44,85 @@ def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = Non
         files = [Path(folder) / name for name in (NEXT, CHECKPOINT, PREVIOUS)]
         return [file for file in files if file.is_file()]
 
-    return work() if comm is None else on_root(comm, work) or []
+    return work() if comm is None else on_root(comm, work)
+
+
+def _check_resumable(folder: Path) -> None:
+    """Refuse a run whose files, some of which are written on, are links, or whose checkpoints are none."""
+    check_folder(folder)
+    for file in checkpoint_files(folder):
+        with suppress(*HDF5_ERRORS), open_own(file):  # a damaged one has one before it
+            pass
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What a folder is for.
+
+    Attributes
+    ----------
+    what : str
+        In a word.
+    parent : Path
+        Where folders are that the user does not name.
+    lock : str
+        Name of the file that is locked.
+    result : re.Pattern
+        Names of the files that are written; ``--force`` removes no other file.
+    resumable : callable
+        The files of a folder from which it goes on; empty if it cannot.
+    lacks : str
+        What is missing then, in words.
+    check : callable, optional
+        Refuses a folder that cannot go on all the same.
+    folders : tuple of str
+        Names of folders that ``--force`` removes.
+    """
+
+    what: str
+    parent: Path
+    lock: str
+    result: re.Pattern[str]
+    resumable: Callable[[Path], list[Path]]
+    lacks: str
+    check: Callable[[Path], None] | None = None
+    folders: tuple[str, ...] = ()
+
+    def exists(self, path: Path, key: str) -> InputError:
+        """The refusal of a folder that is there."""
+        return InputError(
+            f"exists; name another folder, or give --resume to go on with its {self.what} or --force to "
+            "replace it",
+            file=path,
+            key=key,
+        )
+
+    def newest(self, stem: str) -> Path:
+        """The folder of a scene that was worked on last.
+
+        Raises
+        ------
+        InputError
+            If there is none that can go on.
+        """
+        ours = re.compile(re.escape(stem) + r"(-\d+)?")
+        folders = self.parent.iterdir() if self.parent.is_dir() else []
+        ages = [
+            (max(file.stat().st_mtime for file in files), path)
+            for path in folders
+            if ours.fullmatch(path.name) and (files := self.resumable(path))
+        ]
+        if not ages:
+            raise InputError(
+                f"no {self.what} of {stem} under {self.parent} that can go on; run without --resume",
+                key="--resume",
+            )
+        return max(ages)[1]
+
+
+RUN = FolderKind(
+    "run", RUNS, LOCK_FILE, RESULT, checkpoint_files, "no checkpoint to resume from", _check_resumable
+)
 
 
 @dataclass(frozen=True)
@@ -65,6 +142,7 @@ class FolderChoice:
         Results that stand there are replaced.
     first : Path or None
         What a name found for it is counted on from.
+    kind : FolderKind
     """
 
     path: Path
@@ -72,6 +150,7 @@ class FolderChoice:
     given: bool = False
     force: bool = False
     first: Path | None = None
+    kind: FolderKind = RUN
 
 
 def choose(
@@ -81,6 +160,7 @@ def choose(
     *,
     force: bool = False,
     resume: bool = False,
+    kind: FolderKind = RUN,
 ) -> FolderChoice:
     """Decide on the folder without touching the disk; rank 0 decides for all.
 
@@ -95,31 +175,33 @@ def choose(
         ``resume`` the newest run of that scene; with ``force`` always ``runs/<scene stem>``.
     force, resume : bool
         ``--force`` and ``--resume``.
+    kind : FolderKind
 
     Raises
     ------
     InputError
         On every rank, if the folder cannot be used.
     """
-    choice = on_root(comm, lambda: _choose(scene_stem, out, force, resume))
-    assert choice is not None
-    return choice
+    return on_root(comm, lambda: _choose(kind, scene_stem, out, force, resume))
 
 
-def _choose(stem: str, out: str | os.PathLike[str] | None, force: bool, resume: bool) -> FolderChoice:
+def _choose(
+    kind: FolderKind, stem: str, out: str | os.PathLike[str] | None, force: bool, resume: bool
+) -> FolderChoice:
     if force and resume:
         raise InputError("--force begins anew and --resume goes on: give one of them", key="--force")
     key = "--out"
     if out is None:
-        first = RUNS / stem
+        first = kind.parent / stem
         if resume:
-            return FolderChoice(_newest(stem), resume=True, given=True)
-        choice = FolderChoice(first if force else free_name(first), given=force, force=force, first=first)
+            return FolderChoice(kind.newest(stem), resume=True, given=True, kind=kind)
+        path = first if force else free_name(first)
+        choice = FolderChoice(path, given=force, force=force, first=first, kind=kind)
         key = "output folder"
     else:
-        if not os.fspath(out):
+        if not os.fspath(out).strip():
             raise InputError("is empty; give the folder to write to", key=key)
-        choice = FolderChoice(Path(out), resume=resume, given=True, force=force)
+        choice = FolderChoice(Path(out), resume=resume, given=True, force=force, kind=kind)
     try:
         _check(choice, key)
     except OSError as error:
@@ -128,20 +210,20 @@ def _choose(stem: str, out: str | os.PathLike[str] | None, force: bool, resume: 
 
 
 def _check(choice: FolderChoice, key: str) -> None:
-    path = choice.path
+    path, kind = choice.path, choice.kind
     if os.path.lexists(path) and not path.is_dir():
         raise InputError("is a file; name a folder", file=path, key=key)
     if choice.resume:
         if not path.is_dir():
-            raise InputError("does not exist, so there is no run to resume", file=path, key="--resume")
-        if not checkpoint_files(path):
-            raise InputError(NO_CHECKPOINT, file=path, key="--resume")
-        check_folder(path)  # some of its files are written on
-        for file in checkpoint_files(path):
-            with suppress(*HDF5_ERRORS), open_own(file):  # a damaged one has one before it
-                pass
-    elif choice.given and not choice.force and path.exists() and os.listdir(path) != [LOCK_FILE]:
-        raise InputError(EXISTS, file=path, key=key)
+            raise InputError(
+                f"does not exist, so there is no {kind.what} to resume", file=path, key="--resume"
+            )
+        if not kind.resumable(path):
+            raise InputError(f"holds {kind.lacks}; run without --resume", file=path, key="--resume")
+        if kind.check is not None:
+            kind.check(path)
+    elif choice.given and not choice.force and path.exists() and os.listdir(path) != [kind.lock]:
+        raise kind.exists(path, key)
     check_creatable(path, key)
 
 
@@ -169,23 +251,8 @@ def free_name(first: Path) -> Path:
     return path
 
 
-def _newest(stem: str) -> Path:
-    ours = re.compile(re.escape(stem) + r"(-\d+)?")
-    folders = [path for path in RUNS.iterdir() if ours.fullmatch(path.name)] if RUNS.is_dir() else []
-    ages = [
-        (max(file.stat().st_mtime for file in files), path)
-        for path in folders
-        if (files := checkpoint_files(path))
-    ]
-    if not ages:
-        raise InputError(
-            f"no run of {stem} with a checkpoint under {RUNS}; run without --resume", key="--resume"
-        )
-    return max(ages)[1]
-
-
 class RunDirectory:
-    """The folder chosen for one run, created and locked until the run's end; construction is collective.
+    """The folder chosen for a run or study, created and locked until its end; construction is collective.
 
     A folder made for it that is still empty at the end is removed again.
 
@@ -212,9 +279,8 @@ class RunDirectory:
         self._made: list[Path] = []
         self._lock: FolderLock | None = None
         found = on_root(comm, self._take)
-        assert found is not None
         self.path, held = found
-        self.note = None if held else f"{self.path}: this file system has no locks: keep other runs out of it"
+        self.note = None if held else f"{self.path}: this file system has no locks: keep others out of it"
 
     def clean(self) -> None:
         """Remove old results (``--force``) or what a kill left half-written (``--resume``); collective.
@@ -225,6 +291,12 @@ class RunDirectory:
             On every rank, if they cannot be removed.
         """
         on_root(self._comm, self._clear)
+
+    @property
+    def descriptor(self) -> int:
+        """Of the locked file, on rank 0: processes that inherit it keep the folder locked."""
+        assert self._lock is not None
+        return self._lock.descriptor
 
     def release(self) -> None:
         """Unlock the folder; not collective."""
@@ -242,16 +314,16 @@ class RunDirectory:
         self.release()
 
     def _take(self) -> tuple[Path, bool]:
-        choice, path = self._choice, self._choice.path
+        choice, path, kind = self._choice, self._choice.path, self._choice.kind
         fresh = not (choice.resume or choice.force)
         while True:
             try:
                 self._make(path)
-                self._lock = FolderLock(path)
-                if fresh and os.listdir(path) != [LOCK_FILE]:
+                self._lock = FolderLock(path, kind.lock)
+                if fresh and os.listdir(path) != [kind.lock]:
                     raise FileExistsError
-                if choice.resume and not checkpoint_files(path):  # replaced by another run meanwhile
-                    raise InputError(NO_CHECKPOINT, file=path)
+                if choice.resume and not kind.resumable(path):  # replaced by another meanwhile
+                    raise InputError(f"holds {kind.lacks}; run without --resume", file=path)
                 return path, self._lock.held
             except (FileExistsError, Busy) as obstacle:
                 self.release()
@@ -266,13 +338,11 @@ class RunDirectory:
                 raise
 
     def _refusal(self, path: Path, obstacle: Exception) -> InputError:
-        if isinstance(obstacle, Busy):
-            return InputError(
-                f"another run is at work in this folder ({obstacle}); wait for it, or name another folder",
-                file=path,
-                key="--resume" if self._choice.resume else "--out",
-            )
-        return InputError(EXISTS, file=path, key="--out")
+        if not isinstance(obstacle, Busy):
+            return self._choice.kind.exists(path, "--out")
+        words = f"another {self._choice.kind.what} is at work in this folder ({obstacle}); wait for it, or "
+        key = "--resume" if self._choice.resume else "--out"
+        return InputError(words + "name another folder", file=path, key=key)
 
     def _make(self, path: Path) -> None:
         """Create the folder and what is missing above it, noting what was not there before."""
@@ -293,10 +363,14 @@ class RunDirectory:
         self._made.clear()
 
     def _clear(self) -> None:
+        kind = self._choice.kind
         try:
             for entry in sorted(self.path.iterdir()):
-                match = RESULT.fullmatch(entry.name)
-                if match and (self._choice.force or entry.name.endswith(".part")):
+                if self._choice.force and entry.name in kind.folders:
+                    shutil.rmtree(entry)
+                elif kind.result.fullmatch(entry.name) and (
+                    self._choice.force or entry.name.endswith(".part")
+                ):
                     entry.unlink()
         except OSError as error:
             raise InputError(f"cannot be cleared: {reason(error)}", file=self.path, key="--out") from error
@@ -316,9 +390,13 @@ class FolderLock:
     ----------
     folder : Path
         An existing folder.
+    name : str
+        Of the file.
 
     Attributes
     ----------
+    descriptor : int
+        Of the file.
     held : bool
         False where the file system knows no locks.
 
@@ -330,28 +408,28 @@ class FolderLock:
         If the file cannot be created.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / LOCK_FILE
+    def __init__(self, folder: Path, name: str = LOCK_FILE) -> None:
+        self.path = folder / name
         while True:
-            self._descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             try:
                 self.held = self._lock()
                 if self._stands():
                     break
             except BaseException:
-                os.close(self._descriptor)
+                os.close(self.descriptor)
                 raise
-            os.close(self._descriptor)  # its former holder removed it meanwhile
+            os.close(self.descriptor)  # its former holder removed it meanwhile
         with suppress(OSError):  # on a full disk the lock holds without its text
-            os.ftruncate(self._descriptor, 0)
+            os.ftruncate(self.descriptor, 0)
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             os.pwrite(
-                self._descriptor, f"process {os.getpid()} on {socket.gethostname()}, {since}".encode(), 0
+                self.descriptor, f"process {os.getpid()} on {socket.gethostname()}, {since}".encode(), 0
             )
 
     def _lock(self) -> bool:
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise Busy(self._holder()) from None
         except OSError:
@@ -359,13 +437,13 @@ class FolderLock:
         return True
 
     def _holder(self) -> str:
-        text = os.pread(self._descriptor, 200, 0).decode("utf-8", "replace")
+        text = os.pread(self.descriptor, 200, 0).decode("utf-8", "replace")
         return "".join(c for c in text if c.isprintable()) or "a process that has not said which"
 
     def _stands(self) -> bool:
         """Whether the file locked is still the one that others would find."""
         try:
-            return os.path.samestat(os.fstat(self._descriptor), os.stat(self.path))
+            return os.path.samestat(os.fstat(self.descriptor), os.stat(self.path))
         except FileNotFoundError:
             return False
 
@@ -375,7 +453,7 @@ class FolderLock:
             if self._stands():
                 self.path.unlink()
         with suppress(OSError):
-            os.close(self._descriptor)
+            os.close(self.descriptor)
 
 
 def in_use(folder: Path) -> bool:

@@ -103,7 +103,6 @@ class StateWriter:
         self.in_plane: frozenset[str] = frozenset()
         if resume_after is not None:
             found = on_root(self._comm, lambda: self._truncate(resume_after))
-            assert found is not None
             self._next, self.in_plane = found
 
     @property

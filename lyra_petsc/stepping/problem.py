@@ -133,7 +133,6 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
 
     with phases("mesh"):
         outline = on_root(comm, prepare)
-        assert outline is not None
     with phases("partition"):
         part = distribute(comm, whole)
         whole = None

@@ -7,7 +7,7 @@ import io
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.cli.study_progress import StudyProgress
+from lyra_petsc.cli.progress import StudyProgress
 
 
 class Terminal(io.StringIO):

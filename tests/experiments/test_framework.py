@@ -14,12 +14,10 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
-from lyra_petsc.experiments import records
-from lyra_petsc.experiments.case import Case, Outcome, Verdict, passed_of
-from lyra_petsc.experiments.registry import Registry
-from lyra_petsc.experiments.results import Results, View
-from lyra_petsc.experiments.stress.registry import FAMILIES
-from lyra_petsc.experiments.verification.registry import CASES
+from lyra_petsc.experiments.case import Case, Outcome, Registry, Verdict, load_record, passed_of, save_record
+from lyra_petsc.experiments.results import Line, Results, View, aligned
+from lyra_petsc.experiments.stress.trials import FAMILIES
+from lyra_petsc.experiments.verification.answers import CASES
 from lyra_petsc.show.report.document import Report
 
 GOOD, BAD = Verdict(True, "as it should be"), Verdict(False, "off by a half")
@@ -66,13 +64,13 @@ class Whole:
 
 def test_a_record_comes_back_from_its_file(tmp_path: Path) -> None:
     whole = Whole("Δt", [Part(0.5), Part(math.inf)], ("a", "b"), 3)
-    records.save(tmp_path / "whole.json", whole)
-    assert records.load(tmp_path / "whole.json", Whole) == whole
+    save_record(tmp_path / "whole.json", whole)
+    assert load_record(tmp_path / "whole.json", Whole) == whole
     (tmp_path / "whole.json").write_text('{"name": "older", "parts": [], "gone": 1}', encoding="utf-8")
-    assert records.load(tmp_path / "whole.json", Whole) == Whole("older", [])
+    assert load_record(tmp_path / "whole.json", Whole) == Whole("older", [])
     (tmp_path / "whole.json").write_text('{"name": "half"', encoding="utf-8")
     with pytest.raises(ValueError, match="JSON"):
-        records.load(tmp_path / "whole.json", Whole)
+        load_record(tmp_path / "whole.json", Whole)
 
 
 class Told(View[Outcome[Case]]):
@@ -81,11 +79,22 @@ class Told(View[Outcome[Case]]):
     def rows(self, outcome: Outcome[Case]) -> Iterable[Mapping[str, Any]]:
         yield {"case": outcome.case.name, "value": math.nan, "more": 1}
 
+    def lines(self, outcome: Outcome[Case]) -> Iterable[Line]:
+        return [(outcome.case.name, "bold")]
+
+    def summary(self, outcomes: Sequence[Outcome[Case]]) -> list[Sequence[str]]:
+        return [(outcome.case.name,) for outcome in outcomes]
+
     def told(self, outcome: Outcome[Case]) -> dict[str, Any]:
         return {"seconds": outcome.seconds}
 
     def page(self, report: Report, outcomes: Sequence[Outcome[Case]], summary: str, *, drawn: bool) -> None:
         report.paragraph(summary)
+
+
+def test_a_table_for_the_terminal() -> None:
+    assert aligned([("case", "n"), ("a", "10")]) == ["case   n", "a     10"]
+    assert aligned([("case", "n"), ("a", "10")], words=2) == ["case  n", "a     10"]
 
 
 class Silent:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from written_run import written
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.samples import read_here
+from lyra_petsc.experiments.study.comparison import read_here
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import Run
 from lyra_petsc.output.run_folder import choose

@@ -1,16 +1,135 @@
-"""What physics says of a record: pure functions, the same on every rank."""
+"""What was seen while a case ran.
+
+What physics says of a record: pure functions, the same on every rank.
+"""
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.stress.balance import Balance
-from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.experiments.stress.step_balance import StepBalance
 from lyra_petsc.show.report.numbers import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
+from lyra_petsc.stepping.simulation import StepReport
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
+
+
+@dataclass
+class Record:
+    """A case's steps, the same on every rank.
+
+    Attributes
+    ----------
+    planned : int
+        Steps at the nominal Δt.
+    nominal : float
+        That Δt [s].
+    end : float
+        Time [s] to reach.
+    start_energy : float
+        Kinetic + potential at the start [J].
+    reports : list of StepReport
+        One for each accepted step.
+    balances : list of StepBalance
+        One for each; empty for the semi-implicit method, which solves no step.
+    energies : list of float
+        Kinetic + potential after each [J].
+    observed : list
+        What the case observes, from the start on.
+    notes : list of str
+        Of the simulation.
+    stopped : str
+        Why it did not reach its end; empty if it did.
+    integrator : str
+    balance : dict
+        The whole run's energy balance, as in summary.json; empty where nothing ran.
+    busy : list of float
+        CPU time of each step [s], of the rank that took most.
+    last : (V, 3) array or None
+        Positions [m] after the last step, on rank 0; None if none were gathered, or they are freed.
+    triangles : (F, 3) array or None
+        On rank 0.
+    """
+
+    planned: int = 0
+    nominal: float = math.nan
+    end: float = math.nan
+    start_energy: float = math.nan
+    reports: list[StepReport] = field(default_factory=list)
+    balances: list[StepBalance] = field(default_factory=list)
+    energies: list[float] = field(default_factory=list)
+    observed: list[Any] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    stopped: str = ""
+    integrator: str = "beuler"
+    balance: dict[str, Any] = field(default_factory=dict)
+    busy: list[float] = field(default_factory=list)
+    last: NDArray[np.float64] | None = None
+    triangles: NDArray[np.int64] | None = None
+
+    @property
+    def newton(self) -> list[int]:
+        """Newton iterations of each step, those of its rejected attempts included."""
+        return [report.newton_iterations for report in self.reports]
+
+    @property
+    def linear(self) -> int:
+        """Linear iterations of all steps."""
+        return sum(report.linear_iterations for report in self.reports)
+
+    @property
+    def rejected(self) -> int:
+        """Attempts that failed, or were too inaccurate."""
+        return sum(report.rejected for report in self.reports)
+
+    @property
+    def smallest_step(self) -> float:
+        """Smallest Δt [s] of an accepted step; NaN without any."""
+        return min((report.dt for report in self.reports), default=math.nan)
+
+    @property
+    def stretches(self) -> tuple[float, float]:
+        """Smallest and largest principal stretch met; NaN without a step."""
+        if not self.reports:
+            return math.nan, math.nan
+        return (
+            min(report.smallest_stretch for report in self.reports),
+            max(report.largest_stretch for report in self.reports),
+        )
+
+    @property
+    def median_seconds(self) -> float:
+        """Median wall time of a step; NaN without any."""
+        return statistics.median(r.wall_seconds for r in self.reports) if self.reports else math.nan
+
+    @property
+    def median_busy(self) -> float:
+        """Median CPU time of a step; NaN without any."""
+        return statistics.median(self.busy) if self.busy else math.nan
+
+    @property
+    def median_newton(self) -> float:
+        """Median Newton iterations of a step; NaN without any."""
+        return float(statistics.median(self.newton)) if self.reports else math.nan
+
+    @property
+    def lost(self) -> float:
+        """Numerical dissipation over the largest energy at work; NaN without a step."""
+        return float(self.balance.get("numerical_dissipation", math.nan)) if self.reports else math.nan
+
+    @property
+    def times(self) -> list[float]:
+        """Times [s] at which steps ended."""
+        return [report.time for report in self.reports]
+
 
 RESOLVED = 0.1
 """Part of the forces that move a sheet, or of how far they do, below which the rest is negligible."""
@@ -189,7 +308,7 @@ def of_physics(record: Record) -> dict[str, Verdict]:
     return verdicts
 
 
-def _gain(balance: Balance) -> float:
+def _gain(balance: StepBalance) -> float:
     return balance.change - balance.work
 
 
@@ -200,7 +319,7 @@ def over(amount: float, tolerance: float) -> float:
     return amount / tolerance if tolerance > 0.0 else math.copysign(math.inf, amount) if amount else 0.0
 
 
-def _worst(record: Record, measure: Callable[[Balance], float]) -> tuple[int, Balance]:
+def _worst(record: Record, measure: Callable[[StepBalance], float]) -> tuple[int, StepBalance]:
     """Number, from 1, and balance of the step for which ``measure`` is largest."""
     number = max(range(len(record.balances)), key=lambda i: measure(record.balances[i]))
     return number + 1, record.balances[number]

@@ -1,28 +1,118 @@
-"""A study worked out before anything runs: combinations, their scenes, sample times, what is measured."""
+"""Quantities whose errors are measured: ``--quantities``.
+
+A study worked out before anything runs: combinations, their scenes, sample times, what is measured.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.axes import Axis, Value, parse_axes
-from lyra_petsc.experiments.study.combination import (
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.experiments.study.combinations import (
+    Axis,
     Combination,
+    Value,
     combinations,
     mesh_overrides,
     overrides,
+    parse_axes,
     scene_of,
 )
-from lyra_petsc.experiments.study.quantities import Quantity, chosen
-from lyra_petsc.experiments.study.request import Request
+from lyra_petsc.experiments.study.jobs import Request
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.numbers import seconds
+
+KINDS = ("position", "energy", "probes")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One error that is measured of each combination.
+
+    Attributes
+    ----------
+    name : str
+        ``position_max``, ``position_l2``, ``energy`` or ``probe_<name>``: columns are ``error_<name>``.
+    title : str
+        In words.
+    probe : str or None
+        The scene's probe it is about.
+    """
+
+    name: str
+    title: str
+    probe: str | None = None
+
+
+MEAN_SQUARE = "position_l2"
+"""Name of the quantity whose samples are combined by their mean square; of all others the largest counts."""
+
+POSITION = (
+    Quantity(MEAN_SQUARE, "L2 error in position / sheet size"),
+    Quantity("position_max", "largest error in position / sheet size"),
+)
+"""Root mean square over area and sample times; and the largest at any vertex and sample time."""
+
+ENERGY = Quantity("energy", "error in energy / largest energy exchanged")
+
+
+def probe_quantity(name: str) -> Quantity:
+    """The error of a probe's position."""
+    return Quantity(f"probe_{name}", f"error of probe '{name}' / sheet size", name)
+
+
+def chosen(text: str, probes: Iterable[str]) -> list[Quantity]:
+    """The quantities that ``--quantities`` names; all for an empty text.
+
+    Parameters
+    ----------
+    text : str
+        ``position``, ``energy``, ``probes`` (all of the scene's) or names of probes, separated by commas.
+    probes : iterable of str
+        The scene's.
+
+    Raises
+    ------
+    InputError
+        For an unknown one, one given twice, or probes where the scene has none.
+    """
+    names = list(probes)
+    key = "--quantities"
+    words = [word.strip() for word in text.split(",")] if text.strip() else []
+    if not words:
+        words = ["position", "energy", *(["probes"] if names else [])]
+    found: list[Quantity] = []
+    for word in words:
+        if not word:
+            raise InputError("has an empty name between its commas", key=key)
+        new = _of(word, names)
+        if any(quantity in found for quantity in new):
+            raise InputError(f"names '{word}' twice", key=key)
+        found += new
+    return found
+
+
+def _of(word: str, probes: Sequence[str]) -> list[Quantity]:
+    if word == "position":
+        return list(POSITION)
+    if word == "energy":
+        return [ENERGY]
+    if word == "probes":
+        if not probes:
+            raise InputError(
+                "the scene has no probes; add some, as in probes: {tip: {group: tip}}", key="--quantities"
+            )
+        return [probe_quantity(name) for name in probes]
+    if word in probes:
+        return [probe_quantity(word)]
+    raise InputError(f"unknown quantity '{word}', {nearest(word, [*KINDS, *probes])}", key="--quantities")
+
 
 LANDING = 1e-6
 """Fraction of Δt by which a multiple of it may miss a sample time."""

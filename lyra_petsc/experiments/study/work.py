@@ -1,44 +1,64 @@
-"""A study at work: runs what is not finished, compares all with the references."""
+"""A study at work: runs what is not finished, compares all with the references.
+
+A whole study: runs, comparisons, and what it leaves in its folder.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import math
+import os
+import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.analysis import Row, mark_unresolved
-from lyra_petsc.experiments.study.case import RESULT_FILE, Job, Result, fingerprint, read_result
-from lyra_petsc.experiments.study.combination import LEAN, Combination, scene_of
-from lyra_petsc.experiments.study.folder import CASES
-from lyra_petsc.experiments.study.measure import (
+from lyra_petsc.experiments.study.analysis import (
+    Advice,
+    StudyRow,
+    advise,
+    choose_recommended,
+    mark_front,
+    mark_unresolved,
+    observed_orders,
+)
+from lyra_petsc.experiments.study.combinations import LEAN, Combination, scene_of
+from lyra_petsc.experiments.study.comparison import (
     Errors,
     Party,
     against_motion,
     against_run,
     history_against_run,
+    read_samples,
 )
+from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, fingerprint, read_result
 from lyra_petsc.experiments.study.plan import Plan
-from lyra_petsc.experiments.study.reference import Chosen, Physics, physical_overrides, physics_of
-from lyra_petsc.experiments.study.refine import (
+from lyra_petsc.experiments.study.references import (
+    Chosen,
     Estimate,
-    Family,
-    Level,
+    Known,
+    Physics,
+    ReferenceRun,
+    ReferenceRuns,
     integrators,
     joined,
     make_family,
     of_chain,
+    physical_overrides,
+    physics_of,
     refines_time,
 )
-from lyra_petsc.experiments.study.samples import read_samples
+from lyra_petsc.experiments.study.study_report import content, main_axis, make_report, write_csv
+from lyra_petsc.extras import PACKAGES
+from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 
@@ -63,29 +83,6 @@ class Observer(Protocol):
 
     def note(self, text: str) -> None:
         """Something the user should know."""
-
-
-@dataclass
-class Known:
-    """A reference as it came out.
-
-    Attributes
-    ----------
-    kind : str
-        ``exact``, ``run``, ``finer`` or ``none``.
-    words : str
-    own : dict of str to Estimate
-        Own error by quantity; empty where it is unknown.
-    seconds : float
-        Wall time [s] of its steps, where it was run here.
-    notes : list of str
-    """
-
-    kind: str
-    words: str
-    own: dict[str, Estimate] = field(default_factory=dict)
-    seconds: float = math.nan
-    notes: list[str] = field(default_factory=list)
 
 
 class Work:
@@ -139,17 +136,19 @@ class Work:
 
     # -- runs --------------------------------------------------------------------------------------------
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[StudyRow]:
         """Run every combination that is not finished."""
-        return [Row(combination, self._combination(combination)) for combination in self.plan.combinations]
+        return [
+            StudyRow(combination, self._combination(combination)) for combination in self.plan.combinations
+        ]
 
     def _combination(self, combination: Combination) -> Result:
         request, words = self.plan.request, tuple(v for v in combination.values if isinstance(v, str))
         overrides = (*request.settings, *LEAN, *self.plan.overrides(combination))
-        level = Level(combination.name, combination.label, overrides, self._weight(combination))
+        level = ReferenceRun(combination.name, combination.label, overrides, self._weight(combination))
         return self._case(level, request.repeats, ("combination", *words))
 
-    def _case(self, level: Level, repeats: int, kind: tuple[object, ...]) -> Result:
+    def _case(self, level: ReferenceRun, repeats: int, kind: tuple[object, ...]) -> Result:
         """The result of a run, which is made unless a finished one is found.
 
         ``kind`` names the runs that use the same kernels: the first of each begins with a step to warm up.
@@ -163,7 +162,6 @@ class Work:
             return job, found, found is None and (folder / RESULT_FILE).exists()
 
         looked = on_root(self.comm, look)
-        assert looked is not None
         job, found, stale = looked
         self._observer.case(label, resumed=found is not None)
         if stale:
@@ -202,7 +200,7 @@ class Work:
 
     # -- comparisons -------------------------------------------------------------------------------------
 
-    def compare(self, rows: Sequence[Row]) -> dict[Physics, Known]:
+    def compare(self, rows: Sequence[StudyRow]) -> dict[Physics, Known]:
         """Errors of all rows that ran; the references behind them, which are run where needed."""
         known: dict[Physics, Known] = {}
         for physics, chosen in self.chosen.items():
@@ -216,7 +214,7 @@ class Work:
                 known[physics] = self._against_given(chosen, able)
         return known
 
-    def _against_given(self, chosen: Chosen, rows: Sequence[Row]) -> Known:
+    def _against_given(self, chosen: Chosen, rows: Sequence[StudyRow]) -> Known:
         found = Known(chosen.kind, chosen.words, notes=list(chosen.notes))
         quantities, motion = self.plan.quantities, chosen.motion
         if motion is not None:
@@ -229,7 +227,7 @@ class Work:
         self._fill(rows, found, lambda party: against_run(self.comm, party, other, quantities))
         return found
 
-    def _against_finer(self, physics: Physics, rows: Sequence[Row]) -> Known:
+    def _against_finer(self, physics: Physics, rows: Sequence[StudyRow]) -> Known:
         smallest = self._smallest(rows)
         notes = []
         for integrator in integrators(self.plan) if smallest is not None else [""]:
@@ -247,11 +245,11 @@ class Work:
         self._fill(rows, found, lambda mine: against_run(self.comm, mine, party, self.plan.quantities))
         return found
 
-    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> Family:
+    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> ReferenceRuns:
         given = [*self.plan.request.settings, *LEAN, *physical_overrides(self.plan, physics)]
         return make_family(self.plan, given, smallest, integrator)
 
-    def _smallest(self, rows: Sequence[Row]) -> float | None:
+    def _smallest(self, rows: Sequence[StudyRow]) -> float | None:
         """Smallest Δt [s] that is asked for, or that automatic steps took on average."""
         if not refines_time(self.plan):
             return None
@@ -263,7 +261,7 @@ class Work:
             steps = [float(base) if isinstance(base, int | float) else self.plan.end / AUTO_STEPS]
         return min(steps)
 
-    def _level(self, physics: Physics, level: Level) -> Result:
+    def _level(self, physics: Physics, level: ReferenceRun) -> Result:
         name = self._level_name(level.name, physics)
         if name not in self._levels:
             named = replace(level, name=name, label=f"reference: {level.label}")
@@ -274,14 +272,14 @@ class Work:
         number = f"-{list(self.chosen).index(physics) + 1}" if len(self.chosen) > 1 else ""
         return name + number
 
-    def _of_level(self, physics: Physics, level: Level) -> Party:
+    def _of_level(self, physics: Physics, level: ReferenceRun) -> Party:
         name = self._level_name(level.name, physics)
         return self._party(self.folder / CASES / name, self._levels[name].sheets)
 
     def _party(self, folder: Path, sheets: Sequence[int]) -> Party:
         return Party(read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every), sheets)
 
-    def _own(self, physics: Physics, family: Family, known: Known) -> dict[str, Estimate]:
+    def _own(self, physics: Physics, family: ReferenceRuns, known: Known) -> dict[str, Estimate]:
         """Own error of the reference from its chains."""
         estimates = []
         for chain in family.chains:
@@ -305,7 +303,7 @@ class Work:
             )
         return own
 
-    def _fill(self, rows: Sequence[Row], known: Known, errors_of: Callable[[Party], Errors]) -> None:
+    def _fill(self, rows: Sequence[StudyRow], known: Known, errors_of: Callable[[Party], Errors]) -> None:
         """Errors of the rows; one that misses a sample time has failed after all."""
         for row in rows:
             try:
@@ -316,3 +314,112 @@ class Work:
             row.errors = errors_of(party)
             row.own = {name: estimate.error for name, estimate in known.own.items()}
             mark_unresolved(row)
+
+
+@dataclass
+class StudyOutcome:
+    """What came of a study.
+
+    Attributes
+    ----------
+    rows : list of StudyRow
+    known : dict of physics → Known
+        References as they came out.
+    advice : dict of physics → list of Advice
+    reused : int
+        Cases that were found finished.
+    """
+
+    rows: list[StudyRow]
+    known: dict[Physics, Known]
+    advice: dict[Physics, list[Advice]] = field(default_factory=dict)
+    reused: int = 0
+
+    @property
+    def failed(self) -> list[StudyRow]:
+        """Rows without a result."""
+        return [row for row in self.rows if not row.result.done]
+
+
+def conduct(comm: MPI.Comm, work: Work, command: str) -> StudyOutcome:
+    """Run what is not finished, compare, and write tables, diagrams and reports; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    work : Work
+    command : str
+        That repeats the study.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if something cannot be written.
+    """
+    plan, folder = work.plan, work.folder
+    plan.notes += busy(plan.request.ranks or comm.size)
+    rows = work.rows()
+    known = work.compare(rows)
+    outcome = StudyOutcome(rows, known, reused=work.reused)
+    main = plan.quantities[0].name
+    for physics in known:
+        mine = [row for row in rows if physics_of(row.combination) == physics]
+        mark_front(mine, main)
+        outcome.advice[physics] = advise(mine, main, main_axis(plan.axes))
+        choose_recommended(outcome.advice[physics])
+    orders = observed_orders(rows, plan.axes, [quantity.name for quantity in plan.quantities])
+    facts: dict[str, Any] = {
+        "scene": plan.request.scene,
+        "title": plan.base.title,
+        "command": command,
+        "ranks": plan.request.ranks or comm.size,
+        "machine": machine(),
+        "versions": all_versions(),
+    }
+    on_root(comm, lambda: write_csv(folder, plan, rows))
+    write_summary(folder / "study.json", content(plan, rows, known, orders, outcome.advice, facts), comm)
+
+    def pages() -> None:
+        make_report(plan, rows, known, orders, outcome.advice, facts).write(folder)
+
+    on_root(comm, pages)
+    return outcome
+
+
+def all_versions() -> dict[str, str]:
+    """Versions of the program and all that takes part."""
+    found = versions()
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def busy(ranks: int) -> list[str]:
+    """A note where other processes leave too few cores of this machine idle for so many ranks."""
+    cores = os.cpu_count() or 1
+    try:
+        load = os.getloadavg()[0]
+    except OSError:
+        return []
+    if load + ranks <= cores + 0.5:
+        return []
+    return [
+        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
+        "run times may be larger and spread more than on an idle one"
+    ]
+
+
+def machine() -> str:
+    """Processor and cores, in words."""
+    model = platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                model = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    return f"{model}, {os.cpu_count() or 1} cores"

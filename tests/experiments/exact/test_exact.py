@@ -13,8 +13,7 @@ from physics import CLOTH, grid, scene_of
 from physics import Simulation as Stepping
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.exact.body import Body
-from lyra_petsc.experiments.exact.registry import SOLUTIONS, exact_motion, matching
+from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, exact_motion, matching
 
 pytest.importorskip("scipy")
 

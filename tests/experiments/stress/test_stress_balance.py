@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.stress.base import sheet
-from lyra_petsc.experiments.stress.case import Case, Level, Setting
-from lyra_petsc.experiments.stress.changes import as_it_is, blow, damp
-from lyra_petsc.experiments.stress.record import Record
-from lyra_petsc.experiments.stress.registry import selected
-from lyra_petsc.experiments.stress.runner import Outcome, run_case
+from lyra_petsc.experiments.stress.stress_scenes import (
+    Scope,
+    Setting,
+    StressCase,
+    as_it_is,
+    blow,
+    damp,
+    sheet,
+)
+from lyra_petsc.experiments.stress.trials import StressOutcome, run_case, selected
+from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 
@@ -22,11 +27,11 @@ Array = np.ndarray
 CELLS = 8
 
 
-def run(comm: MPI.Comm, *, steps: int = 4, **changes: Any) -> Outcome:
+def run(comm: MPI.Comm, *, steps: int = 4, **changes: Any) -> StressOutcome:
     """A small hanging sheet in a breeze, or what ``changes`` make of it."""
     content = blow(sheet(CELLS), 3.0) | changes
-    case = Case("try", "a try", as_it_is, steps=steps)
-    return run_case(comm, case, Setting(content, False, Level.QUICK))
+    case = StressCase("try", "a try", as_it_is, steps=steps)
+    return run_case(comm, case, Setting(content, False, Scope.QUICK))
 
 
 def handled(seconds: float) -> dict[str, Any]:
@@ -70,8 +75,8 @@ def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
 
 
 def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
-    [case] = selected(["pressed"], Level.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(10), False, Level.QUICK))
+    [case] = selected(["pressed"], Scope.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(10), False, Scope.QUICK))
     assert any(balance.jumped for balance in outcome.record.balances)
     assert "jumped" in outcome.verdicts["energy"].words
     assert outcome.failures == {}
@@ -89,8 +94,8 @@ def test_every_balance_holds_where_triangles_collapse(
         return real(self, x, *more)
 
     monkeypatch.setattr(Bending, "energies", energies)
-    [case] = selected(["wind-200"], Level.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(CELLS), False, Level.QUICK))
+    [case] = selected(["wind-200"], Scope.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(CELLS), False, Scope.QUICK))
     assert comm.allreduce(min(left), op=MPI.MIN) < 0.1
     assert outcome.failures == {}
 
@@ -160,15 +165,15 @@ def test_negative_damping_is_seen(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(Membrane, "__init__", init)
     content = damp(sheet(CELLS), 1e-3)
-    case = Case("try", "a try", as_it_is, steps=4)
-    outcome = run_case(comm, case, Setting(content, False, Level.QUICK))
+    case = StressCase("try", "a try", as_it_is, steps=4)
+    outcome = run_case(comm, case, Setting(content, False, Scope.QUICK))
     assert "no gain" in outcome.failures
 
 
-def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> Outcome:
+def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> StressOutcome:
     content = blow(sheet(CELLS), 3.0) | changes
     content["time"]["integrator"] = integrator
-    return run_case(comm, Case("a", "b", as_it_is, steps=4), Setting(content, True, Level.QUICK))
+    return run_case(comm, StressCase("a", "b", as_it_is, steps=4), Setting(content, True, Scope.QUICK))
 
 
 @pytest.mark.parallel
@@ -204,4 +209,4 @@ def test_the_semi_implicit_method_promises_no_balance(comm: MPI.Comm) -> None:
 
 
 def test_an_empty_record_is_no_success() -> None:
-    assert not Outcome(Case("a", "b", as_it_is), record=Record(1, 1.0, 1.0)).passed
+    assert not StressOutcome(StressCase("a", "b", as_it_is), record=Record(1, 1.0, 1.0)).passed

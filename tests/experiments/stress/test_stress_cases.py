@@ -11,11 +11,19 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.stress.base import setting_of, sheet
-from lyra_petsc.experiments.stress.case import Level, NotHere, Setting
-from lyra_petsc.experiments.stress.cases import chain, rigid_plate, start
-from lyra_petsc.experiments.stress.changes import anisotropic, blow, move, scale
-from lyra_petsc.experiments.stress.registry import FAMILIES, selected
+from lyra_petsc.experiments.stress.cases import chain, rigid_plate, shapes_and_handles
+from lyra_petsc.experiments.stress.stress_scenes import (
+    NotHere,
+    Scope,
+    Setting,
+    anisotropic,
+    blow,
+    move,
+    scale,
+    setting_of,
+    sheet,
+)
+from lyra_petsc.experiments.stress.trials import FAMILIES, selected
 from lyra_petsc.scene.schema import Scene
 
 CLOTH = """\
@@ -50,35 +58,35 @@ def test_names_are_unique_and_speak_for_themselves() -> None:
 
 def test_levels_include_each_other_and_every_family_is_in_the_usual_one() -> None:
     quick, usual, full = (
-        [case.name for case in selected([], level)] for level in (Level.QUICK, Level.USUAL, Level.FULL)
+        [case.name for case in selected([], level)] for level in (Scope.QUICK, Scope.USUAL, Scope.FULL)
     )
     assert set(quick) < set(usual) < set(full)
-    assert {case.family for case in selected([], Level.USUAL)} == set(FAMILIES.modules) - {"products"}
+    assert {case.family for case in selected([], Scope.USUAL)} == set(FAMILIES.modules) - {"products"}
 
 
 def test_a_case_is_found_by_name_at_any_level_and_a_family_by_level() -> None:
-    assert [case.name for case in selected(["plate-1e8-1e3-1ms"], Level.QUICK)] == ["plate-1e8-1e3-1ms"]
-    assert [case.name for case in selected(["wind"], Level.QUICK)] == ["wind-200"]
-    assert len(selected(["wind"], Level.USUAL)) == 2
+    assert [case.name for case in selected(["plate-1e8-1e3-1ms"], Scope.QUICK)] == ["plate-1e8-1e3-1ms"]
+    assert [case.name for case in selected(["wind"], Scope.QUICK)] == ["wind-200"]
+    assert len(selected(["wind"], Scope.USUAL)) == 2
 
 
 def test_a_family_without_a_case_at_the_level_is_refused() -> None:
     with pytest.raises(InputError, match="--full"):
-        selected(["products"], Level.QUICK)
+        selected(["products"], Scope.QUICK)
 
 
 @pytest.mark.parametrize("name", ["stiff-1e7-5ms", "winds"])
 def test_an_unknown_name_is_refused(name: str) -> None:
     with pytest.raises(InputError, match="did you mean"):
-        selected([name], Level.QUICK)
+        selected([name], Scope.QUICK)
 
 
 @pytest.mark.parametrize("given", [False, True])
 def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None:
-    setting = setting_of(scene if given else None, (), Level.QUICK)
+    setting = setting_of(scene if given else None, (), Scope.QUICK)
     made, left_out = 0, []
     with Bench(comm, exact=False) as bench:
-        for case in selected([], Level.FULL):
+        for case in selected([], Scope.FULL):
             try:
                 content = case.content(setting, bench)
             except NotHere:
@@ -89,13 +97,13 @@ def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None
             assert checked.solver == Scene.model_validate(setting.base).solver
             assert checked.petsc == {}
             made += 1
-    assert setting.base == setting_of(scene if given else None, (), Level.QUICK).base
+    assert setting.base == setting_of(scene if given else None, (), Scope.QUICK).base
     assert made > 200
     assert bool(left_out) is given
 
 
 def test_a_given_scene_keeps_what_it_is_made_of(scene: Path) -> None:
-    setting = setting_of(scene, ("gravity=[0, 0, -1]",), Level.QUICK)
+    setting = setting_of(scene, ("gravity=[0, 0, -1]",), Scope.QUICK)
     assert setting.base["gravity"] == [0, 0, -1]
     assert setting.step == 0.005
     assert not {"output", "probes"} & setting.base.keys()
@@ -108,11 +116,11 @@ def test_a_given_scene_keeps_what_it_is_made_of(scene: Path) -> None:
 def test_a_static_scene_is_refused(scene: Path) -> None:
     scene.write_text(CLOTH.replace("{end: 4, step: auto}", "{analysis: static}"), encoding="utf-8")
     with pytest.raises(InputError, match="analysis"):
-        setting_of(scene, (), Level.QUICK)
+        setting_of(scene, (), Scope.QUICK)
 
 
 def test_anisotropy_of_a_library_cloth(scene: Path) -> None:
-    setting = setting_of(scene, (), Level.QUICK)
+    setting = setting_of(scene, (), Scope.QUICK)
     for block in anisotropic(setting.content(), 1e4)["material"]:
         assert block["membrane"]["c11"] / block["membrane"]["c22"] == pytest.approx(1e4)
         assert block["membrane"]["c12"] == 0.0
@@ -145,7 +153,7 @@ def flat(n: int = 40) -> np.ndarray:
 
 def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
     x = flat()
-    y = start._crumpled(x, 0.025)
+    y = shapes_and_handles._crumpled(x, 0.025)
     assert np.ptp(y, axis=0).max() < 0.4
     assert np.ptp(y, axis=0).min() > 0.05
     # folds only ever shorten a way
@@ -158,27 +166,27 @@ def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
 
 
 def test_a_folded_sheet_lies_on_itself_with_its_crease_on_vertices() -> None:
-    y = start._folded(flat(), 0.025).reshape(41, 41, 3)
+    y = shapes_and_handles._folded(flat(), 0.025).reshape(41, 41, 3)
     np.testing.assert_allclose(y[:, 20, 0], 0.5)
     np.testing.assert_allclose(y[:, :20], y[:, :20:-1], atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(np.diff(y, axis=1), axis=2), 0.025)
 
 
 def test_a_fold_spares_an_odd_number_of_cells() -> None:
-    y = start._folded(flat(15), 1 / 15).reshape(16, 16, 3)
+    y = shapes_and_handles._folded(flat(15), 1 / 15).reshape(16, 16, 3)
     assert np.linalg.norm(np.diff(y, axis=1), axis=2).min() == pytest.approx(1 / 15)
 
 
 def test_noise_has_its_size_and_is_always_the_same() -> None:
     x = flat()
-    shift = start._noisy(x, 0.025) - x
+    shift = shapes_and_handles._noisy(x, 0.025) - x
     assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
-    np.testing.assert_array_equal(start._noisy(x, 0.025), x + shift)
+    np.testing.assert_array_equal(shapes_and_handles._noisy(x, 0.025), x + shift)
 
 
 def test_a_mirrored_shell_keeps_its_rim() -> None:
     x = np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.3]])
-    np.testing.assert_allclose(start._mirrored(x, 1.0)[:, 2], [0.1, -0.1])
+    np.testing.assert_allclose(shapes_and_handles._mirrored(x, 1.0)[:, 2], [0.1, -0.1])
 
 
 # -- known answers -------------------------------------------------------------------------------------
@@ -220,8 +228,8 @@ def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
 
 
 def test_the_base_sheet_is_of_the_size_that_is_promised() -> None:
-    grid = Scene.model_validate(setting_of(None, (), Level.USUAL).base).mesh[0].grid
+    grid = Scene.model_validate(setting_of(None, (), Scope.USUAL).base).mesh[0].grid
     assert grid is not None
     assert (grid.nx + 1) * (grid.ny + 1) == 1681
     assert grid.pattern == "alternating"
-    assert Setting(sheet(4), False, Level.QUICK).step == 0.005
+    assert Setting(sheet(4), False, Scope.QUICK).step == 0.005

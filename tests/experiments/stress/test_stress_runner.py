@@ -8,20 +8,23 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.stress import runner
-from lyra_petsc.experiments.stress.base import setting_of, sheet
-from lyra_petsc.experiments.stress.case import Case, Level, Setting
-from lyra_petsc.experiments.stress.changes import as_it_is
-from lyra_petsc.experiments.stress.launch import restore, save
-from lyra_petsc.experiments.stress.registry import selected
-from lyra_petsc.experiments.stress.runner import BaseClock, Outcome, run_case
-from lyra_petsc.experiments.stress.view import PICTURES, Stress, release_shapes, row_of
+from lyra_petsc.experiments.stress import trials
+from lyra_petsc.experiments.stress.stress_report import PICTURES, Stress, row_of
+from lyra_petsc.experiments.stress.stress_scenes import (
+    Scope,
+    Setting,
+    StressCase,
+    as_it_is,
+    setting_of,
+    sheet,
+)
+from lyra_petsc.experiments.stress.trials import BaseClock, StressOutcome, restore, run_case, save, selected
 
-SMALL = Setting(sheet(6), False, Level.QUICK)
+SMALL = Setting(sheet(6), False, Scope.QUICK)
 
 
-def run(comm: MPI.Comm, name: str) -> Outcome:
-    [case] = selected([name], Level.QUICK)
+def run(comm: MPI.Comm, name: str) -> StressOutcome:
+    [case] = selected([name], Scope.QUICK)
     return run_case(comm, case, SMALL)
 
 
@@ -38,7 +41,9 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
 
 @pytest.mark.parallel
 def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
-    case = Case("a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x)
+    case = StressCase(
+        "a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x
+    )
     record = run_case(comm, case, SMALL).record
     assert record.observed[0].min() == pytest.approx(record.observed[0][0, 0])
     assert np.ptp(record.observed[0], axis=0) == pytest.approx([0.5, 0.5, 0.0])
@@ -46,9 +51,9 @@ def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
 
 
 def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
-    outcomes = [run_case(comm, Case("a", "b", as_it_is, steps=1), SMALL) for _ in range(PICTURES + 2)]
+    outcomes = [run_case(comm, StressCase("a", "b", as_it_is, steps=1), SMALL) for _ in range(PICTURES + 2)]
     outcomes[-1].record.stopped = "at once"
-    release_shapes(outcomes)
+    Stress(SMALL, len(outcomes)).ended(outcomes)
     assert outcomes[-1].record.last is not None
     assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
 
@@ -56,7 +61,7 @@ def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
 @pytest.mark.parallel
 def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_max_it": 0}}
-    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert not outcome.passed
     assert "did not converge" in outcome.failures["converged"].words
     row = row_of(outcome)
@@ -68,7 +73,7 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
 @pytest.mark.parallel
 def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_atol": 1e9}}
-    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].words
 
 
@@ -77,7 +82,7 @@ def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) 
 def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
     content = sheet(6)
     content["material"]["stretching_scale"] = scale
-    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert outcome.passed
     assert min(report.newton_iterations for report in outcome.record.reports) > 1
 
@@ -86,20 +91,20 @@ def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
 def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
     content = sheet(6)
     content["handles"] = [{"group": "nowhere"}]
-    outcome = run_case(comm, Case("a", "b", as_it_is), Setting(content, False, Level.QUICK))
+    outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert "nowhere" in outcome.failures["converged"].words
 
 
 @pytest.mark.parallel
 def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(runner.LONGEST, Level.QUICK, 0.0)
-    outcome = run_case(comm, Case("a", "b", as_it_is), SMALL)
+    monkeypatch.setitem(trials.LONGEST, Scope.QUICK, 0.0)
+    outcome = run_case(comm, StressCase("a", "b", as_it_is), SMALL)
     assert "has had its time" in outcome.failures["converged"].words
 
 
 def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> None:
-    [case] = selected(["slivers"], Level.QUICK)
-    outcome = run_case(comm, case, Setting(sheet(4), True, Level.QUICK))
+    [case] = selected(["slivers"], Scope.QUICK)
+    outcome = run_case(comm, case, Setting(sheet(4), True, Scope.QUICK))
     assert outcome.left_out
     assert outcome.passed
     assert outcome.record.reports == []
@@ -110,7 +115,7 @@ def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
     clock = BaseClock(comm, SMALL)
     assert np.all(clock.latest > 0.0)
     assert clock.size == pytest.approx(np.sqrt(2.0))
-    outcome = run_case(comm, Case("same", "the base itself", as_it_is), SMALL, clock)
+    outcome = run_case(comm, StressCase("same", "the base itself", as_it_is), SMALL, clock)
     # about 1 on a machine that does nothing else
     assert 0.0 < outcome.ratio < 1e3
     assert 0.0 < outcome.busy_ratio < 1e3
@@ -138,7 +143,7 @@ def test_library_cloth_in_a_given_scene(comm: MPI.Comm, tmp_path: Path) -> None:
         "time: {end: 1, step: 0.01}\n",
         encoding="utf-8",
     )
-    setting = setting_of(path, (), Level.QUICK)
+    setting = setting_of(path, (), Scope.QUICK)
     for name in ("membrane-1e9", "bending-0", "stiff-warp", "wind-200", "jump", "folded"):
-        [case] = selected([name], Level.QUICK)
+        [case] = selected([name], Scope.QUICK)
         assert run_case(comm, case, setting).failures == {}, name

@@ -7,15 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from lyra_petsc.experiments.stress.balance import Balance
-from lyra_petsc.experiments.stress.case import Case
-from lyra_petsc.experiments.stress.changes import as_it_is
-from lyra_petsc.experiments.stress.record import Record
-from lyra_petsc.experiments.stress.runner import Outcome
-from lyra_petsc.experiments.stress.verdicts import of_physics, speed
+from lyra_petsc.experiments.stress.step_balance import StepBalance
+from lyra_petsc.experiments.stress.stress_scenes import StressCase, as_it_is
+from lyra_petsc.experiments.stress.trials import StressOutcome
+from lyra_petsc.experiments.stress.verdicts import Record, of_physics, speed
 from lyra_petsc.stepping.simulation import StepReport
 
-GOOD = Balance(
+GOOD = StepBalance(
     energy=1.0, change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
     tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, push=1e-3, momentum=1e-8,
     momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
@@ -24,7 +22,7 @@ STEP = StepReport(1, 0.01, 0.01, 5, 100, 0, 1e-6, 0.1, 0.9, 1.1)
 NOTE = "step 1: triangle 3 …; below 0.577 the St. Venant-Kirchhoff model softens"
 
 
-def record(balance: Balance = GOOD, report: StepReport = STEP, **more: object) -> Record:
+def record(balance: StepBalance = GOOD, report: StepReport = STEP, **more: object) -> Record:
     """Three steps, the middle one as given."""
     good = Record(3, 0.01, 0.03, 1.0, [STEP, report, STEP], [GOOD, balance, GOOD])
     return replace(good, **more)  # type: ignore[arg-type]
@@ -148,4 +146,4 @@ def test_the_whole_run_is_judged(integrator: str, lost: float, gained: float, go
     verdicts = of_physics(found)
     assert verdicts["whole run"].passed is good
     assert "2 attempts repeated" in verdicts["whole run"].words
-    assert Outcome(Case("a", "b", as_it_is), verdicts, record=found).verdict == word
+    assert StressOutcome(StressCase("a", "b", as_it_is), verdicts, record=found).verdict == word

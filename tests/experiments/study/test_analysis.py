@@ -7,12 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from lyra_petsc.experiments.study.advice import advise, choose_recommended
-from lyra_petsc.experiments.study.analysis import Row, mark_front, mark_unresolved, observed_orders
-from lyra_petsc.experiments.study.axes import Axis
-from lyra_petsc.experiments.study.case import Result, Timing
-from lyra_petsc.experiments.study.combination import combinations
-from lyra_petsc.experiments.study.refine import Chain, Estimate, joined, of_chain, richardson
+from lyra_petsc.experiments.study.analysis import (
+    StudyRow,
+    advise,
+    choose_recommended,
+    mark_front,
+    mark_unresolved,
+    observed_orders,
+)
+from lyra_petsc.experiments.study.combinations import Axis, combinations
+from lyra_petsc.experiments.study.jobs import Result, Timing
+from lyra_petsc.experiments.study.references import Chain, Estimate, joined, of_chain, richardson
 
 AXES = [
     Axis("integrator", "time.integrator", ("beuler", "bdf2")),
@@ -20,7 +25,7 @@ AXES = [
 ]
 
 
-def made_up(own: float = 0.0) -> list[Row]:
+def made_up(own: float = 0.0) -> list[StudyRow]:
     """Backward Euler errs by Δt, in 1 s/(100 Δt); BDF2 by 25 Δt², half as fast."""
     rows = []
     for combination in combinations(AXES):
@@ -30,7 +35,7 @@ def made_up(own: float = 0.0) -> list[Row]:
         seconds = (0.01 if first else 0.02) / dt
         timings = [Timing(0.5, seconds * factor) for factor in (1.0, 0.95, 1.3)]
         result = Result("", integrator=str(integrator), steps=round(1.0 / dt), end=1.0, timings=timings)
-        row = Row(combination, result, {"position_max": dt if first else 25.0 * dt * dt})
+        row = StudyRow(combination, result, {"position_max": dt if first else 25.0 * dt * dt})
         row.own = {"position_max": own}
         mark_unresolved(row)
         rows.append(row)

@@ -7,9 +7,8 @@ import re
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.axes import parse_axes
-from lyra_petsc.experiments.study.combination import combinations, described
-from lyra_petsc.experiments.study.quantities import chosen
+from lyra_petsc.experiments.study.combinations import combinations, described, parse_axes
+from lyra_petsc.experiments.study.plan import chosen
 
 MANY = ",".join(str(k + 1) for k in range(101))
 

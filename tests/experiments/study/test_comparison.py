@@ -13,12 +13,20 @@ from numpy.typing import NDArray
 from physics import grid, scene_of
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.exact.motion import Energies, Motion
-from lyra_petsc.experiments.study import samples as samples_module
-from lyra_petsc.experiments.study.measure import Party, against_motion, against_run
-from lyra_petsc.experiments.study.quantities import ENERGY, POSITION, probe_quantity
-from lyra_petsc.experiments.study.samples import Surface, read_here, read_samples, read_surface
-from lyra_petsc.experiments.study.transfer import barycentric, make_transfer
+from lyra_petsc.experiments.exact_motions import Energies, ExactMotion
+from lyra_petsc.experiments.study import comparison
+from lyra_petsc.experiments.study.comparison import (
+    Party,
+    RestSurface,
+    against_motion,
+    against_run,
+    barycentric,
+    make_transfer,
+    read_here,
+    read_samples,
+    read_surface,
+)
+from lyra_petsc.experiments.study.plan import ENERGY, POSITION, probe_quantity
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
 
@@ -88,7 +96,7 @@ def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
     assert against_run(comm, one, one, QUANTITIES) == dict.fromkeys(errors, 0.0)
 
 
-class Falling(Motion):
+class Falling(ExactMotion):
     """The motion of the first run."""
 
     def positions(self, start: Array, t: float) -> Array:
@@ -118,7 +126,7 @@ def linear(rest: Array, t: float) -> Array:
 def test_errors_across_meshes(
     shared_tmp: Path, comm: MPI.Comm, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(samples_module, "ROWS_AT_ONCE", rows_at_once)
+    monkeypatch.setattr(comparison, "ROWS_AT_ONCE", rows_at_once)
     folders = {"coarse": grid(0.3, 0.4, 3, 2), "fine": grid(0.3, 0.4, 7, 9, "criss-cross")}
     if comm.rank == 0:
         for name, source in folders.items():
@@ -137,8 +145,8 @@ def test_errors_across_meshes(
         assert errors["energy"] == 0.0
 
 
-def surface(mesh: Mesh) -> Surface:
-    return Surface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+def surface(mesh: Mesh) -> RestSurface:
+    return RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
 
 
 @pytest.mark.parallel
@@ -180,9 +188,9 @@ def test_other_meshes_are_told_apart(tmp_path: Path) -> None:
     one, two = surface(mesh_of(SHEET)), surface(mesh_of(grid(0.3, 0.4, 3, 4, "alternating")))
     assert one.same_as(one)
     assert not one.same_as(two)
-    moved = Surface(one.rest + [0, 0, 1e-12], one.triangles, one.areas)
+    moved = RestSurface(one.rest + [0, 0, 1e-12], one.triangles, one.areas)
     assert one.same_as(moved)
-    assert not one.same_as(Surface(one.rest * 1.001, one.triangles, one.areas))
+    assert not one.same_as(RestSurface(one.rest * 1.001, one.triangles, one.areas))
 
 
 def test_missing_samples_are_named(pair: tuple[Path, Path]) -> None:

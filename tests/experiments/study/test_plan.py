@@ -8,11 +8,16 @@ from typing import Any
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments import records
+from lyra_petsc.experiments.case import save_record
+from lyra_petsc.experiments.study.jobs import Request
 from lyra_petsc.experiments.study.plan import Plan, make_plan
-from lyra_petsc.experiments.study.reference import choose_references, physical_overrides, physics_of
-from lyra_petsc.experiments.study.refine import make_family, refines_time
-from lyra_petsc.experiments.study.request import Request
+from lyra_petsc.experiments.study.references import (
+    choose_references,
+    make_family,
+    physical_overrides,
+    physics_of,
+    refines_time,
+)
 from lyra_petsc.scene.schema import INTEGRATORS
 
 pytest.importorskip("scipy")
@@ -188,10 +193,10 @@ def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
 
 
 def test_requests_survive_their_file(tmp_path: Path) -> None:
-    from lyra_petsc.experiments.study.request import read_request
+    from lyra_petsc.experiments.study.jobs import read_request
 
     request = Request("a.yaml", ("time.end=1",), ("dt=0.1,0.2",), "auto", "position", 2, 4)
-    records.save(tmp_path / "request.json", request)
+    save_record(tmp_path / "request.json", request)
     assert read_request(tmp_path) == request
     (tmp_path / "request.json").write_text("[]", encoding="utf-8")
     with pytest.raises(InputError, match="is damaged"):
@@ -199,7 +204,7 @@ def test_requests_survive_their_file(tmp_path: Path) -> None:
 
 
 def test_a_busy_machine_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    from lyra_petsc.experiments.study import conduct
+    from lyra_petsc.experiments.study import work as conduct
 
     monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)
     monkeypatch.setattr(conduct.os, "getloadavg", lambda: (2.1, 0.0, 0.0))

@@ -8,7 +8,12 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.folder import Lock, choose_folder, clear
+from lyra_petsc.experiments.study.jobs import STUDY
+from lyra_petsc.output.run_folder import FolderChoice, RunDirectory, choose
+
+
+def chosen(stem: str, out: Path | None, *, force: bool = False, resume: bool = False) -> FolderChoice:
+    return choose(MPI.COMM_SELF, stem, out, force=force, resume=resume, kind=STUDY)
 
 
 @pytest.fixture(autouse=True)
@@ -24,15 +29,13 @@ def begun(path: Path) -> Path:
 
 
 def test_a_free_name_is_found(here: Path) -> None:
-    assert choose_folder("flag", None, force=False, resume=False).path == Path("studies/flag")
+    assert chosen("flag", None).path == Path("studies/flag")
     begun(here / "studies" / "flag")
-    choice = choose_folder("flag", None, force=False, resume=False)
+    choice = chosen("flag", None)
     assert choice.path == Path("studies/flag-2")
     begun(here / "studies" / "flag-2")  # taken between the choice and the lock
-    lock = Lock(MPI.COMM_SELF, choice)
-    assert lock.path == Path("studies/flag-3")
-    assert (lock.path / "cases").is_dir()
-    lock.release()
+    with RunDirectory(MPI.COMM_SELF, choice) as directory:
+        assert directory.path == Path("studies/flag-3")
 
 
 def test_the_newest_is_resumed(here: Path) -> None:
@@ -41,9 +44,9 @@ def test_the_newest_is_resumed(here: Path) -> None:
     for number, name in enumerate(("flag", "flag-2", "flag-b")):
         path = begun(here / "studies" / name) / "request.json"
         os.utime(path, (1000.0 + number, 1000.0 + number))
-    assert choose_folder("flag", None, force=False, resume=True).path == Path("studies/flag-2")
+    assert chosen("flag", None, resume=True).path == Path("studies/flag-2")
     with pytest.raises(InputError, match="no study of drape"):
-        choose_folder("drape", None, force=False, resume=True)
+        chosen("drape", None, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +57,7 @@ def test_the_newest_is_resumed(here: Path) -> None:
         ("file/below", {}, "is a file"),
         ("there", {}, "exists; name another folder"),
         ("there", {"resume": True}, "holds no study"),
-        ("nowhere", {"resume": True}, "holds no study"),
+        ("nowhere", {"resume": True}, "no study to resume"),
         ("there", {"resume": True, "force": True}, "give one of them"),
     ],
 )
@@ -62,7 +65,7 @@ def test_folders_that_cannot_be(here: Path, out: str, flags: dict[str, bool], wo
     (here / "file").write_text("")
     (here / "there").mkdir()
     with pytest.raises(InputError, match=words):
-        choose_folder("x", Path(out) if out else Path(" "), **({"force": False, "resume": False} | flags))
+        chosen("x", Path(out) if out else Path(" "), **flags)
 
 
 def test_force_removes_what_a_study_writes_and_nothing_else(here: Path) -> None:
@@ -72,15 +75,14 @@ def test_force_removes_what_a_study_writes_and_nothing_else(here: Path) -> None:
     (folder / "cases" / "beuler-dt0.1").mkdir(parents=True)
     for name in ("notes.txt", "photo.png", "report.docx"):
         (folder / name).write_text("")
-    clear(folder)
+    with RunDirectory(MPI.COMM_SELF, chosen("mine", folder, force=True)) as directory:
+        directory.clean()
     assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "photo.png", "report.docx"]
 
 
 def test_a_locked_folder_is_refused(here: Path) -> None:
-    choice = choose_folder("x", Path("out"), force=False, resume=False)
-    lock = Lock(MPI.COMM_SELF, choice)
-    begun_again = choose_folder("x", Path("out"), force=True, resume=False)
-    with pytest.raises(InputError, match="another study is at work"):
-        Lock(MPI.COMM_SELF, begun_again)
-    lock.release()
-    Lock(MPI.COMM_SELF, begun_again).release()
+    with RunDirectory(MPI.COMM_SELF, chosen("x", Path("out"))):
+        again = chosen("x", Path("out"), force=True)
+        with pytest.raises(InputError, match="another study is at work"):
+            RunDirectory(MPI.COMM_SELF, again)
+    RunDirectory(MPI.COMM_SELF, again).release()

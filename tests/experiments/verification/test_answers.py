@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
-from lyra_petsc.experiments.verification.bar_strip import arc
-from lyra_petsc.experiments.verification.case import data
+from lyra_petsc.experiments.verification.answers import data
 from lyra_petsc.experiments.verification.cases.hanging import middle
 from lyra_petsc.experiments.verification.cases.motions import level_fall
+from lyra_petsc.experiments.verification.strips import arc
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,13 +10,11 @@ from mpi4py import MPI
 from physics import reference
 
 from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import hinges
 from lyra_petsc.experiments.verification.cases.hinges import expected
-from lyra_petsc.experiments.verification.coupled_strip import heavy_coupled_strip
-from lyra_petsc.experiments.verification.elastica import cantilever, overhang_weight
-from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness
-from lyra_petsc.experiments.verification.periodic_cell import strip_stiffness
-from lyra_petsc.experiments.verification.runner import run_case
+from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness, strip_stiffness
+from lyra_petsc.experiments.verification.rods import cantilever, heavy_coupled_strip, overhang_weight
 from lyra_petsc.experiments.verification.strips import strip
 
 PUBLISHED = reference("cantilevers")

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.verification.registry import CASES
-from lyra_petsc.experiments.verification.runner import run_case
+from lyra_petsc.experiments.verification.answers import CASES, run_case
 
 SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
 """Cases that are run whatever is selected: each takes no more than a second or two."""

@@ -11,32 +11,33 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted, SolverError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.case import Case, Measured
-from lyra_petsc.experiments.verification.claims import (
+from lyra_petsc.experiments.verification.answers import (
+    CASES,
     Claim,
     Converges,
+    ErrorRow,
     Exact,
-    Row,
+    Measured,
+    VerificationCase,
     at_finest,
     observed_order,
+    run_case,
 )
-from lyra_petsc.experiments.verification.registry import CASES
-from lyra_petsc.experiments.verification.runner import run_case
 
 
-def row(n: float, error: float) -> Row:
-    return Row("q", "m", n, 1.0 / n, value=1.0 + error, exact=1.0, error=error)
+def row(n: float, error: float) -> ErrorRow:
+    return ErrorRow("q", "m", n, 1.0 / n, value=1.0 + error, exact=1.0, error=error)
 
 
-def table(*errors: float, first: float = 4.0) -> list[Row]:
-    rows: list[Row] = []
+def table(*errors: float, first: float = 4.0) -> list[ErrorRow]:
+    rows: list[ErrorRow] = []
     for k, error in enumerate(errors):
         new = row(first * 2.0**k, error)
         rows.append(dataclasses.replace(new, order=observed_order(rows[-1], new)) if rows else new)
     return rows
 
 
-def finest(rows: list[Row]) -> float:
+def finest(rows: list[ErrorRow]) -> float:
     return rows[-1].h
 
 
@@ -84,11 +85,11 @@ def test_errors_are_relative_to_their_scale() -> None:
     assert Measured("q", 1e-6, 0.0, "N", 10.0).error == pytest.approx(1e-7)
 
 
-def made(**changes: object) -> Case:
+def made(**changes: object) -> VerificationCase:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         return [Measured("a", 1.0 + n**-2, 1.0, "m"), Measured("b", 2.0, 2.0)]
 
-    case = Case(
+    case = VerificationCase(
         "made-up", "title", measure, "source", (4, 8, 16), Converges(2.0, 1e-2), claims={"b": Exact(1e-12)}
     )
     return dataclasses.replace(case, **changes)  # type: ignore[arg-type]
@@ -140,7 +141,7 @@ def test_a_request_to_stop_ends_the_case(comm: MPI.Comm) -> None:
         run_case(comm, CASES.load("free-fall"), watch=stop)
 
 
-def wrong_by(case: Case, fraction: float) -> Case:
+def wrong_by(case: VerificationCase, fraction: float) -> VerificationCase:
     """The case with every exact answer off by a fraction of its scale."""
 
     def measure(bench: Bench, n: float) -> Iterable[Measured]:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.stress.case import QUICK, USUAL, Case, Content, Setting, family
-from lyra_petsc.experiments.stress.record import Record
-from lyra_petsc.experiments.verification.bar_strip import LENGTH, WIDTH, G, hung
-from lyra_petsc.experiments.verification.case import isotropic
+from lyra_petsc.experiments.stress.stress_scenes import QUICK, USUAL, Content, Setting, StressCase, family
+from lyra_petsc.experiments.stress.verdicts import Record
+from lyra_petsc.experiments.verification.answers import isotropic
+from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
 
 Array = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ chain = family(
     "chain",
     "a strip between two supports against the chain that does not stretch",
     *(
-        Case(
+        StressCase(
             f"chain-{stiffness}",
             f"C {stiffness} N/m, swinging",
             partial(_strip, stiffness=float(stiffness)),

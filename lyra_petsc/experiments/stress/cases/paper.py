@@ -12,9 +12,17 @@ from collections.abc import Mapping
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.stress.case import FULL, USUAL, Case, Content, Level, Setting, family
-from lyra_petsc.experiments.stress.changes import scale
-from lyra_petsc.experiments.stress.record import Record
+from lyra_petsc.experiments.stress.stress_scenes import (
+    FULL,
+    USUAL,
+    Content,
+    Scope,
+    Setting,
+    StressCase,
+    family,
+    scale,
+)
+from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.dump import dump_scene
@@ -37,7 +45,6 @@ def _paper(bench: Bench, integrator: str) -> Content:
         return understood
 
     content = on_root(bench.comm, read)
-    assert content is not None
     content.pop("output")
     return content
 
@@ -54,7 +61,7 @@ def _soft(bench: Bench, integrator: str, step: float) -> float:
         return _kinetic(trial.run())
 
 
-def _case(step: float, level: Level) -> Case:
+def _case(step: float, level: Scope) -> StressCase:
     def judge(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
         error = abs(record.observed[-1] / KINETIC - 1.0)
         converged = _soft(bench, SHARPER, step / FINER)
@@ -66,7 +73,7 @@ def _case(step: float, level: Level) -> Case:
         )
         return {"kinetic energy": Verdict(error <= allowed, words)}
 
-    return Case(
+    return StressCase(
         f"paper-{step * 1e3:g}ms",
         f"the paper scene, Δt {step * 1e3:g} ms",
         lambda setting, bench: _paper(bench, "beuler"),

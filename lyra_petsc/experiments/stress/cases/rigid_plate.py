@@ -15,18 +15,18 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.stress.case import (
+from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
     USUAL,
-    Case,
     Content,
-    Level,
+    Scope,
     Setting,
+    StressCase,
     family,
 )
-from lyra_petsc.experiments.stress.record import Record
-from lyra_petsc.experiments.verification.case import isotropic
+from lyra_petsc.experiments.stress.verdicts import Record
+from lyra_petsc.experiments.verification.answers import isotropic
 
 LENGTH, G, DENSITY, CELLS = 1.0, 9.8, 0.15, 16
 """m, m/s², kg/m², cells along a side"""
@@ -75,8 +75,8 @@ def _falls(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdi
     return {"rigid plate": Verdict(least <= found <= most, words)}
 
 
-def _case(stiffness: str, bending: str, step: float, level: Level) -> Case:
-    return Case(
+def _case(stiffness: str, bending: str, step: float, level: Scope) -> StressCase:
+    return StressCase(
         f"plate-{stiffness}-{bending}-{step * 1e3:g}ms",
         f"C {stiffness} N/m, B {bending} N·m, Δt {step * 1e3:g} ms",
         partial(_plate, stiffness=float(stiffness), bending=float(bending)),

@@ -1,4 +1,7 @@
-"""The base scene with its stiffnesses, density, damping or Δt multiplied, one by one and all at once."""
+"""The base scene with its stiffnesses, density, damping or Δt multiplied, one by one and all at once.
+
+Gales, and a thousand times the weight.
+"""
 
 from __future__ import annotations
 
@@ -7,25 +10,32 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.stress.base import CELLS, sheet
-from lyra_petsc.experiments.stress.case import (
+from lyra_petsc.experiments.stress.stress_scenes import (
+    CELLS,
     FULL,
     QUICK,
     USUAL,
-    Case,
     Content,
-    Level,
+    Scope,
     Setting,
+    StressCase,
+    anisotropic,
+    as_it_is,
+    blow,
+    changed,
+    damp,
     family,
+    scale,
+    sheet,
+    weigh,
 )
-from lyra_petsc.experiments.stress.changes import anisotropic, as_it_is, changed, damp, scale
 
 
-def _times(what: str, parameter: str, levels: Mapping[str, Level]) -> Iterator[Case]:
+def _times(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
     """A case for each factor of a parameter of `scale`."""
     for factor, level in levels.items():
         scene = changed(scale, **{parameter: float(factor)})
-        yield Case(f"{what}-{factor}", f"{what} × {factor}", scene, level=level)
+        yield StressCase(f"{what}-{factor}", f"{what} × {factor}", scene, level=level)
 
 
 # the goal: stiff sheets at steps of milliseconds and tens of milliseconds, solved in few iterations
@@ -33,7 +43,7 @@ stiff_steps = family(
     "stiff-steps",
     "membrane stiffness and Δt together, with bounds on iterations and wall time",
     *(
-        Case(
+        StressCase(
             f"stiff-{factor}-{ms}ms", f"membrane × {factor}, Δt {ms} ms",
             changed(scale, stretching=float(factor)), step=1e-3 * ms, level=QUICK, swift=True,
         )
@@ -58,7 +68,7 @@ time_step = family(
     "time-step",
     "Δt from 1e-5 s to 1 s",
     *(
-        Case(f"step-{step}", f"Δt {step} s", as_it_is, steps=steps, step=float(step), level=level)
+        StressCase(f"step-{step}", f"Δt {step} s", as_it_is, steps=steps, step=float(step), level=level)
         for step, steps, level in (
             ("1e-5", 30, QUICK),
             ("1e-4", 30, USUAL),
@@ -83,15 +93,15 @@ density = family(
 anisotropy = family(
     "anisotropy",
     "c11/c22 = 1e4, their mean staying",
-    Case("stiff-warp", "c11/c22 = 1e4", changed(anisotropic, ratio=1e4), level=QUICK),
-    Case("stiff-weft", "c11/c22 = 1e-4", changed(anisotropic, ratio=1e-4)),
+    StressCase("stiff-warp", "c11/c22 = 1e4", changed(anisotropic, ratio=1e4), level=QUICK),
+    StressCase("stiff-weft", "c11/c22 = 1e-4", changed(anisotropic, ratio=1e-4)),
 )
 
 damping = family(
     "damping",
     "γ 0 and 10 s",
-    Case("damping-0", "no damping", changed(damp, seconds=0.0)),
-    Case("damping-10s", "damping γ = 10 s", changed(damp, seconds=10.0), level=QUICK),
+    StressCase("damping-0", "no damping", changed(damp, seconds=0.0)),
+    StressCase("damping-10s", "damping γ = 10 s", changed(damp, seconds=10.0), level=QUICK),
 )
 
 
@@ -107,7 +117,7 @@ products = family(
     "products",
     "stiffness × Δt × bending × density",
     *(
-        Case(
+        StressCase(
             f"all-{stretching}-{step}-{bending}-{density}",
             f"membrane × {stretching}, Δt {step} s, bending × {bending}, density × {density}",
             partial(_product, stretching=float(stretching), bending=float(bending), density=float(density)),
@@ -122,4 +132,18 @@ products = family(
             ("1e-3", "1", "1e3"),
         )
     ),
+)
+
+
+wind = family(
+    "wind",
+    "wind of 50 and 200 m/s",
+    StressCase("wind-50", "wind 50 m/s", changed(blow, speed=50.0)),
+    StressCase("wind-200", "wind 200 m/s", changed(blow, speed=200.0), level=QUICK),
+)
+
+gravity = family(
+    "gravity",
+    "gravity × 1000",
+    StressCase("gravity-1000", "gravity × 1000", changed(weigh, factor=1000.0), level=QUICK),
 )

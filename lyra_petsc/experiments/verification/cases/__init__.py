@@ -1,1 +1,1 @@
-"""The cases, by what they look at; `lyra_petsc.experiments.verification.registry` lists them by name."""
+"""The cases, by what they look at; `lyra_petsc.experiments.verification.answers` lists them by name."""

@@ -10,11 +10,22 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.case import Measured, case, isotropic
+from lyra_petsc.experiments.verification.answers import (
+    Claim,
+    Converges,
+    Exact,
+    Measured,
+    at_finest,
+    case,
+    isotropic,
+)
 from lyra_petsc.experiments.verification.cases.hinges import expected
-from lyra_petsc.experiments.verification.claims import Claim, Converges, Exact, at_finest
-from lyra_petsc.experiments.verification.coupled_strip import heavy_coupled_strip
-from lyra_petsc.experiments.verification.elastica import Cantilever, cantilever, overhang_weight
+from lyra_petsc.experiments.verification.rods import (
+    Cantilever,
+    cantilever,
+    heavy_coupled_strip,
+    overhang_weight,
+)
 from lyra_petsc.experiments.verification.strips import DENSITY, MEMBRANE, compared, strip, tip
 from lyra_petsc.parallel import on_root
 
@@ -156,7 +167,6 @@ def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
         with bench.simulation(scene) as trial:
             x, y, z = trial.run().x[[round(n), 2 * round(n) + 1]].mean(axis=0)
         exact = on_root(bench.comm, partial(heavy_coupled_strip, nominal, 1.0 / STIFF))
-        assert exact is not None
         reach, sideways, drop = exact
         way = float(np.hypot(1.0 - reach, np.hypot(sideways, drop)))
         words = f"Γ = {weight:g}"

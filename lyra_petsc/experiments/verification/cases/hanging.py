@@ -9,9 +9,16 @@ from typing import Any
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.bar_strip import LENGTH, WIDTH, G, hung
-from lyra_petsc.experiments.verification.case import Measured, case, data, farthest, isotropic
-from lyra_petsc.experiments.verification.claims import Converges, Exact
+from lyra_petsc.experiments.verification.answers import (
+    Converges,
+    Exact,
+    Measured,
+    case,
+    data,
+    farthest,
+    isotropic,
+)
+from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
 
 ALONG = "cells along the strip"
 

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.case import Measured, case, data
-from lyra_petsc.experiments.verification.claims import Converges, Exact
-from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness
-from lyra_petsc.experiments.verification.periodic_cell import sheet_stiffness, strip_stiffness
+from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data
+from lyra_petsc.experiments.verification.flat_sheet import (
+    hinge_blocks,
+    sheet_stiffness,
+    stiffness,
+    strip_stiffness,
+)
 from lyra_petsc.experiments.verification.strips import DENSITY, strip
 
 PATTERNS = ("diagonal", "alternating", "criss-cross")

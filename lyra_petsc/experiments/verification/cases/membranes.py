@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import quarter_disc, rectangle
-from lyra_petsc.experiments.verification.case import Measured, case, data, isotropic
-from lyra_petsc.experiments.verification.claims import Converges, Exact
+from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data, isotropic
 from lyra_petsc.experiments.verification.spectrum import lowest_modes
 
 G = 9.81

@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.case import Measured, case, data, farthest, isotropic
-from lyra_petsc.experiments.verification.claims import Converges, Exact
+from lyra_petsc.experiments.verification.answers import (
+    Converges,
+    Exact,
+    Measured,
+    case,
+    data,
+    farthest,
+    isotropic,
+)
 
 # -- falls -----------------------------------------------------------------------------------------------
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import irregular_rectangle
-from lyra_petsc.experiments.verification.case import Measured, case, data, farthest
-from lyra_petsc.experiments.verification.claims import Exact
+from lyra_petsc.experiments.verification.answers import Exact, Measured, case, data, farthest
 
 DATA = data("patch_states")
 WIDTH, HEIGHT = 1.0, 0.7

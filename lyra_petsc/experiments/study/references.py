@@ -1,4 +1,6 @@
-"""The reference where nothing is exact: which runs to make, finer than all that is studied.
+"""Which reference each physical scene of a study gets; decided before anything runs, on rank 0.
+
+The reference where nothing is exact: which runs to make, finer than all that is studied.
 
 A second-order integrator at a quarter of the smallest Δt, and solver tolerances of a hundredth of the
 tightest. Where element sizes vary, half the smallest; and where nothing of the time integration varies
@@ -11,15 +13,161 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
-from lyra_petsc.experiments.study.axes import Value
-from lyra_petsc.experiments.study.combination import mesh_overrides, overrides, time_overrides
-from lyra_petsc.experiments.study.measure import History, overall
-from lyra_petsc.experiments.study.plan import Plan
-from lyra_petsc.experiments.study.quantities import MEAN_SQUARE
+import numpy as np
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
+from lyra_petsc.experiments.study.combinations import (
+    Combination,
+    Value,
+    mesh_overrides,
+    overrides,
+    scene_of,
+    time_overrides,
+)
+from lyra_petsc.experiments.study.comparison import History, RestSurface, overall, read_here, read_surface
+from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Plan
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.report.numbers import seconds
+
+Physics = tuple[tuple[str, Value], ...]
+"""The settings that make a scene another one, in the axes' order."""
+
+NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
+"""Keys in which the scene of a run to compare with may differ without a note."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The reference of one physical scene.
+
+    Attributes
+    ----------
+    kind : str
+        ``exact``, ``run`` or ``finer``.
+    words : str
+        What it is; empty for ``finer`` until it is known which run it became.
+    motion : ExactMotion or None
+    folder : Path or None
+    notes : tuple of str
+    """
+
+    kind: str
+    words: str = ""
+    motion: ExactMotion | None = None
+    folder: Path | None = None
+    notes: tuple[str, ...] = ()
+
+
+def physics_of(combination: Combination) -> Physics:
+    """Key of the physical scene that a combination belongs to."""
+    return tuple(combination.physics.items())
+
+
+def physical_overrides(plan: Plan, physics: Physics) -> list[str]:
+    """What makes one physical scene of the study's scene, with what the whole study sets."""
+    axes = [axis for axis in plan.axes if axis.physical]
+    return [f"output.every={plan.every!r}", *overrides(plan.base, axes, [value for _, value in physics])]
+
+
+def choose_references(plan: Plan) -> dict[Physics, Chosen]:
+    """The reference of every physical scene of a study. For rank 0.
+
+    Raises
+    ------
+    InputError
+        Unknown reference, an exact solution that does not hold, a run that does not fit.
+    """
+    text = plan.request.reference
+    kind, colon, name = text.partition(":")
+    key = f"--reference {text}"
+    groups = list(dict.fromkeys(physics_of(combination) for combination in plan.combinations))
+    if kind == "auto" and not colon:
+        return {physics: _automatic(_scene(plan, physics)) for physics in groups}
+    if kind == "exact" and name:
+        found = {}
+        for physics in groups:
+            motion = exact_motion(name, Body(_scene(plan, physics)))
+            found[physics] = Chosen("exact", _exact_words(name), motion)
+        return found
+    if kind == "run" and name:
+        if len(groups) > 1:
+            listed = ", ".join(axis.key for axis in plan.axes if axis.physical)
+            raise InputError(
+                f"one run cannot be the reference of different scenes ({listed} varies)", key=key
+            )
+        return {groups[0]: _of_run(plan, Path(name), key)}
+    raise InputError("must be auto, exact:NAME or run:DIR", key=key)
+
+
+def _scene(plan: Plan, physics: Physics) -> Scene:
+    return scene_of(Path(plan.request.scene), plan.request.settings, physical_overrides(plan, physics))
+
+
+def _exact_words(name: str) -> str:
+    return f"exact: {name} ({SOLUTIONS[name].title})"
+
+
+def _automatic(scene: Scene) -> Chosen:
+    if scene.handles or scene.loads:
+        return Chosen("finer")  # no exact solution has any: the mesh need not be built to know
+    body = Body(scene)
+    solution = matching(body)
+    if solution is None:
+        return Chosen("finer")
+    return Chosen("exact", _exact_words(solution.name), solution.motion(body))
+
+
+def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
+    if not folder.is_dir():
+        raise InputError("no such folder", file=folder, key=key)
+    try:
+        samples = read_here(folder, plan.sample_times(), plan.every)
+        stored = read_surface(folder)
+    except InputError as error:
+        raise InputError(error.message, file=error.file, key=key) from None
+    axis = plan.axis("mesh")
+    for value in axis.values if axis is not None else [None]:
+        further = overrides(plan.base, [axis], [value]) if axis is not None and value is not None else []
+        scene = scene_of(Path(plan.request.scene), plan.request.settings, further)
+        mesh = build_mesh(scene.mesh, file=scene.source)
+        built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+        if not built.same_as(stored):
+            raise InputError(
+                f"is a run of another mesh ({len(stored.rest)} vertices, {len(stored.triangles)} triangles; "
+                f"the study's has {mesh.n_vertices} and {mesh.n_triangles}, or others)",
+                file=folder,
+                key=key,
+            )
+    lacking = [
+        quantity.probe
+        for quantity in plan.quantities
+        if quantity.probe is not None and quantity.probe not in samples.probes
+    ]
+    if lacking and plan.request.quantities:
+        raise InputError(f"has no probe '{lacking[0]}'", file=folder, key=key)
+    notes = [f"the reference run has no probe '{name}': its error is not told" for name in lacking]
+    return Chosen("run", f"run {folder}", folder=folder, notes=(*notes, *_differences(plan, folder)))
+
+
+def _differences(plan: Plan, folder: Path) -> Sequence[str]:
+    """What the scene of a run has that the study's has not, beside how it was solved."""
+    try:
+        other = load_scene(folder / "scene.yaml")
+    except InputError:
+        return ["the reference run's scene cannot be read, so it is unknown whether it is the same"]
+    keys = [
+        name
+        for name in type(plan.base).model_fields
+        if name not in NUMERICAL_BLOCKS and getattr(plan.base, name) != getattr(other, name)
+    ]
+    return [f"the reference run is of another scene: {', '.join(keys)} differ"] if keys else []
+
 
 FINER = 4
 """How many times smaller than the smallest Δt of the study the reference's is."""
@@ -40,7 +188,7 @@ SLOWEST = 0.5
 
 
 @dataclass(frozen=True)
-class Level:
+class ReferenceRun:
     """One run of the reference's family.
 
     Attributes
@@ -66,17 +214,17 @@ class Chain:
 
     Attributes
     ----------
-    levels : tuple of Level
+    levels : tuple of ReferenceRun
     order : int
         Expected; 0 where none is.
     """
 
-    levels: tuple[Level, ...]
+    levels: tuple[ReferenceRun, ...]
     order: int
 
 
 @dataclass
-class Family:
+class ReferenceRuns:
     """All runs of a reference.
 
     Attributes
@@ -88,17 +236,17 @@ class Family:
     chains: list[Chain]
 
     @property
-    def best(self) -> Level:
+    def best(self) -> ReferenceRun:
         """The reference."""
         return self.chains[0].levels[0]
 
     @property
-    def levels(self) -> list[Level]:
+    def levels(self) -> list[ReferenceRun]:
         """Each run once, cheapest last."""
         return list({level.name: level for chain in self.chains for level in chain.levels}.values())
 
 
-def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> Family:
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> ReferenceRuns:
     """The runs of the reference of one physical scene.
 
     Parameters
@@ -127,14 +275,14 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
 
     if smallest is None:
         if mesh is not None:
-            return Family([chain(2, *((h, None) for h in meshes))])
+            return ReferenceRuns([chain(2, *((h, None) for h in meshes))])
         tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
-        loose = Level("reference-loose", "tolerances ten times larger", tolerances)
-        return Family([Chain((*chain(0, (None, None)).levels, loose), 0)])
+        loose = ReferenceRun("reference-loose", "tolerances ten times larger", tolerances)
+        return ReferenceRuns([Chain((*chain(0, (None, None)).levels, loose), 0)])
     finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
     order = 2 if integrator in SECOND_ORDER else 1
     in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
-    return Family([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
+    return ReferenceRuns([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
 
 
 def refines_time(plan: Plan) -> bool:
@@ -151,7 +299,9 @@ def integrators(plan: Plan) -> list[str]:
     return [*sorted(SECOND_ORDER, key=lambda name: name != plan.base.time.integrator), "beuler"]
 
 
-def _level(base: Scene, common: list[str], h: float | None, step: float | None, integrator: str) -> Level:
+def _level(
+    base: Scene, common: list[str], h: float | None, step: float | None, integrator: str
+) -> ReferenceRun:
     further, words, name, weight = [], [], ["reference"], 1.0
     if step is not None:
         chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
@@ -164,7 +314,9 @@ def _level(base: Scene, common: list[str], h: float | None, step: float | None, 
         words.append(f"h {h:g} m")
         name.append(f"h{h:.6g}")
         weight *= h**-2
-    return Level("-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight)
+    return ReferenceRun(
+        "-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight
+    )
 
 
 def _tolerances(plan: Plan, tighter: float) -> list[str]:
@@ -201,6 +353,29 @@ class Estimate:
     error: float
     order: float
     trusted: bool
+
+
+@dataclass
+class Known:
+    """A reference as it came out.
+
+    Attributes
+    ----------
+    kind : str
+        ``exact``, ``run``, ``finer`` or ``none``.
+    words : str
+    own : dict of str to Estimate
+        Own error by quantity; empty where it is unknown.
+    seconds : float
+        Wall time [s] of its steps, where it was run here.
+    notes : list of str
+    """
+
+    kind: str
+    words: str
+    own: dict[str, Estimate] = field(default_factory=dict)
+    seconds: float = math.nan
+    notes: list[str] = field(default_factory=list)
 
 
 def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:

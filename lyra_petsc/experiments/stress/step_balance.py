@@ -1,4 +1,6 @@
-"""What one step of backward Euler did to energy and momenta, from its two states and the terms alone.
+"""Elastic forces along the straight way of a step: what they add up to, if they are an energy's.
+
+What one step of backward Euler did to energy and momenta, from its two states and the terms alone.
 
 The energy identity, with the masses M, the elastic energy E and x' − x = Δt v' =: Δx::
 
@@ -14,31 +16,132 @@ Every step leaves a residual r on the free coordinates, of which the solver prom
 forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may be
 off by no more than ‖r‖ ‖Δx‖ and the round-off of its own summands, and the balance of momentum by √V ‖r‖ Δt:
 these are the tolerances, none is chosen.
+
+What one step of an integrator other than backward Euler can be held to.
+
+Its stage solves M v̇ + ∇E + D v = f, and that is judged as for backward Euler: by what is left on the free
+coordinates, and by what the forces within the sheet add up to. There is no identity for its energies; but
+along the way of a step the elastic forces must add up to the change of the elastic energy.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.experiments.stress.path import EPSILON, Terms, energy, force_along, gradient
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.terms.bending import Bending
+from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import Role
-from lyra_petsc.terms.term import Step
+from lyra_petsc.terms.term import Elastic, Step
 
 Array = NDArray[np.float64]
+
+EPSILON = 10.0 * float(np.finfo(np.float64).eps)
+"""Relative round-off of a sum, as in `residual_roundoff`."""
+
+MOST_PANELS = 16
+"""Of the integral along the hinges' way."""
+
+SAMPLES, WIDEST_TURN = 9, 1.0
+"""Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
+passes 180° changes its energy without a force, one whose triangle is turned over in its plane loses it and
+has it back within a short way."""
+
+
+Terms = Mapping[Elastic, Any]
+"""Terms, and what each of them froze for the step."""
+
+
+def gradient(terms: Terms, x: Array) -> Array:
+    """Of the terms' energy at x (n_local, 3), [N]."""
+    out = np.zeros_like(x)
+    for term, frozen in terms.items():
+        term.add_gradient(x, frozen, out)
+    return out
+
+
+def energy(terms: Terms, x: Array) -> float:
+    """Of this rank's elements [J]."""
+    return sum(float(term.energies(x, frozen).sum()) for term, frozen in terms.items())
+
+
+def force_along(
+    comm: MPI.Comm, n: int, terms: Terms, x0: Array, dx: Array, *, enough: float
+) -> tuple[float, bool]:
+    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether hinges had their part taken from energies; collective.
+
+    Exact for the membrane, whose energy is a quartic along a line; refined until it stands for the rest.
+
+    Parameters
+    ----------
+    n : int
+        Owned vertices of this rank.
+    terms : mapping of Elastic to what it froze for the step
+    x0, dx : (n_local, 3)
+        Where the way begins, and the way [m].
+    enough : float
+        Error [J] that does not matter.
+    """
+    smooth: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
+    bent = {term: frozen for term, frozen in terms.items() if term not in smooth}
+
+    def integral(which: Terms, panels: int, points: int) -> float:
+        return float(comm.allreduce(_panels(which, n, x0, dx, panels, points)))
+
+    exact = integral(smooth, 1, 2)
+    if not comm.allreduce(len(bent)):
+        return exact, False
+    if comm.allreduce(_widest_turn(bent, x0, dx), op=MPI.MAX) < WIDEST_TURN:
+        panels, before = 1, integral(bent, 1, 5)
+        while panels < MOST_PANELS:
+            panels *= 2
+            now = integral(bent, panels, 5)
+            if abs(now - before) <= max(enough, EPSILON * abs(now)):
+                return exact + now, False
+            before = now
+    return exact + float(comm.allreduce(energy(bent, x0 + dx) - energy(bent, x0))), True
+
+
+def _panels(terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
+    """This rank's part of the integral by Gauss's rule on equal panels."""
+    if not terms:
+        return 0.0
+    nodes, weights = np.polynomial.legendre.leggauss(points)  # type: ignore[no-untyped-call]
+    value = 0.0
+    for panel in range(panels):
+        for node, weight in zip(nodes, weights, strict=True):
+            s = (panel + 0.5 * (1.0 + node)) / panels
+            value += 0.5 * weight * float(np.vdot(gradient(terms, x0 + s * dx)[:n], dx[:n]))
+    return value / panels
+
+
+def _widest_turn(terms: Terms, x0: Array, dx: Array) -> float:
+    """Largest change [rad] of a hinge's angle between two of `SAMPLES` points of the way."""
+    widest = 0.0
+    for term in terms:
+        if isinstance(term, Bending):
+            before = term.angles(x0)
+            for s in np.linspace(0.0, 1.0, SAMPLES)[1:]:
+                now = term.angles(x0 + s * dx)
+                widest = max(widest, float(np.abs(now - before).max(initial=0.0)))
+                before = now
+    return widest
+
 
 CHUNK = 4096
 """Elements whose Hessians are held at once."""
 
 
 @dataclass(frozen=True)
-class Balance:
+class StepBalance:
     """The balances of one step; J, N, kg m/s and kg m²/s, the same on every rank.
 
     Attributes
@@ -128,7 +231,7 @@ class Accountant:
         self._x, self._v = system.x.copy(), system.v.copy()
         self._energy = energy(self._shell, system.x)
 
-    def balance(self, report: StepReport) -> Balance:
+    def balance(self, report: StepReport) -> StepBalance:
         """The balance of the step just accepted, which started from the state looked at last."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
@@ -192,7 +295,7 @@ class Accountant:
         p, p_tol, spin, spin_tol = self._momenta(
             gap, gap + dt * (parts["damping"] - slowed), dt, residual + floor, forces, reach
         )
-        return Balance(
+        return StepBalance(
             energy=kinetic1 + stored + fallen1,
             change=change,
             numerical=numerical,
@@ -306,3 +409,69 @@ class Accountant:
             float(np.abs(sums[3:]).max()),
             float(angular),
         )
+
+
+class StageAccountant(Accountant):
+    """Takes what balances of each step there are; collective. See `Accountant`."""
+
+    def balance(self, report: StepReport) -> StepBalance:
+        """The balance of the step just accepted: ``change`` is that of the elastic energy, ``bracket`` the
+        integral of the elastic forces, and nothing is known of ``numerical``, ``viscous`` and ``work``."""
+        system, comm = self._system, self._system.points.comm
+        n, dt = system.points.n_owned, report.dt
+        x0, x1 = self._x, system.x
+        # targets that move stand where the step ends by now
+        self._prepare(system.t0 + system.stage.after)
+        parts = system.forces_at_stage()
+        self._prepare(system.t1)
+        total = np.asarray(sum(parts.values()))
+        gap = total - self._simulation.ledger.reaction
+        if not any(term.registration.moving for term in self._shell):
+            # clamps push from outside, and cannot be told from the sheet's own forces here
+            gap = gap - parts["internal"] - parts.get("damping", 0.0)
+        free = ~system.prescribed.mask[:n]
+        sums = comm.allreduce(
+            np.array(
+                [
+                    float(np.sum(total**2, where=free)),
+                    energy(self._shell, x1) - energy(self._shell, x0),
+                    self._energy_roundoff(x1) + self._energy_roundoff(x0),
+                    float(sum(np.abs(part).sum() for part in parts.values())),
+                    float(np.sum((x1 - x0)[:n] ** 2)),
+                    *gap.sum(axis=0),
+                ]
+            )
+        )
+        left, change, noise, forces, way = map(float, sums[:5])
+        reach = largest(comm, x1)
+        promised, floor, driving = self._promise(parts, reach)
+        residual = math.sqrt(left)
+        tolerance = EPSILON * (noise + forces * reach) + floor * math.sqrt(way)
+        along, jumped = force_along(comm, n, self._shell, x0, x1 - x0, enough=0.1 * tolerance)
+        count = system.points.n_global
+        return StepBalance(
+            energy=math.nan,
+            change=change,
+            numerical=0.0,
+            viscous=0.0,
+            bracket=along,
+            work=0.0,
+            defect=change - along,
+            tolerance=tolerance,
+            residual=residual,
+            promised=promised,
+            floor=floor,
+            driving=driving,
+            push=largest(comm, np.where(free, (x1 - x0 - dt * self._v)[:n], 0.0)),
+            momentum=dt * float(np.abs(sums[5:]).max()),
+            momentum_tolerance=dt * ((residual + floor) * math.sqrt(count) + EPSILON * forces),
+            spin=0.0,
+            spin_tolerance=0.0,
+            jumped=jumped,
+        )
+
+    def _prepare(self, at: float) -> None:
+        """Let moving targets stand where they are at time ``at`` [s] of the step."""
+        system = self._system
+        step = Step(system.t0, system.t1, at, system.x, system.reference.at)
+        system.frozen |= {term: term.freeze(step) for term in system.elastic}

@@ -7,9 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from lyra_petsc.experiments.results import View
-from lyra_petsc.experiments.verification.claims import Row
-from lyra_petsc.experiments.verification.runner import Outcome
+from lyra_petsc.experiments.results import Line, View, aligned
+from lyra_petsc.experiments.verification.answers import ErrorRow, VerificationOutcome
 from lyra_petsc.show.report.closing import PLOTS
 from lyra_petsc.show.report.document import Report
 from lyra_petsc.show.report.numbers import seconds
@@ -18,7 +17,7 @@ from lyra_petsc.show.report.plots import Series, convergence, work_precision
 HEADINGS = ("n", "h", "value", "exact", "error", "order", "steps", "run time [s]")
 
 
-def cells(row: Row) -> list[str]:
+def cells(row: ErrorRow) -> list[str]:
     """A row of a quantity's table, as it is shown."""
     return [
         f"{row.n:g}",
@@ -38,7 +37,7 @@ def headings(unit: str) -> list[str]:
     return [name + suffix if name in ("value", "exact") else name for name in HEADINGS]
 
 
-class Verification(View[Outcome]):
+class Verification(View[VerificationOutcome]):
     """Rows by case, quantity and resolution."""
 
     verb = "verify"
@@ -49,12 +48,30 @@ class Verification(View[Outcome]):
         "passed", "problem",
     )  # fmt: skip
 
-    def rows(self, outcome: Outcome) -> Iterable[Mapping[str, Any]]:
+    def lines(self, outcome: VerificationOutcome) -> Iterable[Line]:
+        case = outcome.case
+        yield f"{case.name}: {case.title}", "bold"
+        yield f"source: {case.source}; n: {case.counts}", ""
+        for quantity, rows in outcome.tables().items():
+            if not rows[0].problem:
+                yield f"  {quantity}", ""
+                table = [headings(rows[0].unit), *map(cells, rows)]
+                yield from ((line, "") for line in aligned(table, words=0))
+            verdict = outcome.verdicts[quantity]
+            word, style = ("passed", "") if verdict.passed else ("FAILED", "bold red")
+            yield f"  {word}: {verdict.words}", style
+        yield "", ""
+
+    def summary(self, outcomes: Sequence[VerificationOutcome]) -> list[Sequence[str]]:
+        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
+        return [("case", "verdict", "run time [s]"), *table]
+
+    def rows(self, outcome: VerificationOutcome) -> Iterable[Mapping[str, Any]]:
         for row in outcome.rows:
             passed = outcome.verdicts[row.quantity].passed
             yield asdict(row) | {"case": outcome.case.name, "passed": passed}
 
-    def told(self, outcome: Outcome) -> dict[str, Any]:
+    def told(self, outcome: VerificationOutcome) -> dict[str, Any]:
         return {
             "source": outcome.case.source,
             "counts": outcome.case.counts,
@@ -63,7 +80,9 @@ class Verification(View[Outcome]):
             "rows": [asdict(row) for row in outcome.rows],
         }
 
-    def page(self, report: Report, outcomes: Sequence[Outcome], summary: str, *, drawn: bool) -> None:
+    def page(
+        self, report: Report, outcomes: Sequence[VerificationOutcome], summary: str, *, drawn: bool
+    ) -> None:
         report.paragraph(
             f"{summary} The error is |value − exact| over the size of the exact value, or over a natural "
             "scale where that is zero; the order is that between a row and the one before; the run time of "
@@ -90,7 +109,7 @@ class Verification(View[Outcome]):
                 _figures(report, outcome)
 
 
-def _figures(report: Report, outcome: Outcome) -> None:
+def _figures(report: Report, outcome: VerificationOutcome) -> None:
     """Error against h and against run time, of the quantities that converge."""
     case = outcome.case
     tables = {

@@ -1,28 +1,35 @@
-"""Runs a case, takes the balance of every step, and judges."""
+"""Runs a case, takes the balance of every step, and judges.
+
+``--ranks P``: every case in an mpirun of its own.
+
+The families of cases, in the order in which ``stress`` runs them, and the modules that they are in.
+"""
 
 from __future__ import annotations
 
 import math
+import pickle
+import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments import case as experiments
+from lyra_petsc.api.mpirun import last_words
+from lyra_petsc.errors import InputError, SolverError, nearest
 from lyra_petsc.experiments.bench import Bench, Trial, problem_of
-from lyra_petsc.experiments.launch import Watch
-from lyra_petsc.experiments.stress.balance import Accountant
-from lyra_petsc.experiments.stress.case import Case, Level, NotHere, Setting
-from lyra_petsc.experiments.stress.record import Record
-from lyra_petsc.experiments.stress.stage import StageAccountant
-from lyra_petsc.experiments.stress.verdicts import LITTLE_LOST, of_physics, speed
+from lyra_petsc.experiments.case import Launcher, Outcome, Registry, Watch
+from lyra_petsc.experiments.stress.step_balance import Accountant, StageAccountant
+from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, NotHere, Scope, Setting, StressCase
+from lyra_petsc.experiments.stress.verdicts import LITTLE_LOST, Record, of_physics, speed
 
 Array = NDArray[np.float64]
 
-LONGEST = {Level.QUICK: 20.0, Level.USUAL: 60.0, Level.FULL: 600.0}
+LONGEST = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
 """Wall seconds [s] after which a case is ended between two steps."""
 
 BASE_STEPS = 20
@@ -30,7 +37,7 @@ BASE_STEPS = 20
 
 
 @dataclass
-class Outcome(experiments.Outcome[Case]):
+class StressOutcome(Outcome[StressCase]):
     """What came of a case.
 
     Attributes
@@ -101,17 +108,17 @@ class BaseClock:
 
 def run_case(
     comm: MPI.Comm,
-    case: Case,
+    case: StressCase,
     setting: Setting,
     clock: BaseClock | None = None,
     watch: Watch | None = None,
-) -> Outcome:
+) -> StressOutcome:
     """Run a case and judge it; collective, the same outcome on all ranks.
 
     Parameters
     ----------
     comm : MPI.Comm
-    case : Case
+    case : StressCase
     setting : Setting
     clock : BaseClock, optional
         What wall times are compared with; without, they are not.
@@ -125,7 +132,7 @@ def run_case(
     """
     began = time.perf_counter()
     before = clock.latest if clock is not None else None
-    outcome = Outcome(case, record=Record(case.steps))
+    outcome = StressOutcome(case, record=Record(case.steps))
     with Bench(comm, watch, exact=False) as bench:
         try:
             content = case.content(setting, bench)
@@ -153,7 +160,7 @@ def run_case(
     return outcome
 
 
-def _run(trial: Trial, case: Case, record: Record, deadline: float) -> None:
+def _run(trial: Trial, case: StressCase, record: Record, deadline: float) -> None:
     """Step to the end, or to the deadline, and note everything."""
     simulation = trial.simulation
     comm = simulation.comm
@@ -208,3 +215,98 @@ def _energy(trial: Trial) -> float:
     """Kinetic + potential [J]."""
     budget = trial.simulation.budget
     return budget.kinetic + budget.membrane + budget.bending + budget.potential
+
+
+OUTCOME_FILE = "outcome.pickle"
+
+
+def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: Watch) -> StressOutcome:
+    """What comes of a case in processes of its own.
+
+    Parameters
+    ----------
+    launcher : Launcher
+    case : StressCase
+    asked : sequence of str
+        Scene and options of ``stress`` that say what is run.
+    watch : callable
+        Called again and again; where it raises, the processes are ended.
+
+    Raises
+    ------
+    InputError
+        If the launched program refuses what it was asked for.
+    """
+    with tempfile.TemporaryDirectory(prefix="lyra-stress-") as folder:
+        code, heard = launcher([*asked, "--only", case.name, "--job", folder], watch)
+        outcome = restore(Path(folder), case)
+    if outcome is None:
+        if code == InputError.exit_code:
+            raise InputError(last_words(heard, code))
+        record = Record(case.steps, stopped=last_words(heard, code))
+        outcome = StressOutcome(case, of_physics(record), record=record)
+    return outcome
+
+
+def save(outcome: StressOutcome, folder: Path) -> None:
+    """Write an outcome, but for its case, for the process that has launched this one. On one rank."""
+    content = {name: value for name, value in vars(outcome).items() if name != "case"}
+    (folder / OUTCOME_FILE).write_bytes(pickle.dumps(content))
+
+
+def restore(folder: Path, case: StressCase) -> StressOutcome | None:
+    """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
+    try:
+        return StressOutcome(case, **pickle.loads((folder / OUTCOME_FILE).read_bytes()))
+    except (OSError, EOFError, pickle.UnpicklingError):
+        return None
+
+
+FAMILIES: Registry[CaseFamily] = Registry(
+    "lyra_petsc.experiments.stress.cases",
+    {
+        "stiff-steps": "scaled",
+        "membrane": "scaled",
+        "bending": "scaled",
+        "time-step": "scaled",
+        "density": "scaled",
+        "anisotropy": "scaled",
+        "damping": "scaled",
+        "wind": "scaled",
+        "gravity": "scaled",
+        "handles": "shapes_and_handles",
+        "start": "shapes_and_handles",
+        "elements": "shapes_and_handles",
+        "free": "shapes_and_handles",
+        "compression": "shapes_and_handles",
+        "rigid-plate": "rigid_plate",
+        "chain": "chain",
+        "paper": "paper",
+        "products": "scaled",
+    },
+)
+
+
+def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
+    """The cases of a level, or those of the families and cases named, of whatever level.
+
+    Raises
+    ------
+    InputError
+        For a name that is neither, with the nearest that is.
+    """
+    everything = [case for family in FAMILIES.all() for case in family.cases]
+    if not only:
+        return [case for case in everything if case.level <= level]
+    known = dict.fromkeys([*FAMILIES.modules, *(case.name for case in everything)])
+    for name in only:
+        if name not in known:
+            raise InputError(f"unknown case or family, {nearest(name, known)}; --list names all", key=name)
+    # a family brings those of its cases that the level has; a case that is named is run at any level
+    found = [
+        case for case in everything if case.name in only or (case.family in only and case.level <= level)
+    ]
+    for name in only:
+        if not any(name in (case.family, case.name) for case in found):
+            raise InputError("has cases only with --full", key=name)
+    return found

@@ -1,31 +1,191 @@
-"""report.html and report.md of a study, with its diagrams."""
+"""study.csv and study.json.
+
+report.html and report.md of a study, with its diagrams.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from lyra_petsc.experiments.study.advice import DEFAULT_TARGET, Advice, setting
-from lyra_petsc.experiments.study.analysis import Order, Row, extent, families
-from lyra_petsc.experiments.study.axes import Axis
-from lyra_petsc.experiments.study.combination import described
-from lyra_petsc.experiments.study.plan import Plan
-from lyra_petsc.experiments.study.quantities import Quantity
-from lyra_petsc.experiments.study.reference import Physics, physics_of
-from lyra_petsc.experiments.study.refine import SAFETY, refines_time
-from lyra_petsc.experiments.study.tables import PHASES
-from lyra_petsc.experiments.study.work import Known
+from lyra_petsc.experiments.results import csv_text
+from lyra_petsc.experiments.study.analysis import (
+    DEFAULT_TARGET,
+    Advice,
+    Order,
+    StudyRow,
+    extent,
+    families,
+    setting,
+)
+from lyra_petsc.experiments.study.combinations import Axis, described
+from lyra_petsc.experiments.study.plan import Plan, Quantity
+from lyra_petsc.experiments.study.references import SAFETY, Known, Physics, physics_of, refines_time
+from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.show.report.document import Drawing, Report
 from lyra_petsc.show.report.numbers import percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
+
+PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
+"""Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
+
+
+def order_axes(plan: Plan) -> list[str]:
+    """Keys of the axes along which orders are reported."""
+    return [axis.key for axis in plan.axes if axis.refines]
+
+
+def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
+    """A row of ``study.csv`` by its columns; None where there is nothing to tell."""
+    result, settings = row.result, row.combination.settings
+    names = [quantity.name for quantity in plan.quantities]
+    keys = {axis.path: axis.key for axis in plan.axes}
+    varied = [axis.key for axis in plan.axes if axis.path not in ("time.integrator", "time.step", "mesh")]
+
+    def spread(name: str, median: float, times: list[float]) -> dict[str, Any]:
+        fastest, slowest = min(times, default=None), max(times, default=None)
+        return _if(
+            result.done,
+            {f"{name}_seconds": median, f"{name}_seconds_min": fastest, f"{name}_seconds_max": slowest},
+        )
+
+    def tolerance(name: str) -> Any:
+        key = keys.get(f"solver.{name}")
+        return settings[key] if key else getattr(plan.base.solver, name)
+
+    phases = result.phase_seconds()
+    steps = {
+        "steps": result.steps,
+        "rejected": result.rejected,
+        "newton_iterations": result.newton_iterations,
+        "linear_iterations": result.linear_iterations,
+    }
+    lengths = {"dt_mean": result.mean_step, "dt_min": result.shortest, "dt_max": result.longest}
+    mesh = {"h": result.spacing, "vertices": result.vertices, "triangles": result.triangles}
+    axes = order_axes(plan)
+    return {
+        "combination": row.combination.name,
+        "status": "done" if result.done else "failed",
+        "reason": result.problem,
+        "integrator": row.line,
+        "dt": _nominal_step(plan, row),
+        **_if(result.done, lengths),
+        "mesh": settings.get(keys.get("mesh", "")),
+        **_if(result.vertices > 0, mesh),
+        **{key: settings[key] for key in varied},
+        "force_tolerance": tolerance("force_tolerance"),
+        "step_tolerance": tolerance("step_tolerance"),
+        "linear_solver": result.linear_solver,
+        **{f"error_{name}": _told(row.shown(name)) for name in names},
+        **{f"reference_error_{name}": _told(row.own.get(name, math.nan)) for name in names},
+        "not_resolved": " ".join(sorted(row.unresolved)),
+        **{f"order_{axis}_{name}": row.orders.get((axis, name)) for axis in axes for name in names},
+        "repeats": len(result.timings),
+        "ranks": result.ranks,
+        **spread("run", row.run, result.run_seconds()),
+        **spread("total", row.total, result.total_seconds()),
+        **_if(result.done, {f"seconds_{phase}": phases.get(phase, 0.0) for phase in PHASES}),
+        **_if(result.done, steps),
+        "pareto": row.on_front,
+        "recommended": row.recommended,
+    }
+
+
+def _if(there: bool, values: dict[str, Any]) -> dict[str, Any]:
+    """The values, or None for each."""
+    return values if there else dict.fromkeys(values)
+
+
+def _nominal_step(plan: Plan, row: StudyRow) -> float | str | None:
+    for axis, value in zip(row.combination.axes, row.combination.values, strict=True):
+        if axis.path == "time.step":
+            return value
+        if axis.path == "time.tolerance":
+            return "auto"
+    return plan.base.time.step
+
+
+def _told(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def write_csv(folder: Path, plan: Plan, rows: Sequence[StudyRow]) -> None:
+    """Write ``study.csv``. Call on one rank."""
+    rows_told = [record(plan, row) for row in rows]
+    replace_text(folder / "study.csv", csv_text(list(rows_told[0]), rows_told, _cell))
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return repr(float(value)) if isinstance(value, float) else str(value)
+
+
+def content(
+    plan: Plan,
+    rows: Sequence[StudyRow],
+    known: Mapping[Physics, Known],
+    orders: Sequence[Order],
+    advice: Mapping[Physics, Sequence[Advice]],
+    facts: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What ``study.json`` holds: all of the table, the repeats, the references, orders and advice."""
+    return {
+        **facts,
+        "request": asdict(plan.request),
+        "axes": {axis.key: list(axis.values) for axis in plan.axes},
+        "quantities": {quantity.name: quantity.title for quantity in plan.quantities},
+        "sample_times": plan.sample_times(),
+        "notes": plan.notes,
+        "references": [
+            {
+                "scene": dict(physics),
+                "kind": one.kind,
+                "reference": one.words,
+                "run_seconds": one.seconds,
+                "own_error": {
+                    name: {"error": own.error, "observed_order": own.order, "trusted": own.trusted}
+                    for name, own in one.own.items()
+                },
+                "notes": one.notes,
+            }
+            for physics, one in known.items()
+        ],
+        "combinations": [
+            {
+                **{key: value for key, value in record(plan, row).items() if value not in ("", None)},
+                "errors": {name: row.shown(name) for name in row.errors},
+                "not_resolved": sorted(row.unresolved),
+                "timings": [asdict(timing) for timing in row.result.timings],
+                "notes": row.result.notes,
+            }
+            for row in rows
+        ],
+        "orders": [asdict(order) for order in orders],
+        "advice": [
+            {
+                "scene": dict(physics),
+                "accuracy": one.target,
+                "combination": one.row.combination.name if one.row is not None else None,
+                "words": one.words,
+            }
+            for physics, list_ in advice.items()
+            for one in list_
+        ],
+    }
+
 
 BELOW = "below what the reference can tell"
 
 
 def make_report(
     plan: Plan,
-    rows: Sequence[Row],
+    rows: Sequence[StudyRow],
     known: Mapping[Physics, Known],
     orders: Sequence[Order],
     advice: Mapping[Physics, Sequence[Advice]],
@@ -93,7 +253,7 @@ def _left_out(plan: Plan, known: Known) -> str:
     return "The errors are those of the mesh and of all else that is solved."
 
 
-def _what(plan: Plan, rows: Sequence[Row], facts: Mapping[str, Any]) -> list[str]:
+def _what(plan: Plan, rows: Sequence[StudyRow], facts: Mapping[str, Any]) -> list[str]:
     done = [row for row in rows if row.result.done]
     values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
     varied = "; ".join(f"{key} = {', '.join(told)}" for key, told in values.items())
@@ -115,7 +275,7 @@ def _what(plan: Plan, rows: Sequence[Row], facts: Mapping[str, Any]) -> list[str
 # -- tables --------------------------------------------------------------------------------------------
 
 
-def _tables(report: Report, plan: Plan, rows: Sequence[Row]) -> None:
+def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     names = [quantity.name for quantity in plan.quantities]
     head = ["setting", *(_short_title(quantity) for quantity in plan.quantities)]
     head += ["run time", "fastest – slowest", "with set-up", "steps", "rejected", "Newton", "linear"]
@@ -152,7 +312,7 @@ def _short_title(quantity: Quantity) -> str:
     return "error in " + words.get(quantity.name, quantity.name.replace("_", " ", 1))
 
 
-def _error(row: Row, name: str) -> str:
+def _error(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
         return f"< {short(SAFETY * row.own[name])}"
     value = row.errors.get(name, math.nan)
@@ -201,7 +361,7 @@ def main_axis(axes: Sequence[Axis]) -> Axis | None:
     return min(able, key=lambda axis: order.index(axis.path) if axis.path in order else 3, default=None)
 
 
-def drawings(plan: Plan, rows: Sequence[Row], known: Known, mark: str) -> list[Drawing]:
+def drawings(plan: Plan, rows: Sequence[StudyRow], known: Known, mark: str) -> list[Drawing]:
     """Work-precision diagrams of every quantity, then convergence along every numeric axis."""
     found = []
     axis = main_axis(plan.axes)
@@ -220,7 +380,7 @@ def _floor(known: Known, quantity: Quantity) -> float | None:
 
 
 def _work(
-    plan: Plan, rows: Sequence[Row], known: Known, quantity: Quantity, axis: Axis | None, mark: str
+    plan: Plan, rows: Sequence[StudyRow], known: Known, quantity: Quantity, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
     lines = [
@@ -258,14 +418,14 @@ def _work(
     )
 
 
-def _point(row: Row, axis: Axis | None) -> str:
+def _point(row: StudyRow, axis: Axis | None) -> str:
     if axis is None:
         return ""
     return described(axis.key, row.combination.settings[axis.key]).removeprefix(axis.key).strip()
 
 
 def _convergence(
-    rows: Sequence[Row], known: Known, quantity: Quantity, axis: Axis, mark: str
+    rows: Sequence[StudyRow], known: Known, quantity: Quantity, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
         Series(label, [extent(row, axis) for row in group], [row.shown(quantity.name) for row in group])

@@ -7,10 +7,9 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lyra_petsc.experiments.results import View
-from lyra_petsc.experiments.stress.case import Case, Setting
-from lyra_petsc.experiments.stress.changes import as_it_is
-from lyra_petsc.experiments.stress.runner import Outcome
+from lyra_petsc.experiments.results import Line, View
+from lyra_petsc.experiments.stress.stress_scenes import Setting, StressCase, as_it_is
+from lyra_petsc.experiments.stress.trials import StressOutcome
 from lyra_petsc.experiments.stress.verdicts import over
 from lyra_petsc.show.report.closing import PLOTS
 from lyra_petsc.show.report.document import Report
@@ -27,7 +26,7 @@ HEADINGS = {
 """Heads of the table's columns, and how wide each is at least."""
 
 
-def row_of(outcome: Outcome) -> dict[str, Any]:
+def row_of(outcome: StressOutcome) -> dict[str, Any]:
     """The line of a case in the CSV; energies in J, times in s, NaN where there is nothing to tell."""
     record = outcome.record
     balances = record.balances
@@ -65,7 +64,7 @@ def row_of(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def cells(outcome: Outcome) -> list[str]:
+def cells(outcome: StressOutcome) -> list[str]:
     """A case's line of the table, by `HEADINGS`."""
     row = row_of(outcome)
     return [
@@ -85,7 +84,7 @@ def cells(outcome: Outcome) -> list[str]:
     ]
 
 
-class Stress(View[Outcome]):
+class Stress(View[StressOutcome]):
     """A line for each case.
 
     Parameters
@@ -98,15 +97,40 @@ class Stress(View[Outcome]):
     verb = "stress"
     title = "Stress: stiff and extreme cases"
     pictures = "pictures"
-    columns = tuple(row_of(Outcome(Case("", "", as_it_is))))
+    columns = tuple(row_of(StressOutcome(StressCase("", "", as_it_is))))
 
     def __init__(self, setting: Setting, count: int) -> None:
         self._setting, self._count = setting, count
 
-    def rows(self, outcome: Outcome) -> Iterable[Mapping[str, Any]]:
+    def heading(self) -> str:
+        return _padded(list(HEADINGS))
+
+    def lines(self, outcome: StressOutcome) -> Iterable[Line]:
+        if outcome.left_out:
+            yield f"{outcome.case.name}: left out: {outcome.left_out}", "dim"
+            return
+        yield _padded(cells(outcome)), "" if outcome.passed else "bold red"
+        for name, verdict in outcome.failures.items():
+            yield f"    {name}: {verdict.words}", "red"
+
+    def summary(self, outcomes: Sequence[StressOutcome]) -> list[Sequence[str]]:
+        table: list[Sequence[str]] = [("family", "passed", "run time [s]")]
+        run = [outcome for outcome in outcomes if not outcome.left_out]
+        for family in dict.fromkeys(outcome.case.family for outcome in run):
+            mine = [outcome for outcome in run if outcome.case.family == family]
+            passed = f"{sum(outcome.passed for outcome in mine)} of {len(mine)}"
+            table.append((family, passed, f"{sum(outcome.seconds for outcome in mine):.1f}"))
+        return table
+
+    def ended(self, outcomes: Sequence[StressOutcome]) -> None:
+        """Free the shapes that the page will not show, since there are worse cases."""
+        for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
+            outcome.record.last = outcome.record.triangles = None
+
+    def rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
         yield row_of(outcome)
 
-    def told(self, outcome: Outcome) -> dict[str, Any]:
+    def told(self, outcome: StressOutcome) -> dict[str, Any]:
         record = outcome.record
         return row_of(outcome) | {
             "notes": record.notes,
@@ -115,11 +139,11 @@ class Stress(View[Outcome]):
             "energies": [record.start_energy, *record.energies],
         }
 
-    def facts(self, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    def facts(self, outcomes: Sequence[StressOutcome]) -> dict[str, Any]:
         left_out = {outcome.case.name: outcome.left_out for outcome in outcomes if outcome.left_out}
         return {"complete": len(outcomes) == self._count, "left_out": left_out}
 
-    def page(self, report: Report, outcomes: Sequence[Outcome], summary: str, *, drawn: bool) -> None:
+    def page(self, report: Report, outcomes: Sequence[StressOutcome], summary: str, *, drawn: bool) -> None:
         run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=badness, reverse=True)
         base = self._setting.base.get("title") or "without a title"
         report.paragraph(
@@ -161,7 +185,7 @@ class Stress(View[Outcome]):
             report.bullets(left_out)
 
 
-def badness(outcome: Outcome) -> tuple[float, ...]:
+def badness(outcome: StressOutcome) -> tuple[float, ...]:
     """Cases that failed first, then those with the most trouble."""
     record = outcome.record
     return (
@@ -172,13 +196,13 @@ def badness(outcome: Outcome) -> tuple[float, ...]:
     )
 
 
-def release_shapes(outcomes: Sequence[Outcome]) -> None:
-    """Free the shapes that the page will not show, since there are worse cases."""
-    for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
-        outcome.record.last = outcome.record.triangles = None
+def _padded(texts: Sequence[str]) -> str:
+    widths = [max(len(name), least) for name, least in HEADINGS.items()]
+    first, *others = zip(texts, widths, strict=True)
+    return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
 
 
-def _figures(report: Report, outcome: Outcome) -> None:
+def _figures(report: Report, outcome: StressOutcome) -> None:
     """The last shape, and the energy over time beside the work done."""
     case, record = outcome.case, outcome.record
     if record.last is not None and record.triangles is not None:

@@ -1,0 +1,453 @@
+"""What an exact solution gives: positions and energies at any time.
+
+A scene with its mesh and masses, whole, on rank 0: what exact solutions check their assumptions on.
+
+Sheets that fall as a whole: freely, flat in still air, edge-on in still air.
+
+With lumped masses (a third of each triangle's mass to each corner) and nodal wind forces (a third of
+each triangle's force to each corner), gravity and drag of a uniform flat sheet accelerate every vertex
+alike, on any mesh. The sheet stays undeformed, and the motion solves the spatially discrete equations
+exactly.
+
+One equilateral triangle that breathes: a large, nonlinear oscillation in closed form.
+
+With circumradius R, areal density ρ and c11 = c22, a start stretched by λ₀ in all directions stays
+equilateral; the strain is (λ² − 1)/2 in every direction, the energy A (c11 + c12)(λ² − 1)²/4, the
+kinetic energy ρ A R² λ'²/2 with lumped masses, hence (Duffing)::
+
+    λ'' = −k (λ³ − λ),   k = (c11 + c12) / (ρ R²)
+    λ = a dn(a √(k/2) t, m),   m = 2 − 2/a²,   a the largest stretch, 1 < a < √2
+
+(dn: Jacobi's elliptic function; DLMF 22.13.15). Released at its smallest stretch it starts half a
+period later.
+
+Exact solutions by name; one line each.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.registry import active
+from lyra_petsc.terms.rest import RestShape
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Energies [J] at one time, as in ``history.csv``."""
+
+    kinetic: float
+    membrane: float
+    potential: float
+
+
+class ExactMotion(ABC):
+    """A motion that maps start positions affinely, so that means of vertices follow it too."""
+
+    @abstractmethod
+    def positions(self, start: Array, t: float) -> Array:
+        """Positions (n, 3) [m] at t [s] of points that start at ``start`` (n, 3) [m]."""
+
+    @abstractmethod
+    def energies(self, t: float) -> Energies:
+        """Energies of the whole scene at t [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Translation(ExactMotion):
+    """Every point moves alike, under uniform gravity.
+
+    Attributes
+    ----------
+    mass : float [kg]
+    gravity : (3,) [m/s²]
+    potential : float [J]
+        −Σ m g·x at t = 0.
+    path : callable t [s] → displacement (3,) [m], velocity (3,) [m/s]
+    """
+
+    mass: float
+    gravity: Array
+    potential: float
+    path: Callable[[float], tuple[Array, Array]]
+
+    def positions(self, start: Array, t: float) -> Array:
+        """Start positions plus the displacement."""
+        return np.asarray(start + self.path(t)[0])
+
+    def energies(self, t: float) -> Energies:
+        """½ m v² and the potential of gravity."""
+        displacement, v = self.path(t)
+        fallen = float(np.dot(self.gravity, displacement))
+        return Energies(0.5 * self.mass * float(v @ v), 0.0, self.potential - self.mass * fallen)
+
+
+SAME = 1e-9
+"""Relative difference up to which lengths and directions count as equal."""
+
+
+class Body:
+    """A scene's mesh, materials and masses.
+
+    Parameters
+    ----------
+    scene : Scene
+    mesh : Mesh, optional
+        Built from the scene unless given.
+
+    Raises
+    ------
+    InputError
+        Whatever in the meshes cannot be simulated.
+    """
+
+    def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
+        self.scene = scene
+        self.mesh = build_mesh(scene.mesh, file=scene.source) if mesh is None else mesh
+        self.rest = RestShape(scene, self.mesh)
+
+    @cached_property
+    def mass(self) -> float:
+        """[kg]."""
+        return float(self.rest.mass.sum())
+
+    @property
+    def gravity(self) -> Array:
+        """(3,) [m/s²]; zero where the scene has none."""
+        return np.asarray(self.scene.gravity or (0.0, 0.0, 0.0), dtype=np.float64)
+
+    @property
+    def start_velocity(self) -> Array:
+        """(3,) [m/s] of the translation at t = 0."""
+        initial = self.scene.initial
+        return np.asarray((0.0, 0.0, 0.0) if initial is None else initial.velocity, dtype=np.float64)
+
+    @cached_property
+    def potential(self) -> float:
+        """−Σ m g·x [J] at t = 0."""
+        return -float(self.rest.mass @ (self.mesh.positions @ self.gravity))
+
+    @cached_property
+    def stretch(self) -> Array:
+        """Start length over rest length of every triangle side, (F, 3)."""
+        corners, flat = self.mesh.positions[self.mesh.triangles], self.mesh.triangle_uv
+        start = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        rest = np.linalg.norm(flat - np.roll(flat, -1, axis=1), axis=2)
+        return np.asarray(start / rest)
+
+    @cached_property
+    def normals(self) -> Array:
+        """Unit normals (F, 3) of the start shape."""
+        corners = self.mesh.positions[self.mesh.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether some hinge starts away from its rest angle."""
+        if not any(entry.name == "bending" for entry in active(self.scene, self.rest.shells)):
+            return False
+        from lyra_petsc.terms import bending
+
+        found = bending.elements(self.rest)
+        if len(found.stencil) == 0:
+            return False
+        angles = bending.dihedral_angles(self.mesh.positions, found.stencil)
+        return bool(np.abs(angles - found.data["rest_angle"]).max() > 1e-7)
+
+    # -- assumptions that solutions share ----------------------------------------------------------------
+
+    def forced(self) -> list[str]:
+        """What moves the sheet beside gravity, wind and its own velocity, in words."""
+        scene, found = self.scene, []
+        if scene.time.analysis == "static":
+            found.append("a static analysis")
+        if scene.handles:
+            found.append("handles")
+        if scene.loads:
+            found.append("loads")
+        if scene.initial is not None and scene.initial.noise > 0.0:
+            found.append("initial.noise")
+        if scene.initial is not None and any(scene.initial.angular_velocity):
+            found.append("initial.angular_velocity")
+        return found
+
+    def strained(self) -> list[str]:
+        """Why the start shape is not free of stress, in words."""
+        found = []
+        if np.abs(self.stretch - 1.0).max() > SAME:
+            found.append("a start shape that is stretched")
+        if self.is_bent:
+            found.append("a start shape that is bent, or a rest curvature")
+        return found
+
+    @property
+    def has_wind(self) -> bool:
+        """Whether air acts on the sheet."""
+        wind = self.scene.wind
+        return wind is not None and (wind.density > 0.0 or wind.drag > 0.0)
+
+
+def _translation(body: Body, path: Callable[[float], tuple[Array, Array]]) -> ExactMotion:
+    return Translation(body.mass, body.gravity, body.potential, path)
+
+
+def free_fall_obstacles(body: Body) -> list[str]:
+    """What of a scene contradicts a free fall, in words."""
+    return [*body.forced(), *(["wind"] if body.has_wind else []), *body.strained()]
+
+
+def free_fall(body: Body) -> ExactMotion:
+    """A sheet that falls or flies freely without deforming: x = X + v₀ t + g t²/2."""
+    return _translation(body, partial(_freely, body.start_velocity, body.gravity))
+
+
+def _freely(start: Array, g: Array, t: float) -> tuple[Array, Array]:
+    return start * t + 0.5 * g * t * t, start + g * t
+
+
+def _in_still_air(body: Body) -> list[str]:
+    found = body.forced()
+    if not body.gravity.any():
+        found.append("no gravity")
+    if body.start_velocity.any():
+        found.append("initial.velocity")
+    if not body.has_wind:
+        found.append("no air (wind with velocity [0, 0, 0])")
+    elif body.scene.wind is not None and any(body.scene.wind.velocity):
+        found.append("wind that is not still")
+    densities = body.rest.per_triangle("density")
+    if np.ptp(densities) > SAME * densities.max():
+        found.append("materials of different densities")
+    return found + body.strained()
+
+
+def _cosines(body: Body) -> Array:
+    """Between normals and gravity, (F,)."""
+    g = body.gravity
+    return np.asarray(body.normals @ (g / np.linalg.norm(g)))
+
+
+def flat_fall_obstacles(body: Body) -> list[str]:
+    """What of a scene contradicts a level sheet falling flat in still air, in words."""
+    found = _in_still_air(body)
+    if body.gravity.any() and np.abs(np.abs(_cosines(body)) - 1.0).max() > SAME:
+        found.append("a sheet that is not flat and level")
+    if body.scene.wind is not None and body.scene.wind.density == 0.0:
+        found.append("wind.density 0")
+    return found
+
+
+def flat_fall(body: Body) -> ExactMotion:
+    """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
+
+    Drag grows with the square of the velocity.
+    """
+    assert body.scene.wind is not None
+    density = float(body.rest.per_triangle("density")[0])
+    terminal = math.sqrt(density * float(np.linalg.norm(body.gravity)) / body.scene.wind.density)
+    return _translation(body, partial(_flat, terminal, body.gravity))
+
+
+def _flat(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
+    g = math.hypot(*gravity)
+    a = g * t / terminal
+    # ln cosh a, without the overflow of cosh
+    fallen = terminal**2 / g * (a + math.log1p(math.exp(-2.0 * a)) - math.log(2.0))
+    return fallen / g * gravity, terminal * math.tanh(a) / g * gravity
+
+
+def edge_fall_obstacles(body: Body) -> list[str]:
+    """What of a scene contradicts an upright sheet falling edge-on in still air, in words."""
+    found = _in_still_air(body)
+    if body.gravity.any() and np.abs(_cosines(body)).max() > SAME:
+        found.append("a sheet that is not upright")
+    if body.scene.wind is not None and body.scene.wind.drag == 0.0:
+        found.append("wind.drag 0")
+    return found
+
+
+def edge_fall(body: Body) -> ExactMotion:
+    """An upright flat sheet released at rest: v = vt (1 − exp(−g t / vt)), vt = ρ_sheet g / drag.
+
+    Drag grows with the velocity.
+    """
+    assert body.scene.wind is not None
+    density = float(body.rest.per_triangle("density")[0])
+    terminal = density * float(np.linalg.norm(body.gravity)) / body.scene.wind.drag
+    return _translation(body, partial(_edge_on, terminal, body.gravity))
+
+
+def _edge_on(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
+    g = math.hypot(*gravity)
+    rate = g / terminal
+    fallen = terminal * (t + math.expm1(-rate * t) / rate)
+    return fallen / g * gravity, -terminal * math.expm1(-rate * t) / g * gravity
+
+
+@dataclass(frozen=True)
+class _Breathing(ExactMotion):
+    """See the module.
+
+    Attributes
+    ----------
+    centre : (3,) [m]
+    first, largest : float
+        Stretch at t = 0, and the largest ever.
+    rate : float [1/s²]
+        k.
+    stiffness : float [J]
+        A (c11 + c12).
+    """
+
+    centre: tuple[float, float, float]
+    first: float
+    largest: float
+    rate: float
+    stiffness: float
+
+    def stretch(self, t: float) -> float:
+        """λ at t [s]."""
+        from scipy.special import ellipj, ellipk
+
+        m = 2.0 - 2.0 / self.largest**2
+        begin = 0.0 if self.first >= 1.0 else float(ellipk(m))
+        return self.largest * float(ellipj(self.largest * math.sqrt(0.5 * self.rate) * t + begin, m)[2])
+
+    def positions(self, start: Array, t: float) -> Array:
+        """Scaled about the centre."""
+        centre = np.asarray(self.centre)
+        return np.asarray(centre + (start - centre) * (self.stretch(t) / self.first))
+
+    def energies(self, t: float) -> Energies:
+        """Kinetic energy from the conserved sum."""
+        whole = 0.25 * self.stiffness * (self.first**2 - 1.0) ** 2
+        membrane = 0.25 * self.stiffness * (self.stretch(t) ** 2 - 1.0) ** 2
+        return Energies(whole - membrane, membrane, 0.0)
+
+
+def breathing_obstacles(body: Body) -> list[str]:
+    """What of a scene contradicts a breathing triangle, in words."""
+    if body.mesh.n_triangles != 1:
+        return [f"{body.mesh.n_triangles} triangles instead of one"]
+    found = body.forced()
+    if body.gravity.any():
+        found.append("gravity")
+    if body.has_wind:
+        found.append("wind")
+    if body.start_velocity.any():
+        found.append("initial.velocity")
+    shell = body.rest.shells[int(body.rest.shell_of[0])]
+    if abs(shell.c11 - shell.c22) > SAME * shell.c11:
+        found.append("c11 and c22 that differ")
+    if shell.damping > 0.0:
+        found.append("damping")
+    sides = np.linalg.norm(body.mesh.triangle_uv[0] - np.roll(body.mesh.triangle_uv[0], -1, axis=0), axis=1)
+    if np.ptp(sides) > SAME * sides.max():
+        found.append("a triangle that is not equilateral")
+    stretch = body.stretch[0]
+    if np.ptp(stretch) > SAME * stretch.max():
+        found.append("a start that is not stretched alike in all directions")
+    elif not 0.0 < stretch[0] < math.sqrt(2.0) or abs(stretch[0] - 1.0) < SAME:
+        found.append("a start stretched by a factor that is 1, or √2 or more")
+    return found
+
+
+def breathing(body: Body) -> ExactMotion:
+    """The oscillation of the triangle."""
+    shell = body.rest.shells[int(body.rest.shell_of[0])]
+    first = float(body.stretch[0].mean())
+    radius2 = float(((body.mesh.triangle_uv[0] - body.mesh.triangle_uv[0].mean(axis=0)) ** 2).sum() / 3.0)
+    area = float(body.rest.area[0])
+    centre = body.mesh.positions.mean(axis=0)
+    return _Breathing(
+        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
+        first=first,
+        largest=first if first > 1.0 else math.sqrt(2.0 - first**2),
+        rate=(shell.c11 + shell.c12) / (shell.density * radius2),
+        stiffness=area * (shell.c11 + shell.c12),
+    )
+
+
+@dataclass(frozen=True)
+class Solution:
+    """An exact solution.
+
+    Attributes
+    ----------
+    name : str
+    title : str
+        In words, for reports.
+    obstacles : callable
+        What of a scene contradicts its assumptions, in words; empty if it holds.
+    motion : callable
+        The motion, for a scene without obstacles.
+    """
+
+    name: str
+    title: str
+    obstacles: Callable[[Body], list[str]]
+    motion: Callable[[Body], ExactMotion]
+
+
+SOLUTIONS = {
+    solution.name: solution
+    for solution in (
+        Solution("free-fall", "free fall, x = X + v t + g t²/2", free_fall_obstacles, free_fall),
+        Solution(
+            "terminal-fall",
+            "level sheet falling in still air, v = vt tanh(g t/vt)",
+            flat_fall_obstacles,
+            flat_fall,
+        ),
+        Solution(
+            "edge-fall",
+            "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
+            edge_fall_obstacles,
+            edge_fall,
+        ),
+        Solution(
+            "breathing-triangle",
+            "equilateral triangle oscillating in its plane, Jacobi's dn",
+            breathing_obstacles,
+            breathing,
+        ),
+    )
+}
+
+
+def exact_motion(name: str, body: Body) -> ExactMotion:
+    """The exact motion of that name for a scene.
+
+    Raises
+    ------
+    InputError
+        Unknown name, or a scene that violates an assumption; all that is violated is named.
+    """
+    key = f"--reference exact:{name}"
+    if name not in SOLUTIONS:
+        raise InputError(f"no exact solution of that name, {nearest(name, SOLUTIONS)}", key=key)
+    found = SOLUTIONS[name].obstacles(body)
+    if found:
+        raise InputError(
+            f"does not hold for this scene, which has {', '.join(found)}", file=body.scene.source, key=key
+        )
+    return SOLUTIONS[name].motion(body)
+
+
+def matching(body: Body) -> Solution | None:
+    """The exact solution that holds for a scene, if one does."""
+    return next((solution for solution in SOLUTIONS.values() if not solution.obstacles(body)), None)

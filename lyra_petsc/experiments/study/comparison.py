@@ -1,0 +1,505 @@
+"""What a run left, at the sample times: positions by slabs, energies and probes as numbers.
+
+From one mesh to another of the same sheets: where a vertex of the one lies in the triangles of the other.
+
+Rest shapes are compared, sheet by sheet: each point goes to the nearest triangle of its sheet and gets
+the barycentric weights of the nearest place in it. On flat sheets that is linear interpolation in
+material coordinates; where a curved outline or surface is cut into different triangles the points are
+projected onto the nearest.
+
+Errors of a run against a reference, slab by slab: no rank holds a whole state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.experiments.exact_motions import ExactMotion
+from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
+from lyra_petsc.mesh.measures import bounding_diagonal
+from lyra_petsc.output.agreement import raise_together
+from lyra_petsc.output.read_run import Columns, read_table
+from lyra_petsc.output.self_contained import check_folder
+from lyra_petsc.output.states import stored_states
+from lyra_petsc.output.stored import open_stored
+from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.parallel import on_root
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FORMS = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
+SAME_TIME = 1e-6
+"""Fraction of the time between samples by which a state may miss a sample time."""
+
+ROWS_AT_ONCE = 1 << 16
+"""Rows of a file that a rank reads at a time."""
+
+
+@dataclass
+class RestSurface:
+    """The rest shape of a run's mesh, on rank 0.
+
+    Attributes
+    ----------
+    rest : (V, 3) float64
+        [m].
+    triangles : (F, 3) int64
+    areas : (V,) float64
+        Rest area of each vertex [m²]: a third of that of its triangles.
+    """
+
+    rest: Array
+    triangles: Ints
+    areas: Array
+
+    @property
+    def size(self) -> float:
+        """Diagonal [m] of the bounding box."""
+        return bounding_diagonal(self.rest)
+
+    def same_as(self, other: RestSurface) -> bool:
+        """Whether it is the same mesh, vertex by vertex, up to rounding."""
+        if self.rest.shape != other.rest.shape or not np.array_equal(self.triangles, other.triangles):
+            return False
+        return bool(np.abs(self.rest - other.rest).max() <= 1e-9 * max(self.size, other.size))
+
+
+@dataclass
+class Samples:
+    """A run at the sample times; the same on all ranks.
+
+    Attributes
+    ----------
+    folder : Path
+    times : tuple of float
+        [s].
+    files : tuple of (str, str)
+        File and dataset of the positions at each time.
+    n_vertices : int
+    size : float
+        Diagonal [m] of the rest shape's bounding box.
+    energies : (T, 4) float64
+        Kinetic, membrane, bending, potential [J] at each time.
+    exchanged : float
+        Largest change [J] of any of them since the start, over all steps.
+    probes : dict of name → (T, 3) float64
+        [m].
+    """
+
+    folder: Path
+    times: tuple[float, ...]
+    files: tuple[tuple[str, str], ...]
+    n_vertices: int
+    size: float
+    energies: Array
+    exchanged: float
+    probes: dict[str, Array] = field(default_factory=dict)
+
+    def rows(self, comm: MPI.Comm, sample: int, wanted: Ints | None = None) -> Array:
+        """Positions (n, 3) [m] of this rank's slab of vertices, or of the vertices ``wanted``; collective.
+
+        Parameters
+        ----------
+        comm : MPI.Comm
+        sample : int
+        wanted : (n,) int, optional
+            Ascending vertex numbers.
+
+        Raises
+        ------
+        InputError
+            On every rank, if the file cannot be read.
+        """
+        file, dataset = self.files[sample]
+        problem: LyraError | None = None
+        rows: Array = np.empty((0, 3))
+        try:
+            with open_stored(self.folder / file) as opened:
+                stored = opened[dataset]
+                if wanted is None:
+                    start, stop = slab(comm, self.n_vertices)
+                    rows = stored[start:stop]
+                else:
+                    rows = _picked(stored, wanted)
+        except InputError as error:
+            problem = error
+        raise_together(comm, problem)
+        return rows
+
+
+def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:
+    """First row and the row after the last of a rank's share of n rows; this one's unless told."""
+    rank = comm.rank if rank is None else rank
+    return rank * n // comm.size, (rank + 1) * n // comm.size
+
+
+def scatter(comm: MPI.Comm, rows: NDArray[Any] | None) -> NDArray[Any]:
+    """This rank's slab of rows (n, …) that rank 0 has; collective."""
+    pieces: list[NDArray[Any]] = []
+    if rows is not None:
+        pieces = [rows[slice(*slab(comm, len(rows), rank))] for rank in range(comm.size)]
+    return np.asarray(comm.scatter(pieces, root=0))
+
+
+def _picked(stored: Any, wanted: Ints) -> Array:
+    """Rows of a dataset, read in pieces so that a rank never holds all of it."""
+    out = np.empty((len(wanted), 3))
+    for start in range(0, stored.shape[0], ROWS_AT_ONCE):
+        first, last = np.searchsorted(wanted, [start, start + ROWS_AT_ONCE])
+        if last > first:
+            piece = stored[start : start + ROWS_AT_ONCE]
+            out[first:last] = piece[wanted[first:last] - start]
+    return out
+
+
+def read_surface(folder: Path) -> RestSurface:
+    """The mesh of a run. For rank 0.
+
+    Raises
+    ------
+    InputError
+        If ``mesh.h5`` is missing or damaged.
+    """
+    mesh = StoredMesh(folder)
+    rest, triangles, uv = mesh.rest, mesh.triangles, mesh.corner_uv
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    thirds = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 6.0
+    areas = np.bincount(triangles.ravel(), np.repeat(thirds, 3), len(rest)).astype(np.float64)
+    return RestSurface(rest, triangles, areas)
+
+
+def read_samples(comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float) -> Samples:
+    """What a run left at the sample times; collective.
+
+    Parameters
+    ----------
+    folder : Path
+    times : sequence of float
+        [s].
+    spacing : float
+        Time between samples [s]; states within 1e-6 of it count.
+
+    Raises
+    ------
+    InputError
+        On every rank, if a state, the mesh or the history is missing.
+    """
+    found = on_root(comm, lambda: read_here(folder, times, spacing))
+    return found
+
+
+def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
+    """As ``read_samples``, on one rank and for it alone."""
+    states = []
+    if folder.is_dir():
+        check_folder(folder)
+        states = stored_states(folder)
+    if not states:
+        raise InputError("holds no states of a run", file=folder)
+    at = np.array([state.time for state in states])
+    files = []
+    for time in times:
+        nearest = int(np.abs(at - time).argmin())
+        if abs(at[nearest] - time) > SAME_TIME * spacing:
+            raise InputError(
+                f"has no state at t = {time:g} s, which is a sample time (its states run from "
+                f"{at.min():g} to {at.max():g} s); run it with output.every = {spacing:g}",
+                file=folder,
+            )
+        number = states[nearest].number
+        files.append((states[nearest].file, f"states/{number:06d}/position"))
+    surface = read_surface(folder)
+    history, at_samples = _table(folder / "history.csv", times)
+    energies = np.column_stack([history[name] for name in FORMS])
+    probes = {}
+    if (folder / "probes.csv").is_file():
+        table, chosen = _table(folder / "probes.csv", times)
+        names = [name.removesuffix("_x") for name in table if name.endswith("_x")]
+        probes = {
+            name: np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[chosen] for name in names
+        }
+    exchanged = float(np.abs(energies - energies[0]).max())
+    return Samples(
+        folder, tuple(times), tuple(files), len(surface.rest), surface.size, energies[at_samples], exchanged,
+        probes,
+    )  # fmt: skip
+
+
+def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
+    """A table's columns, and the rows nearest to the sample times."""
+    columns = read_table(path)
+    if not len(columns["time"]):
+        raise InputError("has no rows", file=path)
+    return columns, [int(np.abs(columns["time"] - time).argmin()) for time in times]
+
+
+CANDIDATES = 12
+"""Triangles with the nearest centroids among which the nearest triangle is looked for."""
+
+
+@dataclass
+class Transfer:
+    """This rank's part: corners and weights for its slab of points.
+
+    Attributes
+    ----------
+    wanted : (m,) int64
+        Vertices of the other mesh that this rank reads, ascending.
+    corner : (n, 3) int64
+        Numbers in ``wanted``.
+    weight : (n, 3) float64
+    """
+
+    wanted: Ints
+    corner: Ints
+    weight: Array
+
+    def rows(self, comm: MPI.Comm, samples: Samples, sample: int) -> Array:
+        """Positions (n, 3) [m] of the other mesh's surface at this rank's points; collective."""
+        found = samples.rows(comm, sample, self.wanted)
+        interpolated: Array = np.einsum("nc,nci->ni", self.weight, found[self.corner])
+        return interpolated
+
+
+def make_transfer(
+    comm: MPI.Comm,
+    points: RestSurface | None,
+    point_sheets: Sequence[int],
+    other: RestSurface | None,
+    other_sheets: Sequence[int],
+) -> Transfer:
+    """Plan the way from ``other`` to the vertices of ``points``; collective, set up on rank 0.
+
+    Parameters
+    ----------
+    points, other : RestSurface
+        Needed on rank 0 only.
+    point_sheets, other_sheets : sequence of int
+        Vertices of each sheet, which are numbered consecutively.
+    """
+    found = on_root(comm, lambda: _locate(points, point_sheets, other, other_sheets), share=False)
+    corner, weight = (scatter(comm, rows) for rows in found or (None, None))
+    wanted, inverse = np.unique(corner, return_inverse=True)
+    return Transfer(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
+
+
+def _locate(
+    points: RestSurface | None,
+    point_sheets: Sequence[int],
+    other: RestSurface | None,
+    other_sheets: Sequence[int],
+) -> tuple[Ints, Array]:
+    """Corners (n, 3) and weights (n, 3) for every vertex of ``points``."""
+    assert points is not None
+    assert other is not None
+    corner = np.empty((len(points.rest), 3), dtype=np.int64)
+    weight = np.empty((len(points.rest), 3))
+    ends, others = np.cumsum(point_sheets), np.cumsum(other_sheets)
+    for sheet, stop in enumerate(ends):
+        mine = slice(int(stop) - point_sheets[sheet], int(stop))
+        low, high = int(others[sheet]) - other_sheets[sheet], int(others[sheet])
+        inside = (other.triangles[:, 0] >= low) & (other.triangles[:, 0] < high)
+        corner[mine], weight[mine] = _nearest(points.rest[mine], other.rest, other.triangles[inside])
+    return corner, weight
+
+
+def _nearest(places: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
+    from scipy.spatial import cKDTree
+
+    corners = vertices[triangles]
+    count = min(CANDIDATES, len(triangles))
+    _, near = cKDTree(corners.mean(axis=1)).query(places, k=count)
+    near = np.asarray(near).reshape(len(places), count)
+    best = np.full(len(places), np.inf)
+    chosen = np.zeros(len(places), dtype=np.int64)
+    weight = np.zeros((len(places), 3))
+    for candidate in near.T:
+        weights = barycentric(places, corners[candidate])
+        distance = np.linalg.norm(np.einsum("nc,nci->ni", weights, corners[candidate]) - places, axis=1)
+        nearer = distance < best
+        best[nearer], chosen[nearer] = distance[nearer], candidate[nearer]
+        weight[nearer] = weights[nearer]
+    return triangles[chosen], weight
+
+
+def barycentric(places: Array, corners: Array) -> Array:
+    """Weights (n, 3) of the nearest place in each triangle; ``corners`` is (n, 3, 3), ``places`` (n, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    u, v, w = b - a, c - a, places - a
+    uu, uv, vv = _dot(u, u), _dot(u, v), _dot(v, v)
+    wu, wv = _dot(w, u), _dot(w, v)
+    area = uu * vv - uv * uv
+    s, t = (vv * wu - uv * wv) / area, (uu * wv - uv * wu) / area
+    weights: Array = np.stack([1.0 - s - t, s, t], axis=1)
+    outside = (weights < 0.0).any(axis=1)
+    if outside.any():
+        weights[outside] = _on_sides(places[outside], corners[outside])
+    return weights
+
+
+def _on_sides(places: Array, corners: Array) -> Array:
+    """Weights of the nearest place on the three sides."""
+    best = np.full(len(places), np.inf)
+    weights = np.zeros((len(places), 3))
+    for k in range(3):
+        start, side = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
+        along = np.clip(_dot(places - start, side) / _dot(side, side), 0.0, 1.0)
+        distance = np.linalg.norm(start + along[:, None] * side - places, axis=1)
+        nearer = distance < best
+        best[nearer] = distance[nearer]
+        weights[nearer] = 0.0
+        weights[nearer, k] = 1.0 - along[nearer]
+        weights[nearer, (k + 1) % 3] = along[nearer]
+    return weights
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", a, b))
+
+
+Errors = dict[str, float]
+"""By the name of the quantity; relative, see ``quantities``. NaN where nothing can be told."""
+
+History = dict[str, Array]
+"""Errors at each sample after the start, by the name of the quantity."""
+
+Rows = Callable[[int], Array]
+"""Positions (n, 3) [m] of this rank's points at a sample."""
+
+
+@dataclass
+class Party:
+    """A run to be compared.
+
+    Attributes
+    ----------
+    samples : Samples
+    sheets : sequence of int
+        Vertices of each mesh source.
+    """
+
+    samples: Samples
+    sheets: Sequence[int]
+
+
+def against_motion(comm: MPI.Comm, run: Party, motion: ExactMotion, quantities: Sequence[Quantity]) -> Errors:
+    """Errors of a run against an exact motion; collective."""
+    samples = run.samples
+    start = samples.rows(comm, 0)
+    areas = _areas(comm, on_root(comm, lambda: read_surface(samples.folder), share=False))
+    found: History = {}
+    if any(quantity.name.startswith("position") for quantity in quantities):
+        found |= _positions(
+            comm,
+            samples,
+            lambda i: samples.rows(comm, i),
+            lambda i: motion.positions(start, samples.times[i]),
+            areas,
+            samples.size,
+        )
+    forms = [motion.energies(t) for t in samples.times]
+    exact = np.array([[form.kinetic, form.membrane, 0.0, form.potential] for form in forms])
+    found["energy"] = _energy(samples.energies, exact, float(np.abs(exact - exact[0]).max()))
+    for quantity in quantities:
+        if quantity.probe is not None and quantity.probe in samples.probes:
+            path = samples.probes[quantity.probe]
+            expected = [motion.positions(path[:1], t)[0] for t in samples.times]
+            found[quantity.name] = _path(path, np.array(expected), samples.size)
+    return overall(_of(quantities, found))
+
+
+def against_run(comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]) -> Errors:
+    """Errors of a run against another, over all samples; collective."""
+    return overall(history_against_run(comm, run, reference, quantities))
+
+
+def history_against_run(
+    comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]
+) -> History:
+    """Errors of a run against another at each sample; collective.
+
+    On different meshes the finer solution is interpolated at the rest places of the coarser one's
+    vertices.
+    """
+    mine, other = run.samples, reference.samples
+    found: History = {}
+    if any(quantity.name.startswith("position") for quantity in quantities):
+        found |= _between(comm, run, reference)
+    found["energy"] = _energy(mine.energies, other.energies, other.exchanged)
+    for quantity in quantities:
+        name = quantity.probe
+        if name is not None and name in mine.probes and name in other.probes:
+            found[quantity.name] = _path(mine.probes[name], other.probes[name], other.size)
+    return _of(quantities, found)
+
+
+def overall(history: History) -> Errors:
+    """The error over all samples: the root mean square of the L2 norms, of all others the largest."""
+    return {name: _overall(name, values) for name, values in history.items()}
+
+
+def _overall(name: str, values: Array) -> float:
+    if len(values) == 0:
+        return math.nan
+    return math.sqrt(float(np.mean(values**2))) if name == MEAN_SQUARE else float(values.max())
+
+
+def _of(quantities: Sequence[Quantity], found: History) -> History:
+    """The quantities in their order; empty where nothing can be told."""
+    return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
+
+
+def _between(comm: MPI.Comm, run: Party, reference: Party) -> History:
+    coarse, fine = run, reference
+    if run.samples.n_vertices > reference.samples.n_vertices:
+        coarse, fine = reference, run
+    both = [party.samples.folder for party in (coarse, fine)]
+    found = on_root(comm, lambda: [read_surface(folder) for folder in both], share=False)
+    at, beyond = found or (None, None)
+    same = comm.bcast(at is not None and beyond is not None and at.same_as(beyond), root=0)
+    here: Rows = lambda i: coarse.samples.rows(comm, i)  # noqa: E731
+    there: Rows = lambda i: fine.samples.rows(comm, i)  # noqa: E731
+    if not same:
+        transfer = make_transfer(comm, at, coarse.sheets, beyond, fine.sheets)
+        there = lambda i: transfer.rows(comm, fine.samples, i)  # noqa: E731
+    return _positions(comm, coarse.samples, here, there, _areas(comm, at), reference.samples.size)
+
+
+def _areas(comm: MPI.Comm, surface: RestSurface | None) -> Array:
+    """This rank's slab of the vertices' rest areas [m²]; ``surface`` on rank 0."""
+    return scatter(comm, None if surface is None else surface.areas)
+
+
+def _positions(
+    comm: MPI.Comm, samples: Samples, here: Rows, there: Rows, areas: Array, size: float
+) -> History:
+    """Largest and area-weighted L2 error over space, at each sample after the start."""
+    whole = comm.allreduce(float(areas.sum()))
+    count = len(samples.times) - 1
+    largest, squares = np.empty(count), np.empty(count)
+    for i in range(count):
+        distance = np.linalg.norm(here(i + 1) - there(i + 1), axis=1)
+        largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
+        squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
+    return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}
+
+
+def _energy(mine: Array, other: Array, exchanged: float) -> Array:
+    """Error of the total energy over the largest energy exchanged."""
+    if not exchanged > 0.0:
+        return np.empty(0)
+    return np.asarray(np.abs(mine.sum(axis=1) - other.sum(axis=1)) / exchanged)
+
+
+def _path(mine: Array, other: Array, size: float) -> Array:
+    return np.asarray(np.linalg.norm(mine - other, axis=1) / size)

@@ -1,0 +1,447 @@
+"""Input and result of a case; both are files, so that studies resume and launch processes.
+
+What the user asked of a study, as it is kept in its folder.
+
+The folder of a study: chosen before anything runs, locked while it does.
+
+Runs one case in this communicator: states from the first repeat, wall time from all.
+
+``--ranks P``: every case in an mpirun of its own, one after another.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mpi4py import MPI
+
+from lyra_petsc.api.mpirun import last_words
+from lyra_petsc.errors import InputError, OutputError, SolverError
+from lyra_petsc.experiments.bench import problem_of, simulated
+from lyra_petsc.experiments.case import Launcher, load_record, save_record
+from lyra_petsc.experiments.study.combinations import scene_of
+from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.output.agreement import reason
+from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.output.run_folder import FolderKind, checkpoint_files
+from lyra_petsc.parallel import on_root
+from lyra_petsc.phases import Phases
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.problem import Outline
+from lyra_petsc.stepping.simulation import StepReport
+
+RESULT_FILE = "result.json"
+SET_UP = ("mesh", "partition", "assembly")
+"""Phases of a run before its first step; the solver's objects are set up in them too."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to make.
+
+    Attributes
+    ----------
+    scene : str
+        Path of the scene file.
+    overrides : tuple of str
+        All that ``--set`` would say.
+    folder : str
+        Where its states and its result go.
+    repeats : int
+        How often it is timed; the first repeat writes the states.
+    fingerprint : str
+        Of everything the result depends on.
+    """
+
+    scene: str
+    overrides: tuple[str, ...]
+    folder: str
+    repeats: int
+    fingerprint: str
+
+
+@dataclass
+class Timing:
+    """Wall seconds of one repeat, the slowest rank's.
+
+    Attributes
+    ----------
+    set_up : float
+        Mesh, partition, assembly set-up and solver objects.
+    run : float
+        All steps, without output.
+    phases : dict of str to float
+        By phase; ``files`` is the writing of states.
+    """
+
+    set_up: float
+    run: float
+    phases: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Result:
+    """What came of a case.
+
+    Attributes
+    ----------
+    fingerprint : str
+    problem : str
+        Why it failed, in words; empty if it did not.
+    ranks : int
+    integrator : str
+    vertices, triangles : int
+    spacing : float
+        Mean edge length [m].
+    sheets : list of int
+        Vertices of each mesh source.
+    steps, rejected, newton_iterations, linear_iterations : int
+    shortest, longest : float
+        Δt [s] of accepted steps.
+    end : float
+        Time reached [s].
+    linear_solver : str
+    timings : list of Timing
+    notes : list of str
+    """
+
+    fingerprint: str
+    problem: str = ""
+    ranks: int = 1
+    integrator: str = ""
+    vertices: int = 0
+    triangles: int = 0
+    spacing: float = 0.0
+    sheets: list[int] = field(default_factory=list)
+    steps: int = 0
+    rejected: int = 0
+    newton_iterations: int = 0
+    linear_iterations: int = 0
+    shortest: float = 0.0
+    longest: float = 0.0
+    end: float = 0.0
+    linear_solver: str = ""
+    timings: list[Timing] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def done(self) -> bool:
+        """Whether it ran to its end."""
+        return not self.problem
+
+    @property
+    def mean_step(self) -> float:
+        """Mean Δt [s]; 0 without steps."""
+        return self.end / self.steps if self.steps else 0.0
+
+    def describe(self, outline: Outline, sheets: Sequence[int]) -> None:
+        """Note the mesh; ``sheets`` are the vertices of its sources, if it has several."""
+        self.vertices, self.triangles = outline.n_vertices, outline.n_triangles
+        self.spacing, self.sheets = outline.spacing, list(sheets) or [outline.n_vertices]
+
+    def count(self, reports: Sequence[StepReport]) -> None:
+        """Note the steps of a run."""
+        self.steps = len(reports)
+        self.rejected = sum(report.rejected for report in reports)
+        self.newton_iterations = sum(report.newton_iterations for report in reports)
+        self.linear_iterations = sum(report.linear_iterations for report in reports)
+        self.shortest = min((report.dt for report in reports), default=0.0)
+        self.longest = max((report.dt for report in reports), default=0.0)
+
+    def fail(self, problem: str) -> None:
+        """It has not ended as it should: no time of it counts."""
+        self.problem, self.timings = problem, []
+
+    def run_seconds(self) -> list[float]:
+        """Of each repeat: the steps alone."""
+        return [timing.run for timing in self.timings]
+
+    def total_seconds(self) -> list[float]:
+        """Of each repeat: set-up and steps."""
+        return [timing.set_up + timing.run for timing in self.timings]
+
+    def phase_seconds(self) -> dict[str, float]:
+        """Median of each phase over the repeats."""
+        names = dict.fromkeys(name for timing in self.timings for name in timing.phases)
+        return {
+            name: statistics.median(timing.phases.get(name, 0.0) for timing in self.timings)
+            for name in names
+            if name != "files"
+        }
+
+    def write(self, folder: Path) -> None:
+        """Write ``result.json``; the case counts as finished from then on. Call on one rank."""
+        save_record(folder / RESULT_FILE, self)
+
+
+def read_result(folder: Path, fingerprint: str) -> Result | None:
+    """The result of a finished case, or None if there is none for this fingerprint."""
+    try:
+        found = load_record(folder / RESULT_FILE, Result)
+    except (OSError, ValueError):
+        return None
+    return found if found.fingerprint == fingerprint else None
+
+
+def fingerprint(*parts: Sequence[str] | str) -> str:
+    """A short digest of texts."""
+    text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+REQUEST_FILE = "request.json"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A study as asked for.
+
+    Attributes
+    ----------
+    scene : str
+        Path of the scene.
+    settings : tuple of str
+        ``--set``.
+    vary : tuple of str
+        ``--vary``; empty: the default sweep.
+    reference : str
+        ``auto``, ``exact:NAME`` or ``run:DIR``.
+    quantities : str
+        Separated by commas; empty: all.
+    repeats : int
+        How often each combination is timed.
+    ranks : int or None
+        ``--ranks``: one mpirun per case; None: the communicator the study was started with.
+    """
+
+    scene: str
+    settings: tuple[str, ...] = ()
+    vary: tuple[str, ...] = ()
+    reference: str = "auto"
+    quantities: str = ""
+    repeats: int = 3
+    ranks: int | None = None
+
+
+def read_request(folder: Path) -> Request:
+    """The request that a study's folder was begun with.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it cannot be read.
+    """
+    path = folder / REQUEST_FILE
+    try:
+        return load_record(path, Request)
+    except OSError as error:
+        raise InputError(f"cannot be read: {reason(error)}", file=path, key="--resume") from None
+    except ValueError:
+        raise InputError("is damaged; begin the study anew with --force", file=path, key="--resume") from None
+
+
+CASES = "cases"
+
+RESULT = re.compile(
+    r"(study\.(csv|json)|request\.json|report\.(html|md)"
+    r"|(work-precision|convergence)[\w.+-]*\.(png|svg))(\.part)?"
+)
+"""What a study writes beside its cases."""
+
+
+def _requests(folder: Path) -> list[Path]:
+    return [file for file in (folder / REQUEST_FILE,) if file.is_file()]
+
+
+STUDY = FolderKind(
+    "study", Path("studies"), "study.lock", RESULT, _requests, "no study to resume", folders=(CASES,)
+)
+
+
+def empty_case(folder: Path) -> None:
+    """An empty folder for a case; what a stopped one left is removed.
+
+    Raises
+    ------
+    OutputError
+    """
+    try:
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be prepared: {reason(error)}") from error
+
+
+Watch = Callable[[float], None]
+"""Called with the fraction of the case that is done, after every step, on all ranks; may raise."""
+
+
+def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
+    """Run a case and write its result; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    job : Job
+    watch : callable
+    warm : bool
+        Take one untimed step first, so that no case is charged with compiling and loading kernels.
+
+    Returns
+    -------
+    Result
+        Also of a case that failed: its ``problem`` says why.
+
+    Raises
+    ------
+    Interrupted
+        From ``watch``; the case is then unfinished.
+    SolverError
+        If ranks failed in different ways and cannot go on together.
+    OutputError
+    """
+    folder = Path(job.folder)
+    on_root(comm, lambda: empty_case(folder))
+    result = Result(job.fingerprint, ranks=comm.size)
+    try:
+        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides))
+        result.integrator = str(scene.time.scheme)
+        if warm:
+            _warm_up(comm, scene)
+        for repeat in range(job.repeats):
+            _repeat(comm, scene, folder, repeat, job.repeats, result, watch)
+    except (InputError, SolverError) as error:
+        result.fail(problem_of(comm, error))
+    on_root(comm, lambda: result.write(folder))
+    return result
+
+
+def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
+    with simulated(comm, scene) as simulation:
+        simulation.problem.release()
+        if not simulation.finished:
+            simulation.step()
+
+
+def _repeat(
+    comm: MPI.Comm, scene: Scene, folder: Path, repeat: int, repeats: int, result: Result, watch: Watch
+) -> None:
+    """One timed run; the first also records, and the recording is charged apart."""
+    comm.Barrier()
+    phases, began = Phases(), time.perf_counter()
+    with simulated(comm, scene, phases) as simulation, ExitStack() as stack:
+        comm.Barrier()
+        set_up = time.perf_counter() - began
+        recorder = None
+        if repeat == 0:
+            result.describe(simulation.problem.outline, _sheets(comm, scene))
+            recorder = stack.enter_context(closing(Recorder(simulation)))
+            with phases("files"):
+                recorder.begin(folder)
+        simulation.problem.release()
+        run, reports = 0.0, []
+        while not simulation.finished:
+            started = time.perf_counter()
+            reports.append(simulation.step())
+            run += time.perf_counter() - started
+            if recorder is not None:
+                with phases("files"):
+                    recorder.record(reports[-1])
+            watch((repeat + min(1.0, simulation.time / simulation.control.end)) / repeats)
+        if recorder is not None:
+            with phases("files"):
+                recorder.settle()
+        if not simulation.control.is_end(simulation.time):
+            raise SolverError(
+                f"stopped at t = {simulation.time:g} s, before the end (-ts_max_steps?)", collective=True
+            )
+        result.notes += [note for note in simulation.notes if note not in result.notes]
+        if repeat == 0:
+            stack.close()
+            result.count(reports)
+            result.end, result.linear_solver = simulation.time, simulation.stepper.preset
+            on_root(comm, lambda: _forget_checkpoints(folder))
+
+        def slowest(seconds: float) -> float:
+            return float(comm.allreduce(seconds, MPI.MAX))
+
+        # phases are entered together, so that all ranks have the same
+        by_phase = {name: slowest(seconds) for name, seconds in phases.seconds().items()}
+        result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
+
+
+def _sheets(comm: MPI.Comm, scene: Scene) -> list[int]:
+    """Vertices of each mesh source, where there are several."""
+    if len(scene.mesh) == 1:
+        return []
+    work = lambda: [build_mesh([source], file=scene.source).n_vertices for source in scene.mesh]  # noqa: E731
+    return on_root(comm, work)
+
+
+def _forget_checkpoints(folder: Path) -> None:
+    for path in checkpoint_files(folder):
+        path.unlink(missing_ok=True)
+
+
+PROGRESS_FILE = "progress"
+
+
+def launched(launcher: Launcher, job: Job, watch: Callable[[float], None], lock: int) -> Result:
+    """What comes of a job in processes of its own.
+
+    Parameters
+    ----------
+    launcher : Launcher
+    job : Job
+    watch : callable
+        Called again and again with the fraction that is done; where it raises, the processes are ended.
+    lock : int
+        File descriptor that the processes keep open, so that the folder stays locked while they live.
+    """
+    folder = Path(job.folder)
+    told = folder.parent / f"{folder.name}.job.json"
+    folder.parent.mkdir(exist_ok=True)
+    save_record(told, job)
+    try:
+        code, heard = launcher(["--job", str(told)], lambda: watch(_fraction(folder)), (lock,))
+        watch(1.0)
+    finally:
+        told.unlink(missing_ok=True)
+        (folder / PROGRESS_FILE).unlink(missing_ok=True)
+    result = read_result(folder, job.fingerprint)
+    if result is None:
+        result = Result(job.fingerprint, problem=last_words(heard, code))
+        folder.mkdir(parents=True, exist_ok=True)
+        result.write(folder)
+    return result
+
+
+def report_progress(folder: Path) -> Callable[[float], None]:
+    """What a launched case calls on rank 0 to tell how far it is, some times a second."""
+    last = 0.0
+
+    def tell(fraction: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > 0.3:
+            last = now
+            (folder / PROGRESS_FILE).write_text(f"{fraction:.6f}", encoding="ascii")
+
+    return tell
+
+
+def _fraction(folder: Path) -> float:
+    try:
+        return min(1.0, float((folder / PROGRESS_FILE).read_text(encoding="ascii")))
+    except (OSError, ValueError):
+        return 0.0

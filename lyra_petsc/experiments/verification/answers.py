@@ -1,0 +1,363 @@
+"""What can be claimed of the errors of a case, and the verdict on it.
+
+A case of ``verify``: a question with a known answer, asked at several resolutions.
+
+Runs a case over its resolutions and judges it.
+
+The cases by name, in the order in which ``verify`` runs them, and the modules that they are in.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any, ClassVar
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.experiments.bench import Bench, problem_of
+from lyra_petsc.experiments.case import Case, Outcome, Registry, Verdict
+
+
+@dataclass
+class ErrorRow:
+    """One line of a case's table.
+
+    Attributes
+    ----------
+    quantity, unit : str
+    n, h : float
+        Resolution, and the length or time that shrinks.
+    value, exact : float
+        In ``unit``.
+    error : float
+        Relative to the scale of the quantity.
+    order : float
+        From the row before: log of the errors' ratio over log of the ratio of h; NaN where there is none.
+    steps : int
+        Accepted time or load steps of all simulations of this resolution.
+    wall_seconds : float
+        Of all of them, set-up included.
+    problem : str
+        Why there is no value, in words; empty if there is one.
+    """
+
+    quantity: str
+    unit: str
+    n: float
+    h: float
+    value: float = math.nan
+    exact: float = math.nan
+    error: float = math.nan
+    order: float = math.nan
+    steps: int = 0
+    wall_seconds: float = 0.0
+    problem: str = ""
+
+
+class Claim(ABC):
+    """A statement about the rows of one quantity."""
+
+    #: whether the errors are of a size that an order can be read from
+    has_order: ClassVar[bool] = True
+
+    @abstractmethod
+    def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
+        """The verdict on rows without problems, coarsest first, at least one.
+
+        ``finest`` is h of the finest resolution the case has, which a quick run leaves out.
+        """
+
+
+@dataclass(frozen=True)
+class Exact(Claim):
+    """At every resolution the error is at most ``bound``: only round-off and the solver's tolerance."""
+
+    has_order: ClassVar[bool] = False
+
+    bound: float = 1e-10
+
+    def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
+        worst = max(rows, key=_size_of_error)
+        good = worst.error <= self.bound
+        words = f"largest error {worst.error:.1e}, " + ("within" if good else "above")
+        return Verdict(good, f"{words} {self.bound:.0e}")
+
+
+@dataclass(frozen=True)
+class Converges(Claim):
+    """The error shrinks with ``order`` in h, within ``slack``, to at most ``bound`` at the finest.
+
+    The order is that of the two finest rows; with an infinite slack none is claimed. Where a quick run
+    stops at a larger h, the bound grows with h to the power of the order.
+    """
+
+    order: float
+    bound: float
+    slack: float = 0.25
+
+    def judge(self, rows: Sequence[ErrorRow], finest: float) -> Verdict:
+        last = rows[-1]
+        bound = self.bound * max(1.0, last.h / finest) ** self.order
+        small = last.error <= bound
+        words = [f"error {last.error:.1e} at n = {last.n:g}, {'within' if small else 'above'} {bound:.1e}"]
+        right = True
+        if len(rows) > 1 and self.slack < math.inf:
+            right = abs(last.order - self.order) <= self.slack
+            expected = f"{'as' if right else 'not the'} expected {self.order:g} ± {self.slack:g}"
+            words.append(f"order {last.order:.2f}, {expected}")
+        return Verdict(small and right, "; ".join(words))
+
+
+def at_finest(bound: float) -> Converges:
+    """At the finest resolution the error is at most ``bound``; where a run stops before, (h / finest)² of it.
+
+    No order is claimed: strips that bend within a cell or two, and criss-cross ones whose membrane resists
+    the dimple in every cell, converge faster at first than in the end.
+    """
+    return Converges(2.0, bound, slack=math.inf)
+
+
+def _size_of_error(row: ErrorRow) -> float:
+    return math.inf if math.isnan(row.error) else row.error
+
+
+def observed_order(before: ErrorRow, row: ErrorRow) -> float:
+    """Order of convergence between two rows; NaN where one error is zero or missing."""
+    if not (before.error > 0.0 and row.error > 0.0 and before.h != row.h):
+        return math.nan
+    return math.log(before.error / row.error) / math.log(before.h / row.h)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One quantity at one resolution.
+
+    Attributes
+    ----------
+    quantity : str
+    value, exact : float
+        In ``unit``.
+    unit : str
+        ``1`` for a pure number.
+    scale : float or None
+        What the error is relative to, in ``unit``; None: the size of ``exact``.
+    """
+
+    quantity: str
+    value: float
+    exact: float
+    unit: str = "1"
+    scale: float | None = None
+
+    @property
+    def error(self) -> float:
+        """|value − exact| over the scale."""
+        scale = abs(self.exact) if self.scale is None else self.scale
+        return abs(self.value - self.exact) / scale
+
+
+Measure = Callable[[Bench, float], Iterable[Measured]]
+
+
+@dataclass(frozen=True)
+class VerificationCase(Case):
+    """A question with a known answer; `case` makes one of a function that measures.
+
+    Attributes
+    ----------
+    measure : callable (bench, n) → Measured, one by one
+        Collective; the same result on every rank. A generator that yields what a simulation gave as soon
+        as that has ended has its steps and run time charged to it, any other iterable those of all its
+        simulations.
+    source : str
+        Where the answer comes from.
+    resolutions : sequence of float
+        n, ascending: the higher, the finer.
+    claim : Claim
+        What every quantity must satisfy.
+    claims : mapping of quantity → Claim
+        For quantities of which something else is claimed.
+    quick : int
+        How many of the resolutions ``--quick`` takes, from the coarsest.
+    counts : str
+        What n counts.
+    size : callable n → h
+        The length or time that shrinks; orders are with respect to it.
+    """
+
+    measure: Measure
+    source: str
+    resolutions: Sequence[float]
+    claim: Claim
+    claims: Mapping[str, Claim] = field(default_factory=dict)
+    quick: int = 2
+    counts: str = "cells along the side"
+    size: Callable[[float], float] = lambda n: 1.0 / n
+
+    def claim_of(self, quantity: str) -> Claim:
+        """What is claimed of a quantity."""
+        return self.claims.get(quantity, self.claim)
+
+
+def case(title: str, **more: Any) -> Callable[[Measure], VerificationCase]:
+    """A decorator: the case that is named as the function which measures it; ``more`` as in `Case`."""
+    return lambda measure: VerificationCase(measure.__name__.replace("_", "-"), title, measure, **more)
+
+
+def data(name: str) -> dict[str, Any]:
+    """A file of ``verification/data``, without ``.json``."""
+    path = files("lyra_petsc.experiments.verification").joinpath("data", f"{name}.json")
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return content
+
+
+def isotropic(stiffness: float, poisson: float = 0.0) -> dict[str, float]:
+    """The membrane block [N/m] of a material with c11 = ``stiffness`` in all directions."""
+    shear = 0.5 * (1.0 - poisson) * stiffness
+    return {"c11": stiffness, "c22": stiffness, "c12": poisson * stiffness, "c33": shear}
+
+
+def farthest(values: NDArray[np.float64], exact: float) -> float:
+    """The one of the values that differs most from the exact one."""
+    return float(values[np.argmax(np.abs(values - exact))])
+
+
+@dataclass
+class VerificationOutcome(Outcome[VerificationCase]):
+    """What came of a case; its verdicts are by quantity.
+
+    Attributes
+    ----------
+    rows : list of ErrorRow
+        By quantity, within a quantity from the coarsest on.
+    """
+
+    rows: list[ErrorRow] = field(default_factory=list)
+
+    def tables(self) -> dict[str, list[ErrorRow]]:
+        """The rows of each quantity, in the order in which they were measured."""
+        found: dict[str, list[ErrorRow]] = {}
+        for row in self.rows:
+            found.setdefault(row.quantity, []).append(row)
+        return found
+
+
+def run_case(
+    comm: MPI.Comm,
+    case: VerificationCase,
+    *,
+    quick: bool = False,
+    warm: bool = True,
+    watch: Callable[[], None] | None = None,
+) -> VerificationOutcome:
+    """Measure a case at its resolutions and judge it; collective, the same outcome on all ranks.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    case : VerificationCase
+    quick : bool
+        Only the coarsest resolutions.
+    warm : bool
+        Measure the coarsest once before the clock runs, so that no compilation is counted.
+    watch : callable, optional
+        Called before every step on all ranks; may raise to end the work.
+    """
+    began = time.perf_counter()
+    resolutions = list(case.resolutions)[: case.quick] if quick else list(case.resolutions)
+    if warm and len(resolutions) > 1:
+        _rows_at(comm, watch, case, resolutions[0])
+    tables: dict[str, list[ErrorRow]] = {}
+    problems: list[ErrorRow] = []
+    for n in resolutions:
+        for row in _rows_at(comm, watch, case, n):
+            if row.problem:
+                problems.append(row)
+                continue
+            table = tables.setdefault(row.quantity, [])
+            if table and case.claim_of(row.quantity).has_order:
+                row.order = observed_order(table[-1], row)
+            table.append(row)
+    outcome = VerificationOutcome(case)
+    for quantity, table in tables.items():
+        outcome.rows += table
+        outcome.verdicts[quantity] = case.claim_of(quantity).judge(table, case.size(case.resolutions[-1]))
+    if problems:
+        outcome.rows += problems
+        outcome.verdicts[problems[0].quantity] = Verdict(
+            False, "; ".join(f"n = {row.n:g} could not run: {row.problem}" for row in problems)
+        )
+    outcome.seconds = time.perf_counter() - began
+    return outcome
+
+
+def _rows_at(
+    comm: MPI.Comm, watch: Callable[[], None] | None, case: VerificationCase, n: float
+) -> list[ErrorRow]:
+    """The rows of one resolution, and one that says why where it cannot run to its end."""
+    comm.Barrier()
+    began, h = time.perf_counter(), case.size(n)
+    rows: list[ErrorRow] = []
+    problem = ""
+    measured: Iterable[Measured] = ()
+    with Bench(comm, watch) as bench:
+        bench.watch()
+        try:
+            measured = case.measure(bench, n)
+            for one in measured:
+                row = ErrorRow(one.quantity, one.unit, n, h, one.value, one.exact, one.error)
+                row.steps, row.wall_seconds = bench.latest
+                rows.append(row)
+        except (InputError, SolverError) as error:
+            problem = problem_of(comm, error)
+    if not isinstance(measured, Generator):
+        whole = time.perf_counter() - began
+        for row in rows:
+            row.steps, row.wall_seconds = bench.steps, whole
+    slowest = np.max(comm.allgather([row.wall_seconds for row in rows]), axis=0)
+    for row, seconds in zip(rows, slowest, strict=True):
+        row.wall_seconds = float(seconds)
+    if problem:
+        rows.append(ErrorRow("could not run", "", n, h, problem=problem))
+    return rows
+
+
+CASES: Registry[VerificationCase] = Registry(
+    "lyra_petsc.experiments.verification.cases",
+    {
+        "patch-states": "patches",
+        "free-fall": "motions",
+        "oscillator": "motions",
+        "rigid-rotation": "motions",
+        "wind-drag": "motions",
+        "uniaxial-pull": "patches",
+        "hanging-strip-chain": "hanging",
+        "hanging-strip": "hanging",
+        "catenary": "hanging",
+        "catenary-unequal": "hanging",
+        "catenary-elastic": "hanging",
+        "circular-membrane": "membranes",
+        "stretched-membrane": "membranes",
+        "hanging-chain": "membranes",
+        "released-mode": "membranes",
+        "hinge-strip": "hinges",
+        "wide-strip": "hinges",
+        "hinge-sheet": "hinges",
+        "hinge-plate": "hinges",
+        "tip-load": "cantilevers",
+        "roll-up": "cantilevers",
+        "heavy-cantilever": "cantilevers",
+        "coiling-strip": "cantilevers",
+        "cloth-overhang": "cantilevers",
+        "strip-vibration": "hinges",
+    },
+)
