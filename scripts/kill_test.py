@@ -33,7 +33,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from lyra_petsc.api.mpirun import environment, find_launcher
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 PATIENCE = 20.0
 """Seconds within which the other ranks must be gone."""
@@ -205,7 +205,7 @@ def table(path: Path) -> np.ndarray:
 
 
 def last_state(out: Path) -> tuple[float, np.ndarray]:
-    run = Run(out)
+    run = StoredRun(out)
     return float(run.times[-1]), run.positions[-1]
 
 

@@ -29,7 +29,7 @@ import click
 import numpy as np
 
 from lyra_petsc.api.mpirun import environment, find_launcher
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 BROWSER = (
     "--headless=new",
@@ -80,21 +80,21 @@ def open_page(browser: str, url: str, folder: str) -> subprocess.Popen[bytes]:
 
 def intervals(page: int, group: int | None, out: Path, seconds: float, count: int) -> list[int]:
     """Rows of history.csv at the ends of the intervals; in the first, third, … the page is stopped."""
-    rows = [len(Run(out).history["step"])]
+    rows = [len(StoredRun(out).history["step"])]
     for i in range(count):
         number = signal.SIGCONT if i % 2 else signal.SIGSTOP
         os.kill(page, number)
         if group is not None:
             os.killpg(group, number)
         time.sleep(seconds)
-        rows.append(len(Run(out).history["step"]))
+        rows.append(len(StoredRun(out).history["step"]))
     os.kill(page, signal.SIGCONT)
     return rows
 
 
 def ratios(out: Path, rows: Sequence[int]) -> list[float]:
     """Time per linear iteration with the page over that without, for pairs of neighbouring intervals."""
-    history = Run(out).history
+    history = StoredRun(out).history
     wall, work = np.asarray(history["wall_seconds"]), np.asarray(history["linear_iterations"])
     # a step at the end of an interval belongs to neither
     costs = [wall[a + 1 : b].sum() / max(work[a + 1 : b].sum(), 1) for a, b in itertools.pairwise(rows)]

@@ -36,7 +36,7 @@ from mpi4py import MPI  # noqa: E402
 
 from lyra_petsc.errors import SolverError  # noqa: E402
 from lyra_petsc.scene.load import load_scene  # noqa: E402
-from lyra_petsc.stepping.simulation import Simulation  # noqa: E402
+from lyra_petsc.stepping.simulation import SteppedScene  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 REFERENCE = json.loads((ROOT / "tests" / "reference" / "paper.json").read_text(encoding="utf-8"))
@@ -72,7 +72,7 @@ def run(setting: str) -> dict[str, Any]:
     scene = load_scene(
         ROOT / "configs" / "paper.yaml", (f"time.integrator={integrator}", f"time.step={float(step):.12f}")
     )
-    simulation = Simulation(MPI.COMM_WORLD, scene)
+    simulation = SteppedScene(MPI.COMM_WORLD, scene)
     times, mean = np.array(REFERENCE["times"]), REFERENCE["mean"]
     system = simulation.problem.system
     mass = system.mass[:, None]

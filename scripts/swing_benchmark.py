@@ -30,7 +30,7 @@ from mpi4py import MPI  # noqa: E402
 
 from lyra_petsc.errors import SolverError  # noqa: E402
 from lyra_petsc.scene.load import load_scene  # noqa: E402
-from lyra_petsc.stepping.simulation import Simulation  # noqa: E402
+from lyra_petsc.stepping.simulation import SteppedScene  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 END = 0.4  # s
@@ -67,7 +67,7 @@ def measure(c11: float, setting: str, cells: int, more: tuple[str, ...]) -> dict
         ROOT / "configs" / "swing.yaml", (*(f"{key}={value}" for key, value in values.items()), *more)
     )
     begun = time.process_time()
-    simulation = Simulation(MPI.COMM_WORLD, scene)
+    simulation = SteppedScene(MPI.COMM_WORLD, scene)
     stepping = time.process_time()
     reports, failure = [], ""
     try:

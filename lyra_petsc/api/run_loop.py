@@ -21,7 +21,7 @@ from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 StopAsked = Callable[[], int]
 """Returns the signal by which any rank was asked to stop, else 0; collective."""
@@ -30,19 +30,19 @@ StopAsked = Callable[[], int]
 class ProgressCallbacks:
     """Called on all ranks while a run goes on; to be overridden."""
 
-    def begin(self, simulation: Simulation, folder: Path) -> None:
+    def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """The initial state, or that of the checkpoint, is on disk in ``folder``."""
 
     def note(self, text: str) -> None:
         """There is something that the user should know."""
 
-    def step(self, simulation: Simulation, report: StepReport) -> None:
+    def step(self, simulation: SteppedScene, report: StepReport) -> None:
         """A step was accepted and recorded."""
 
     def close(self) -> None:
         """No step follows, whatever the reason."""
 
-    def done(self, simulation: Simulation, folder: Path) -> None:
+    def done(self, simulation: SteppedScene, folder: Path) -> None:
         """The run has reached its end, and all its files are written."""
 
 
@@ -67,7 +67,7 @@ def simulate(
     """
     with RunDirectory(comm, choice) as directory:  # locked before the set-up, which may take long
         import_ahead()
-        simulation = Simulation(comm, scene, phases)
+        simulation = SteppedScene(comm, scene, phases)
         try:
             recorder = Recorder(simulation)
             if directory.note:
@@ -98,7 +98,7 @@ class _RunLoop:
 
     def __init__(
         self,
-        simulation: Simulation,
+        simulation: SteppedScene,
         recorder: Recorder,
         folder: Path,
         callbacks: ProgressCallbacks,

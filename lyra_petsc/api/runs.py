@@ -16,10 +16,10 @@ from lyra_petsc.api.run_loop import ProgressCallbacks, StopAsked, simulate
 from lyra_petsc.api.scenes import SceneLike, load
 from lyra_petsc.api.simulations import refuse_mixed_options
 from lyra_petsc.errors import Interrupted
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 OnStep = Callable[[StepReport], object]
 
@@ -33,7 +33,7 @@ def run(
     trust_mesh: bool = False,
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
-) -> Run:
+) -> StoredRun:
     """What `lyra_petsc.run` does beside showing progress, with its parameters and errors; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
     loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
@@ -44,14 +44,14 @@ def run(
             folder = simulate(comm, loaded, choice, _Callback(on_step), stop_asked)
     except Interrupted as stopped:
         raise KeyboardInterrupt(str(stopped)) from None
-    return Run(folder)
+    return StoredRun(folder)
 
 
 class _Callback(ProgressCallbacks):
     def __init__(self, on_step: OnStep | None) -> None:
         self._on_step = on_step
 
-    def step(self, simulation: Simulation, report: StepReport) -> None:
+    def step(self, simulation: SteppedScene, report: StepReport) -> None:
         if self._on_step is not None:
             self._on_step(report)
 

@@ -18,7 +18,7 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output.fields import FIELDS, check_field
 from lyra_petsc.parallel import on_root, take_back_signals
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation as Stepping
+from lyra_petsc.stepping.simulation import SteppedScene
 
 take_back_signals()  # the import of PETSc has replaced them
 
@@ -104,8 +104,8 @@ class Simulation:
         self.scene: Scene = loaded
         refuse_mixed_options(loaded)
         with np.errstate(over="ignore", invalid="ignore"):
-            stepping = Stepping(self.comm, loaded)
-        self._stepping: Stepping | None = stepping
+            stepping = SteppedScene(self.comm, loaded)
+        self._stepping: SteppedScene | None = stepping
         problem = stepping.problem
         self.mesh: Mesh | None = problem.mesh
         self.vertices: NDArray[np.int64] = problem.points.original
@@ -226,7 +226,7 @@ class Simulation:
     # -- end -----------------------------------------------------------------------------------------
 
     @property
-    def _running(self) -> Stepping:
+    def _running(self) -> SteppedScene:
         if self._stepping is None:
             raise ValueError("this simulation is closed")
         return self._stepping

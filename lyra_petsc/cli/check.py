@@ -21,7 +21,7 @@ from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.json_schema import schema_text
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import one_line
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 Counts = NDArray[np.int64]
 
@@ -39,7 +39,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     """
     path = path or default_scene()
     scene = read_scene(comm, path, settings, trust_mesh=trust_mesh)
-    simulation = Simulation(comm, scene, Phases(tell=say))
+    simulation = SteppedScene(comm, scene, Phases(tell=say))
     Recorder(simulation)
     problem = simulation.problem
     points, pattern = problem.points, problem.pattern
@@ -58,11 +58,11 @@ def print_schema(comm: MPI.Comm) -> None:
         print(schema_text(), end="")
 
 
-def _elements(simulation: Simulation) -> int:
+def _elements(simulation: SteppedScene) -> int:
     return sum(term.n_elements for term in simulation.problem.terms.values())
 
 
-def _print(simulation: Simulation, path: Path, ranks: Counts) -> None:
+def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
     problem, scene, control = simulation.problem, simulation.scene, simulation.control
     outline = problem.outline
     blocks = int(ranks[:, 2].sum())
@@ -142,7 +142,7 @@ def _megabytes(ranks: Counts) -> float:
     return float((ranks[:, 2] * 9 * 8 * 4 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 
 
-def _solver_options(simulation: Simulation) -> str:
+def _solver_options(simulation: SteppedScene) -> str:
     stepper = simulation.stepper
     options = PETSc.Options()
     named = [f"-{name} {options.getString(name, '')}" for name in stepper.our_options]

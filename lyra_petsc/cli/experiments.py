@@ -147,11 +147,12 @@ def verify(
         A signal; what had been done is in the folder.
     """
     from lyra_petsc.experiments.verification import answers
-    from lyra_petsc.experiments.verification.verification_report import Verification
+    from lyra_petsc.experiments.verification.answers import Verification
+    from lyra_petsc.experiments.verification.cases import CASES
 
     if listed:
-        return _list(comm, answers.CASES.all(), f"{len(answers.CASES.modules)} cases")
-    cases = [answers.CASES.load(name) for name in dict.fromkeys(names or answers.CASES.modules)]
+        return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
+    cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
     again, view = command(comm, "verify", [*names, *(["--quick"] if quick else [])]), Verification()
     results = Results(comm, out, view, ranks=comm.size, command=again, force=force)
     watch = watched(comm)
@@ -160,7 +161,7 @@ def verify(
         results,
         cases,
         lambda case: answers.run_case(comm, case, quick=quick, watch=watch),
-        len(answers.CASES.modules),
+        len(CASES.modules),
     )
 
 
@@ -188,17 +189,18 @@ def stress(
         A signal; what had been done is in the folder.
     """
     from lyra_petsc.experiments.stress import trials
-    from lyra_petsc.experiments.stress.stress_report import Stress
+    from lyra_petsc.experiments.stress.cases import FAMILIES, selected
     from lyra_petsc.experiments.stress.stress_scenes import Scope, StressCase, setting_of
+    from lyra_petsc.experiments.stress.trials import Stress
 
     if quick and full:
         raise InputError("give one of --quick and --full", key="--quick")
     level = Scope.QUICK if quick else Scope.FULL if full else Scope.USUAL
     names = [name.strip() for text in only for name in text.split(",") if name.strip()]
-    cases, known = trials.selected(names, level), len(trials.selected((), Scope.FULL))
+    cases, known = selected(names, level), len(selected((), Scope.FULL))
     if listed:
         count = f"{len(cases)} of {known} cases; --full has all"
-        return _list(comm, cases, count, lambda c: f"{c.family}: {trials.FAMILIES.load(c.family).title}")
+        return _list(comm, cases, count, lambda c: f"{c.family}: {FAMILIES.load(c.family).title}")
     setting = on_root(comm, lambda: setting_of(scene, settings, level))
     launcher = case_launcher(comm, "stress", ranks)
     first = FOLDER / (scene.stem if scene is not None else "sheet")

@@ -19,7 +19,7 @@ def report(comm: Any, run: Path, out: Path | None) -> None:
     """One HTML page about RUN: pictures, energy, steps, time, settings, notes, what to change."""
     from lyra_petsc.extras import require
     from lyra_petsc.parallel import on_root
-    from lyra_petsc.show.report.page_file import write_page
+    from lyra_petsc.show.report.run_page import write_page
 
     require("report", ("matplotlib", "jinja2"))
     path = on_root(comm, lambda: write_page(run, out))

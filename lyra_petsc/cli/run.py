@@ -23,7 +23,7 @@ from lyra_petsc.phases import Phases
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 if TYPE_CHECKING:
     from lyra_petsc.cli.view import Served
@@ -124,7 +124,7 @@ class TerminalProgress(ProgressCallbacks):
         with suppress(OSError):
             print(text, file=sys.stderr, flush=True)
 
-    def begin(self, simulation: Simulation, folder: Path) -> None:
+    def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """Start the progress bar, and show the run on the page."""
         self._progress = Progress(
             self._comm,
@@ -143,7 +143,7 @@ class TerminalProgress(ProgressCallbacks):
         """Print a line above the bar."""
         self._say(f"note: {text}")
 
-    def step(self, simulation: Simulation, report: StepReport) -> None:
+    def step(self, simulation: SteppedScene, report: StepReport) -> None:
         """Move the bar."""
         if self._progress is not None:
             iterations = report.newton_iterations, report.linear_iterations
@@ -157,7 +157,7 @@ class TerminalProgress(ProgressCallbacks):
         if self._progress is not None:
             self._progress.close()
 
-    def done(self, simulation: Simulation, folder: Path) -> None:
+    def done(self, simulation: SteppedScene, folder: Path) -> None:
         """Print where the time went, and which PETSc options nothing used."""
         simulation.stepper.ts.viewFromOptions("-ts_view")
         outcome = "done"

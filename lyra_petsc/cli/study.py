@@ -15,20 +15,10 @@ from lyra_petsc.cli.progress import StudyProgress
 from lyra_petsc.cli.run import petsc_speaks
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.case import load_record, save_record
-from lyra_petsc.experiments.study.jobs import (
-    REQUEST_FILE,
-    STUDY,
-    Job,
-    Request,
-    Result,
-    launched,
-    read_request,
-    report_progress,
-    run_case,
-)
-from lyra_petsc.experiments.study.plan import Plan, make_plan
-from lyra_petsc.experiments.study.references import choose_references
-from lyra_petsc.experiments.study.work import StudyOutcome, Work, conduct
+from lyra_petsc.experiments.study.jobs import STUDY, Job, Result, launched, report_progress, run_case
+from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
+from lyra_petsc.experiments.study.study_report import StudyOutcome, conduct
+from lyra_petsc.experiments.study.work import Work, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.default import default_scene

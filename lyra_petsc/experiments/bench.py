@@ -21,7 +21,7 @@ from lyra_petsc.parallel import all_here, on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.messages import input_error
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,12 +31,12 @@ TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 
 
 @contextmanager
-def simulated(comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> Iterator[Simulation]:
+def simulated(comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> Iterator[SteppedScene]:
     """A simulation, freed with the options it set when the block ends; collective."""
     before = set(PETSc.Options().getAll())
     simulation, alone = None, False
     try:
-        simulation = Simulation(comm, scene, phases)
+        simulation = SteppedScene(comm, scene, phases)
         yield simulation
     except BaseException as error:
         # this rank may be alone with its error, and freeing would wait for the others
@@ -69,12 +69,12 @@ class Trial:
 
     Attributes
     ----------
-    simulation : Simulation
+    simulation : SteppedScene
     start : (V, 3) array
         Positions [m] in mesh order before the first step.
     """
 
-    def __init__(self, bench: Bench, simulation: Simulation) -> None:
+    def __init__(self, bench: Bench, simulation: SteppedScene) -> None:
         self._bench = bench
         self.simulation = simulation
         self.start = self.x

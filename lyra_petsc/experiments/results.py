@@ -17,8 +17,7 @@ from lyra_petsc.experiments.case import Case, Outcome, passed_of
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
-from lyra_petsc.show.report.closing import close, lacking
-from lyra_petsc.show.report.document import Report
+from lyra_petsc.show.report.document import Report, close, lacking
 
 O = TypeVar("O", bound=Outcome[Any])  # noqa: E741
 C = TypeVar("C", bound=Case)

@@ -48,7 +48,7 @@ COLUMNS = {"velocity": (3,), "displacement": (3,)}
 """Shape of a row of the fields that are vectors."""
 
 
-class Run:
+class StoredRun:
     """The results of one run. Nothing is read before it is asked for, no file stays open.
 
     Parameters

@@ -29,7 +29,7 @@ from lyra_petsc.output.xdmf import group_name
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, changes, dump_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Recorder:
 
     Parameters
     ----------
-    simulation : Simulation
+    simulation : SteppedScene
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Recorder:
         For a field that the scene cannot have.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
         problem = simulation.problem
         self._fields: list[Field] = chosen(problem)

@@ -11,13 +11,13 @@ from lyra_petsc.extras import require
 from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 
 if TYPE_CHECKING:
-    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.output.read_run import StoredRun
 
 WIDTHS = {"velocity": "axis", "displacement": "axis"}
 """What the last axis of a vector counts; that of a tensor: components in the material axes."""
 
 
-def dataset(run: Run, states: Sequence[int]) -> Any:
+def dataset(run: StoredRun, states: Sequence[int]) -> Any:
     """Times, positions, rest shape, triangles and fields of some states, with units; see `Run.dataset`."""
     require("dataset", ("xarray",), "export")
     import xarray
@@ -41,5 +41,5 @@ def dataset(run: Run, states: Sequence[int]) -> Any:
     return xarray.Dataset(content, {"time": time, **axes}, {"title": run.scene.title}).swap_dims(state="time")
 
 
-def _variable(run: Run, name: str, dimensions: tuple[str, ...], arrays: list[Any]) -> tuple[Any, ...]:
+def _variable(run: StoredRun, name: str, dimensions: tuple[str, ...], arrays: list[Any]) -> tuple[Any, ...]:
     return dimensions, np.stack(arrays), {"units": run.field_units(name)}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import LyraError, in_python
 from lyra_petsc.extras import require
-from lyra_petsc.output import read_run
+from lyra_petsc.output.read_run import StoredRun
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -65,7 +65,7 @@ class Media:
         return f"<{self.kind}, {len(self.data)} bytes>"
 
 
-class Run(read_run.Run):
+class Run(StoredRun):
     """The results of a run; reads what was asked for and keeps no file open.
 
     Parameters
@@ -139,7 +139,7 @@ class Run(read_run.Run):
         """
         with in_python():
             require("report", ("matplotlib", "jinja2"))
-            from lyra_petsc.show.report.page_file import write_page
+            from lyra_petsc.show.report.run_page import write_page
 
             path = write_page(self.folder, None if out is None else Path(out))
             return Media(path.read_bytes(), "text/html")

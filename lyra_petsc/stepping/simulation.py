@@ -73,7 +73,7 @@ def _positive(name: str, seconds: float) -> float:
     return seconds
 
 
-class Simulation:
+class SteppedScene:
     """Set up a scene and step through it; every method is collective.
 
     Parameters

@@ -36,11 +36,11 @@ from petsc4py import PETSc  # noqa: E402
 from lyra_petsc import phases  # noqa: E402
 from lyra_petsc.errors import LyraError  # noqa: E402
 from lyra_petsc.linear.matrix import AssembledMatrix  # noqa: E402
-from lyra_petsc.output.read_run import Run  # noqa: E402
+from lyra_petsc.output.read_run import StoredRun  # noqa: E402
 from lyra_petsc.output.recorder import Recorder  # noqa: E402
 from lyra_petsc.output.summary import versions  # noqa: E402
 from lyra_petsc.scene.schema import Scene  # noqa: E402
-from lyra_petsc.stepping.simulation import Simulation  # noqa: E402
+from lyra_petsc.stepping.simulation import SteppedScene  # noqa: E402
 
 FEWEST = 2
 """Steps that are measured however long they take."""
@@ -115,7 +115,7 @@ def steps(comm: Comm, job: Result) -> Result:
     forget_peak()
     before, _ = resident()
     began = now(comm)
-    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
     simulation.problem.release()
     built = now(comm) - began
     simulation.step()
@@ -177,7 +177,7 @@ def meshes(comm: Comm, job: Result) -> Result:
     simulations, found = {}, {}
     for name, scene in job["scenes"].items():
         began = time.process_time()
-        simulation = Simulation(comm, Scene.model_validate(scene))
+        simulation = SteppedScene(comm, Scene.model_validate(scene))
         simulation.problem.release()
         simulation.step()
         simulations[name] = simulation
@@ -214,7 +214,7 @@ def apart(comm: Comm, job: Result) -> Result:
 
 def overhead(comm: Comm, job: Result) -> Result:
     """Steps a second in ``blocks`` blocks of ``steps``, nothing logged."""
-    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
     for _ in range(job["warm_up"]):
         simulation.step()
     rates, newton = [], 0
@@ -234,7 +234,7 @@ def overhead(comm: Comm, job: Result) -> Result:
 def output(comm: Comm, job: Result) -> Result:
     """States with their checkpoints, by turns with plain files of the same sizes; all on the disk (fsync)."""
     folder = Path(job["folder"])
-    simulation = Simulation(comm, Scene.model_validate(job["scene"]))
+    simulation = SteppedScene(comm, Scene.model_validate(job["scene"]))
     recorder = Recorder(simulation)
     recorder.begin(folder)
     ours, raw, sizes = [], [], []
@@ -244,7 +244,7 @@ def output(comm: Comm, job: Result) -> Result:
         recorder.write_state()
         recorder.settle()
         ours.append(now(comm) - began)
-        run = Run(folder)
+        run = StoredRun(folder)
         state = run.positions[number].nbytes + sum(run.field(name)[number].nbytes for name in run.fields)
         written = [state, (folder / "checkpoint.h5").stat().st_size]
         blocks = [os.urandom(size) for size in written] if comm.rank == 0 else []

@@ -53,7 +53,7 @@ from petsc4py import PETSc
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.phases import COMPILE, STAGES, Phases
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 PETSc.Log.begin()
 
 @cached()
@@ -65,7 +65,7 @@ def outer(x):
     return inner(x) * 2.0
 
 phases = Phases()
-simulation = Simulation(MPI.COMM_SELF, load_scene(Path({str(write_scene(tmp_path))!r}), []), phases)
+simulation = SteppedScene(MPI.COMM_SELF, load_scene(Path({str(write_scene(tmp_path))!r}), []), phases)
 stage = STAGES["solve"].id
 before = COMPILE.getPerfInfo(stage)["count"], phases.seconds().get("compilation", 0.0)
 with phases("solve"):

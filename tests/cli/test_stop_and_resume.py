@@ -13,7 +13,7 @@ import pytest
 from launch import DIRECT, Left, done, finish, lyra, start, write_scene
 from numpy.typing import NDArray
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.states import stored_states
 
 LONG = """\
@@ -40,7 +40,7 @@ def history(folder: Path, name: str = "history.csv") -> list[dict[str, str]]:
 
 
 def final_state(folder: Path) -> tuple[float, NDArray[np.float64]]:
-    run = Run(folder)
+    run = StoredRun(folder)
     return float(run.times[-1]), run.positions[-1]
 
 
@@ -151,7 +151,7 @@ FAILING = """
 import sys
 from mpi4py import MPI
 import lyra_petsc.{module} as module
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.states import stored_states
 from lyra_petsc.cli.app import run_command_line
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from launch import lyra, start, without_pictures, write_scene
 
-from lyra_petsc.experiments.stress.stress_report import Stress
-from lyra_petsc.experiments.stress.trials import FAMILIES
+from lyra_petsc.experiments.stress.cases import FAMILIES
+from lyra_petsc.experiments.stress.trials import Stress
 
 TWO = ["--only", "one-triangle,chain-1e6"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from launch import lyra, start, without_pictures
 
-from lyra_petsc.experiments.verification.answers import CASES
+from lyra_petsc.experiments.verification.cases import CASES
 
 
 def test_list_names_every_case(tmp_path: Path) -> None:

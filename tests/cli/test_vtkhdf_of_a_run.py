@@ -9,7 +9,7 @@ import pytest
 from launch import done, write_scene
 from vtkhdf_reader import read
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.scene.schema import FIELDS
 
@@ -17,7 +17,7 @@ ON = ["--set", "output.vtkhdf=true", "--set", f"output.fields=[{', '.join(FIELDS
 
 
 def check(folder: Path) -> None:
-    run = Run(folder)
+    run = StoredRun(folder)
     found = read(folder / "states.vtkhdf")
     np.testing.assert_array_equal([time for time, *_ in found], run.times)
     for i, (_, points, triangles, arrays) in enumerate(found):
@@ -39,7 +39,7 @@ def test_every_time_and_field(tmp_path: Path, ranks: int) -> None:
     check(tmp_path / "out")
     done(["run", scene, "--out", "out", "--resume", *ON], tmp_path, ranks)
     check(tmp_path / "out")
-    assert len(Run(tmp_path / "out")) > 3
+    assert len(StoredRun(tmp_path / "out")) > 3
 
 
 def test_a_scene_that_does_not_name_it_has_no_such_files(tmp_path: Path) -> None:

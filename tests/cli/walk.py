@@ -48,7 +48,7 @@ def simulate(scene: Path, words: list[str]) -> int:
     from lyra_petsc.cli.arguments import petsc_cannot_start, split
     from lyra_petsc.errors import LyraError
     from lyra_petsc.scene.load import load_scene
-    from lyra_petsc.stepping.simulation import Simulation
+    from lyra_petsc.stepping.simulation import SteppedScene
 
     ours, petsc = split(words)
     why = petsc_cannot_start(petsc)
@@ -57,7 +57,9 @@ def simulate(scene: Path, words: list[str]) -> int:
         return 2
     PETSc.Options().insertString(" ".join(petsc))
     try:
-        simulation = Simulation(MPI.COMM_WORLD, load_scene(scene, [word for word in ours if word != "--set"]))
+        simulation = SteppedScene(
+            MPI.COMM_WORLD, load_scene(scene, [word for word in ours if word != "--set"])
+        )
         simulation.step()
         simulation.destroy()
     except LyraError as error:
@@ -105,10 +107,10 @@ def main() -> None:
 
     from lyra_petsc.phases import Phases
     from lyra_petsc.scene.load import load_scene
-    from lyra_petsc.stepping.simulation import Simulation
+    from lyra_petsc.stepping.simulation import SteppedScene
 
     for settings in ([], ["petsc.pc_type=mg"], ["petsc.mat_type=aij"]):
-        simulation = Simulation(MPI.COMM_SELF, load_scene(folder / "scene.yaml", settings), Phases())
+        simulation = SteppedScene(MPI.COMM_SELF, load_scene(folder / "scene.yaml", settings), Phases())
         simulation.step()
         simulation.destroy()
     gc.collect()

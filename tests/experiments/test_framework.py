@@ -16,8 +16,8 @@ from mpi4py import MPI
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Outcome, Registry, Verdict, load_record, passed_of, save_record
 from lyra_petsc.experiments.results import Line, Results, View, aligned
-from lyra_petsc.experiments.stress.trials import FAMILIES
-from lyra_petsc.experiments.verification.answers import CASES
+from lyra_petsc.experiments.stress.cases import FAMILIES
+from lyra_petsc.experiments.verification.cases import CASES
 from lyra_petsc.show.report.document import Report
 
 GOOD, BAD = Verdict(True, "as it should be"), Verdict(False, "off by a half")

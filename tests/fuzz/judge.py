@@ -274,12 +274,12 @@ def _unreadable(out: Path) -> str:
     import numpy as np
 
     from lyra_petsc.errors import InputError
-    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.output.read_run import StoredRun
 
     if not (out / "states.xdmf").exists():
         return "no states.xdmf"
     try:
-        np.asarray(Run(out).positions)
+        np.asarray(StoredRun(out).positions)
     except InputError as error:
         return str(error)
     return ""

@@ -121,11 +121,11 @@ def test_terms_that_the_scene_does_not_name_are_not_loaded() -> None:
 import sys
 from mpi4py import MPI
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 grid = {"width": 1.0, "height": 1.0, "nx": 2, "ny": 2}
 stuff = {"density": 0.1, "membrane": {"c11": 10, "c22": 10, "c12": 0, "c33": 5}, "bending": 0}
 scene = {"mesh": {"grid": grid}, "material": stuff, "time": {"end": 0.01, "step": 0.01}}
-Simulation(MPI.COMM_SELF, Scene.model_validate(scene)).step()
+SteppedScene(MPI.COMM_SELF, Scene.model_validate(scene)).step()
 print(sorted(name.split(".")[-1] for name in sys.modules if name.startswith("lyra_petsc.terms.")))
 """
     done = subprocess.run(

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
 from lyra_petsc.linear.failed_factors import MARGIN, forget
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 FAILED = PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
 WORKSPACE = "mat_mumps_icntl_14"
@@ -89,7 +89,7 @@ def test_mumps_gets_more_workspace(comm: MPI.Comm, integrator: str) -> None:
         for name, value in {**asked, WORKSPACE: margin}.items():
             database.setValue(name, value)
         try:
-            simulation = Simulation(comm, scene_of(scene))
+            simulation = SteppedScene(comm, scene_of(scene))
             simulation.step()
             simulation.step()
             assert simulation.notes == []

@@ -16,7 +16,7 @@ from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -50,7 +50,7 @@ def stepped(
     for name, value in given.items():
         options[name] = value
     try:
-        simulation = Simulation(comm, Scene.model_validate(content))
+        simulation = SteppedScene(comm, Scene.model_validate(content))
         filled = simulation.stepper.our_options
         reports = [simulation.step() for _ in range(steps)]
         counts = [report.linear_iterations // (1 + report.rejected) for report in reports]
@@ -173,7 +173,7 @@ class Scaling:
 def test_sweeps_that_grow_without_bound_are_negative_curvature(comm: MPI.Comm) -> None:
     """In the sixth step the exact Hessian, tried as its own preconditioner, is indefinite."""
     settings = ("time.integrator=alpha2", "time.step=0.01")
-    simulation = Simulation(comm, load_scene(ROOT / "configs" / "swing.yaml", settings))
+    simulation = SteppedScene(comm, load_scene(ROOT / "configs" / "swing.yaml", settings))
     for _ in range(7):
         simulation.step()
     assert simulation.stepper.preset == "multigrid-w"
@@ -189,7 +189,7 @@ def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm
         for name, value in given.items():
             database[name] = value
         try:
-            simulation = Simulation(comm, Scene.model_validate(hanging(25)))
+            simulation = SteppedScene(comm, Scene.model_validate(hanging(25)))
             simulation.step()
             linear = simulation.stepper.linear
             assert isinstance(linear.operator, AssembledMatrix if with_entries else BlockMatrix)

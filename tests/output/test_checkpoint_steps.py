@@ -14,7 +14,7 @@ from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel
 
@@ -39,7 +39,7 @@ def test_checkpoints_by_steps(
             "output": {"every": 0.08, "checkpoint": checkpoint},
         }
     )
-    simulation = Simulation(comm, scene)
+    simulation = SteppedScene(comm, scene)
     recorder = Recorder(simulation)
     recorder.begin(shared_tmp)
     steps = [written(comm, shared_tmp)]

@@ -14,7 +14,7 @@ from lyra_petsc.output.checkpoint import CHECKPOINT, PREVIOUS, checkpoint_file, 
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 pytestmark = pytest.mark.quick
 
@@ -42,7 +42,7 @@ def run(whole, tmp_path):
 
 def read_all(folder):
     """All that a run's folder holds; numbers that are read are those that were written."""
-    run = Run(folder)
+    run = StoredRun(folder)
     for i in range(len(run)):
         run.positions[i]
         assert np.isfinite(run.positions[i]).all()
@@ -228,9 +228,9 @@ def test_states_of_another_shape(run, values):
 def test_mistyped_summaries(run, text):
     (run / "summary.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        _ = Run(run).summary
+        _ = StoredRun(run).summary
     assert "summary.json" in one_line(caught)
-    assert Run(run).positions[0].shape == REST.shape
+    assert StoredRun(run).positions[0].shape == REST.shape
 
 
 @pytest.mark.parametrize(
@@ -241,7 +241,7 @@ def test_tables_cut_short(run, text):
     header, row, *_ = path.read_text(encoding="utf-8").splitlines()
     path.write_text(text.format(header=header, row=row), encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        _ = Run(run).history
+        _ = StoredRun(run).history
     assert "history.csv" in one_line(caught)
 
 
@@ -251,7 +251,7 @@ def test_a_table_of_other_numbers(run):
     for new in ("nan", "inf", "99999999999999999999999", ""):
         path.write_text(text.replace("0.5", new), encoding="utf-8")
         if new == "99999999999999999999999":
-            _ = Run(run).history
+            _ = StoredRun(run).history
             continue
         with pytest.raises(InputError, match=r"history\.csv"):
-            _ = Run(run).history
+            _ = StoredRun(run).history

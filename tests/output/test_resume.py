@@ -21,7 +21,7 @@ from physics import CLOTH, grid, scene_of
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.errors import Interrupted
 from lyra_petsc.output.h5py_loader import import_h5py
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.states import stored_states
 
@@ -161,7 +161,7 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
             assert told[key] == others[key], key
     states = [(state.number, state.step) for state in stored_states(straight)]
     assert [(state.number, state.step) for state in stored_states(resumed)] == states
-    mine, other = Run(resumed), Run(straight)
+    mine, other = StoredRun(resumed), StoredRun(straight)
     np.testing.assert_allclose(mine.times, other.times, rtol=1e-9, atol=0)
     assert mine.fields == other.fields == ("velocity", "stress")
 
@@ -200,7 +200,7 @@ def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, sh
             # which of several equilibria of the slack sheet it passes at half the load, and so the work, is
             # decided by round-off, also in runs that nobody stops: only the end is one
             for folder in (halted, alone):
-                shapes = Run(folder).positions[-1], Run(straight).positions[-1]
+                shapes = StoredRun(folder).positions[-1], StoredRun(straight).positions[-1]
                 np.testing.assert_allclose(*shapes, rtol=0, atol=1e-5)
             return
         same_files(halted, straight, 1e-11 if comm.size == 1 else 1e-7, exact=comm.size == 1)
@@ -226,7 +226,7 @@ def test_displacement_is_from_the_first_state_also_after_resuming(comm: MPI.Comm
     journey(comm, scene, shared_tmp / "run", 2)
     journey(comm, scene | {"initial": {"noise": 2e-3}}, shared_tmp / "run", None, resume=True)
     if comm.rank == 0:
-        run = Run(shared_tmp / "run")
+        run = StoredRun(shared_tmp / "run")
         assert len(run) == 6
         moved = np.asarray(run.positions) - run.positions[0]
         np.testing.assert_array_equal(run.field("displacement"), moved)

@@ -7,12 +7,12 @@ from written_run import REST, TRIANGLES, Writer, position, stress, velocity, wri
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output import read_run as tables
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.schema import FIELDS
 
 
 def test_states_are_read_as_they_were_written(tmp_path):
-    run = Run(written(tmp_path / "run", states=4))
+    run = StoredRun(written(tmp_path / "run", states=4))
 
     assert len(run) == len(run.positions) == 4
     np.testing.assert_array_equal(run.times, [0.0, 0.1, 0.2, 0.1 * 3])
@@ -29,7 +29,7 @@ def test_states_are_read_as_they_were_written(tmp_path):
 
 
 def test_a_slice_of_states_reads_nothing_yet(tmp_path):
-    run = Run(written(tmp_path, states=6))
+    run = StoredRun(written(tmp_path, states=6))
     chosen = run.positions[1:-1:3]
     (tmp_path / "states-0004.h5").unlink()
 
@@ -42,13 +42,13 @@ def test_a_slice_of_states_reads_nothing_yet(tmp_path):
 
 
 def test_nearest_state(tmp_path):
-    run = Run(written(tmp_path, states=4))
+    run = StoredRun(written(tmp_path, states=4))
     assert [run.at(time) for time in (-1.0, 0.0, 0.14, 0.16, 9.0)] == [0, 0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("vt", ["none", "each vertex", "seam"])
 def test_texture_coordinates(tmp_path, vt):
-    run = Run(written(tmp_path, vt=vt))
+    run = StoredRun(written(tmp_path, vt=vt))
     expected = REST[TRIANGLES][..., :2] / 3.0
     if vt == "none":
         assert run.uv is None
@@ -65,13 +65,13 @@ def test_texture_coordinates(tmp_path, vt):
 def test_a_run_that_goes_on(tmp_path):
     writer = Writer(tmp_path)
     with pytest.raises(InputError, match="is not the folder of a run"):
-        Run(tmp_path)
+        StoredRun(tmp_path)
     (tmp_path / "run.lock").touch()
     with pytest.raises(InputError, match="no state is written yet"):
-        Run(tmp_path)
+        StoredRun(tmp_path)
 
     writer.write()
-    run = Run(tmp_path)
+    run = StoredRun(tmp_path)
     assert len(run.history["step"]) == 1
     assert not run.refresh()
     writer.write()
@@ -97,7 +97,7 @@ def test_history_is_a_frame_where_pandas_is(tmp_path, monkeypatch, pandas):
     folder = written(tmp_path, states=3)
     with (folder / "history.csv").open("a") as half:
         half.write("3,0.30000000000000004,0.1")
-    run = Run(folder)
+    run = StoredRun(folder)
 
     assert isinstance(run.history, dict) is not pandas
     assert list(run.history["step"]) == [0, 1, 2]
@@ -109,7 +109,7 @@ def test_history_is_a_frame_where_pandas_is(tmp_path, monkeypatch, pandas):
 
 def test_dataset(tmp_path):
     pytest.importorskip("xarray")
-    data = Run(written(tmp_path, states=5)).dataset(every=2)
+    data = StoredRun(written(tmp_path, states=5)).dataset(every=2)
     np.testing.assert_array_equal(data.time, [0.0, 0.2, 0.4])
     np.testing.assert_array_equal(data.position.sel(time=0.4), position(4))
     np.testing.assert_array_equal(data.velocity.sel(axis="z", time=0.2), velocity(2)[:, 2])
@@ -120,7 +120,7 @@ def test_dataset(tmp_path):
 
 
 def test_units_of_all_fields(tmp_path):
-    run = Run(written(tmp_path))
+    run = StoredRun(written(tmp_path))
     assert [run.field_units(name) for name in ("position", "velocity", "stress")] == ["m", "m/s", "N/m"]
     assert all(run.field_units(name) for name in FIELDS)
 
@@ -130,7 +130,7 @@ def test_scene_of_a_run_whose_mesh_file_is_gone(tmp_path):
     text = (folder / "scene.yaml").read_text()
     start, end = text.index("- grid"), text.index("material:")
     (folder / "scene.yaml").write_text(text[:start] + "- {file: /nowhere/flag.geo}\n" + text[end:])
-    assert str(Run(folder).scene.mesh[0].file) == "/nowhere/flag.geo"
+    assert str(StoredRun(folder).scene.mesh[0].file) == "/nowhere/flag.geo"
 
 
 def test_what_is_no_run(tmp_path):
@@ -143,23 +143,23 @@ def test_what_is_no_run(tmp_path):
         (tmp_path, "not the folder"),
     ):
         with pytest.raises(InputError, match=words):
-            Run(path)
+            StoredRun(path)
     with pytest.raises(InputError, match=r"no field 'velocit', did you mean 'velocity'"):
-        Run(folder).field("velocit")
+        StoredRun(folder).field("velocit")
     with pytest.raises(InputError, match="positions alone"):
-        _ = Run(written(tmp_path / "b", fields=False)).velocities
+        _ = StoredRun(written(tmp_path / "b", fields=False)).velocities
     (folder / "states.xdmf").write_text("<Xdmf")
     with pytest.raises(InputError, match=r"states\.xdmf: is damaged"):
-        Run(folder)
+        StoredRun(folder)
 
 
 def test_reading_needs_neither_mpi_nor_petsc(tmp_path):
     folder = written(tmp_path)
     program = f"""
 import sys
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 assert not {{"h5py", "pydantic", "pandas"}} & sys.modules.keys()
-run = Run({str(folder)!r})
+run = StoredRun({str(folder)!r})
 run.positions[-1], run.history, run.scene, run.uv, run.summary
 assert not any(name.startswith(("mpi4py", "petsc4py")) for name in sys.modules)
 """

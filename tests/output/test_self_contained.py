@@ -16,7 +16,7 @@ from written_run import written
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.study.comparison import read_here
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.output.self_contained import open_own
 from lyra_petsc.output.stored import open_stored
@@ -101,7 +101,7 @@ def attacked(folder: Path, way: str) -> Path:
 def test_states_elsewhere_are_refused(tmp_path: Path, way: str) -> None:
     folder = attacked(tmp_path, way)
     with pytest.raises(InputError) as caught:
-        _ = Run(folder).positions[1]
+        _ = StoredRun(folder).positions[1]
     assert "a run's folder must hold all of its results" in str(caught.value)
     assert str(folder / "states") in str(caught.value)
 
@@ -124,7 +124,7 @@ def test_links_out_of_the_folder_are_refused(tmp_path: Path, name: str) -> None:
     (folder / name).unlink(missing_ok=True)
     os.symlink("../secret", folder / name)
     with pytest.raises(InputError, match=f"{name}: is a link out of the folder"):
-        Run(folder)
+        StoredRun(folder)
 
 
 def test_the_folder_itself_may_be_a_link_and_hold_links(tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_the_folder_itself_may_be_a_link_and_hold_links(tmp_path: Path) -> None:
     os.rename(folder / "history.csv", folder / "steps.csv")
     os.symlink("steps.csv", folder / "history.csv")
     os.symlink("run", tmp_path / "link")
-    run = Run(tmp_path / "link")
+    run = StoredRun(tmp_path / "link")
     assert len(run.positions[1]) == 8
     assert len(run.history) == 3 or len(run.history["time"]) == 3
 
@@ -142,7 +142,7 @@ def test_no_reader_waits_for_a_pipe(tmp_path: Path) -> None:
     (folder / "history.csv").unlink()
     os.mkfifo(folder / "history.csv")
     with pytest.raises(InputError, match="is no plain file"):
-        Run(folder)
+        StoredRun(folder)
 
 
 def test_links_in_the_mesh_are_refused_by_all_that_read_it(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_links_in_the_mesh_are_refused_by_all_that_read_it(tmp_path: Path) -> No
     with h5py.File(folder / "mesh.h5", "r+") as file:
         del file["start"]
         file["start"] = h5py.ExternalLink("other.h5", "/start")
-    run = Run(folder)
+    run = StoredRun(folder)
     for read in (
         lambda: run.triangles,
         lambda: run.uv,

@@ -12,7 +12,7 @@ from written_run import TRIANGLES, stress, tensor, written
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.tensors import in_vtk_order, plane_components, six_components
 from lyra_petsc.output.xdmf import XDMF_FILE
@@ -30,7 +30,7 @@ def test_orders() -> None:
 
 
 def test_readers_take_both_forms(tmp_path: Path) -> None:
-    older, now = Run(written(tmp_path / "older")), Run(written(tmp_path / "now", six=True))
+    older, now = StoredRun(written(tmp_path / "older")), StoredRun(written(tmp_path / "now", six=True))
     np.testing.assert_array_equal(older.field("stress"), [stress(i) for i in range(3)])
     np.testing.assert_array_equal(now.field("stress"), [tensor(i) for i in range(3)])
     np.testing.assert_array_equal(quantity(now, "stress").values(2), quantity(older, "stress").values(2))
@@ -40,7 +40,7 @@ def test_a_tensor_of_another_width_is_damage(tmp_path: Path) -> None:
     path = written(tmp_path / "run", six=True) / XDMF_FILE
     path.write_text(path.read_text().replace('Dimensions="8 6"', 'Dimensions="8 5"'))
     with pytest.raises(InputError, match="damaged"):
-        Run(tmp_path / "run")
+        StoredRun(tmp_path / "run")
 
 
 def test_xdmf_is_a_tensor_to_vtk(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_exports(tmp_path: Path) -> None:
     run = written(tmp_path / "run", six=True)
     found = np.load(export_run(run, "npz").folder / "run.npz")
     np.testing.assert_array_equal(found["stress"], [tensor(i) for i in range(3)])
-    data = pytest.importorskip("xarray") and Run(run).dataset()
+    data = pytest.importorskip("xarray") and StoredRun(run).dataset()
     np.testing.assert_array_equal(data["stress"].sel(component="vv")[2], stress(2)[:, 1])
     reader = pytest.importorskip("vtkhdf_reader")
     steps = reader.read(export_run(run, "vtkhdf").folder / "run.vtkhdf")
@@ -77,7 +77,7 @@ def test_exports(tmp_path: Path) -> None:
     principal.GetCellDataArraySelection().EnableArray("stress")
     principal.Update()
     largest = principal.GetOutput().GetCellData().GetArray("stress - Sigma 1")
-    np.testing.assert_allclose(largest, quantity(Run(run), "stress").values(0), atol=1e-12)
+    np.testing.assert_allclose(largest, quantity(StoredRun(run), "stress").values(0), atol=1e-12)
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
@@ -113,7 +113,7 @@ def test_an_older_folder_goes_on_with_three_components(
     run(comm, shared_tmp / "older", 0.04, resume=True)
     comm.Barrier()
     if comm.rank == 0:
-        now, older = Run(shared_tmp / "now"), Run(shared_tmp / "older")
+        now, older = StoredRun(shared_tmp / "now"), StoredRun(shared_tmp / "older")
         assert len(now) == len(older) == 5
         for name in now.fields:
             expected = np.asarray([plane_components(rows) for rows in now.field(name)])

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from original_lyra import simulate
 
 from lyra_petsc.cli.run import run
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 SIDE = 16
 CONF = """{
@@ -52,7 +52,7 @@ def test_hanging_square_follows_the_original(
 
     run(MPI.COMM_SELF, tmp_path / "conf.json", [], out=None, force=False, resume=False)
 
-    found = Run(tmp_path / "runs" / "conf")
+    found = StoredRun(tmp_path / "runs" / "conf")
     assert found.times[5] == pytest.approx(0.2, abs=1e-12)
     ours = found.positions[5]
     theirs = simulate(

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from physics import reference
 
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 ROOT = Path(__file__).resolve().parents[2]
 ANSWERS = reference("paper")
@@ -24,7 +24,7 @@ ANSWERS = reference("paper")
 def end_of(integrator: str, step: float) -> tuple[float, float]:
     """Relative error of the kinetic energy and distance [m] of the centre of mass at t = 0.48 s."""
     settings = (f"time.integrator={integrator}", f"time.step={step}")
-    simulation = Simulation(MPI.COMM_SELF, load_scene(ROOT / "configs" / "paper.yaml", settings))
+    simulation = SteppedScene(MPI.COMM_SELF, load_scene(ROOT / "configs" / "paper.yaml", settings))
     try:
         while not simulation.finished:
             simulation.step()

@@ -12,16 +12,16 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.load import load_scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SHIPPED = ("drape", "flag", "paper", "plate", "sail", "spin", "swing")
 
 
 @contextmanager
-def simulated(name: str, *settings: str) -> Iterator[Simulation]:
+def simulated(name: str, *settings: str) -> Iterator[SteppedScene]:
     """A shipped scene with settings, run to its end on one rank."""
-    simulation = Simulation(MPI.COMM_SELF, load_scene(CONFIGS / f"{name}.yaml", settings))
+    simulation = SteppedScene(MPI.COMM_SELF, load_scene(CONFIGS / f"{name}.yaml", settings))
     try:
         while not simulation.finished:
             simulation.step()
@@ -30,7 +30,7 @@ def simulated(name: str, *settings: str) -> Iterator[Simulation]:
         simulation.destroy()
 
 
-def mean_of(simulation: Simulation, probe: str) -> NDArray[np.float64]:
+def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
     mean: NDArray[np.float64] = simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
     return mean
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import ToleranceControl
 
 Array = NDArray[np.float64]
@@ -32,13 +32,15 @@ SIZE = float(np.hypot(0.5, 0.1))
 
 
 @contextmanager
-def simulated(comm: MPI.Comm, options: dict[str, str] | None = None, **content: Any) -> Iterator[Simulation]:
-    """A scene in its Simulation; the options are removed again."""
+def simulated(
+    comm: MPI.Comm, options: dict[str, str] | None = None, **content: Any
+) -> Iterator[SteppedScene]:
+    """A scene that is set up; the options are removed again."""
     tight = {"ksp_rtol": "1e-8"} | (options or {})
     database = PETSc.Options()
     for name, value in tight.items():
         database.setValue(name, value)
-    simulation = Simulation(comm, scene_of(SWING | content))
+    simulation = SteppedScene(comm, scene_of(SWING | content))
     try:
         yield simulation
         simulation.destroy()
@@ -47,7 +49,7 @@ def simulated(comm: MPI.Comm, options: dict[str, str] | None = None, **content: 
             database.delValue(name)
 
 
-def positions(simulation: Simulation) -> Array:
+def positions(simulation: SteppedScene) -> Array:
     return gathered(simulation.problem.points, simulation.problem.system.x)
 
 

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import StepControl
 from lyra_petsc.terms.term import Step
 
@@ -30,8 +30,8 @@ STATIC = {"analysis": "static"}
 
 
 @contextmanager
-def done(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
-    simulation = Simulation(comm, scene_of(SHEET | content))
+def done(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
+    simulation = SteppedScene(comm, scene_of(SHEET | content))
     while not simulation.finished:
         simulation.step()
     yield simulation
@@ -101,7 +101,7 @@ def test_the_first_order_estimate_is_the_error_of_free_fall(comm: MPI.Comm) -> N
 def test_a_static_analysis_begins_in_balance(comm: MPI.Comm) -> None:
     """What a start shape needs to stay is let go of with the load factor."""
     still = {"gravity": [0, 0, 0], "initial": {"noise": 5e-3}, "handles": [{"nodes": [0, 6]}]}
-    simulation = Simulation(comm, scene_of(SHEET | still | {"time": STATIC}))
+    simulation = SteppedScene(comm, scene_of(SHEET | still | {"time": STATIC}))
     system, left = simulation.problem.system, []
     for factor in (0.0, 0.5, 1.0):
         system.load_factor = factor

@@ -15,7 +15,7 @@ from physics import CLOTH, SOLVERS, gathered, grid, scene_of
 from repulsion_term import DISTANCE, REPULSION, Repulsion
 
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms import registry
 
 Array = NDArray[np.float64]
@@ -46,9 +46,9 @@ def repulsion(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> Simulation:
+def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> SteppedScene:
     """Two sheets that fly at each other."""
-    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
     system = simulation.problem.system
     n = system.points.n_owned
     v = np.zeros((n, 3))
@@ -59,13 +59,13 @@ def thrown(comm: MPI.Comm, scene: dict[str, Any]) -> Simulation:
     return simulation
 
 
-def term_of(simulation: Simulation) -> Repulsion:
+def term_of(simulation: SteppedScene) -> Repulsion:
     term = simulation.problem.terms["repulsion"]
     assert isinstance(term, Repulsion)
     return term
 
 
-def momentum(simulation: Simulation) -> Array:
+def momentum(simulation: SteppedScene) -> Array:
     """(3,) [kg m/s]."""
     system = simulation.problem.system
     n = system.points.n_owned
@@ -75,7 +75,7 @@ def momentum(simulation: Simulation) -> Array:
 def flown(
     comm: MPI.Comm,
     scene: dict[str, Any],
-    watch: Callable[[Simulation], None] = lambda simulation: None,
+    watch: Callable[[SteppedScene], None] = lambda simulation: None,
     **petsc: Any,
 ) -> tuple[Array, float, float]:
     """Positions in mesh order, mean upward speed of the upper sheet, and most pairs, of a whole run."""
@@ -98,7 +98,7 @@ def flown(
 
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
-    def watch(simulation: Simulation) -> None:
+    def watch(simulation: SteppedScene) -> None:
         system, term = simulation.problem.system, term_of(simulation)
         force = np.zeros((system.points.n_local, 3))
         term.add_gradient(system.x, None, force)
@@ -121,7 +121,7 @@ def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
 def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None:
     nearest: list[float] = []
 
-    def watch(simulation: Simulation) -> None:
+    def watch(simulation: SteppedScene) -> None:
         nearest.append(simulation.ledger.columns()["nearest"])
         assert simulation.problem.system.limits_step
 
@@ -169,7 +169,7 @@ def test_a_sheet_rests_on_another(comm: MPI.Comm) -> None:
         "loads": [{"box": [[-1, -1, 0.01], [2, 2, 1]], "force": [0, 0, -3.0]}],
         "time": {"analysis": "static", "end": 1.0, "step": 0.5},
     }
-    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | pressed))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | pressed))
     while not simulation.finished:
         simulation.step()
     system = simulation.problem.system
@@ -224,7 +224,7 @@ def test_history_has_the_columns_and_a_run_goes_on_with_other_ranks(comm: MPI.Co
         assert float(rows[-1].split(",")[-3]) > 0.0
     few = comm.Split(0 if comm.rank == 0 else 1)
     if comm.rank == 0:
-        resumed = Simulation(few, scene_of(SCENE | {"solver": TIGHT}))
+        resumed = SteppedScene(few, scene_of(SCENE | {"solver": TIGHT}))
         again = Recorder(resumed)
         again.resume(folder)
         kept = gathered(resumed.problem.points, term_of(resumed).state()["touched"])

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 
@@ -26,7 +26,7 @@ def pressed(to: float) -> Scene:
 
 
 def run(comm: MPI.Comm, scene: Scene) -> tuple[list[str], list[tuple[float, float]]]:
-    simulation = Simulation(comm, scene)
+    simulation = SteppedScene(comm, scene)
     stretches = []
     while not simulation.finished:
         report = simulation.step()

@@ -18,12 +18,12 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.failure_diagnosis import worst
 from lyra_petsc.stepping.failure_report import Failure
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel
 
 Array = NDArray[np.float64]
-Spoil = Callable[[Simulation, Array], None]
+Spoil = Callable[[SteppedScene, Array], None]
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
@@ -43,7 +43,7 @@ def failing(
     scene: Mapping[str, Any],
     spoil: Spoil | None = None,
     options: Mapping[str, str] = ONE_ATTEMPT,
-) -> Iterator[tuple[Simulation, SolverError, Failure]]:
+) -> Iterator[tuple[SteppedScene, SolverError, Failure]]:
     """A simulation whose step fails, and what it says of that."""
     direct = {"pc_type": "lu", "ksp_rtol": "1e-12"}
     if comm.size > 1:
@@ -51,7 +51,7 @@ def failing(
     database = PETSc.Options()
     for name, value in (direct | dict(options)).items():
         database.setValue(name, value)
-    simulation = Simulation(comm, scene_of({**SCENE, **scene}))
+    simulation = SteppedScene(comm, scene_of({**SCENE, **scene}))
     if spoil is not None:
         system = simulation.problem.system
         plain = system.residual
@@ -78,7 +78,7 @@ def failing(
 def pushed(vertex: int, value: float) -> Spoil:
     """Put a force that nothing balances on one vertex of the mesh."""
 
-    def spoil(simulation: Simulation, out: Array) -> None:
+    def spoil(simulation: SteppedScene, out: Array) -> None:
         out[simulation.problem.points.original == vertex] = value
 
     return spoil
@@ -177,7 +177,7 @@ def test_a_linear_solver_that_fails_is_told_apart(comm: MPI.Comm) -> None:
 
 
 def test_a_velocity_that_is_not_finite_stops_the_run_in_words(comm: MPI.Comm) -> None:
-    def lost(simulation: Simulation, out: Array) -> None:
+    def lost(simulation: SteppedScene, out: Array) -> None:
         out[:] = np.inf
 
     scene = {"time": {"end": 1.0, "step": 0.01, "integrator": "semi-implicit"}}

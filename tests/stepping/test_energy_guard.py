@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from physics import grid, scene_of
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
 SHELL = {"membrane": MEMBRANE, "bending": 1e-3}
@@ -28,12 +28,12 @@ FREE: dict[str, Any] = {
 
 def simulation(
     comm: MPI.Comm, integrator: str, content: dict[str, Any], end: float = 0.2, step: float = 0.01
-) -> Simulation:
+) -> SteppedScene:
     time = {"end": end, "step": step, "integrator": integrator}
-    return Simulation(comm, scene_of({"time": time} | content))
+    return SteppedScene(comm, scene_of({"time": time} | content))
 
 
-def run(one: Simulation) -> list[float]:
+def run(one: SteppedScene) -> list[float]:
     """Energy [J] at the start and after each step."""
     energies = [one.budget.total]
     while not one.finished:

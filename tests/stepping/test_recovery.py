@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ SCENE: dict[str, Any] = {
 def journey(integrator: str, step: float, comm: MPI.Comm, *, fail: frozenset[int] = frozenset()) -> Any:
     """Positions at the end and rejected steps; attempts of these numbers are made to fail."""
     time = {"end": 0.12, "step": step, "integrator": integrator}
-    simulation = Simulation(comm, scene_of(SCENE | {"time": time}))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"time": time}))
     system, attempts = simulation.problem.system, 0
     residual = system.residual
 
@@ -83,7 +83,7 @@ def test_spectral_radius_by_petsc_option() -> None:
 @pytest.mark.parallel(2)
 def test_one_note_says_how_often_and_why(comm: MPI.Comm) -> None:
     PETSc.Options()["snes_max_it"] = 2
-    simulation = Simulation(comm, scene_of(SCENE | {"time": {"end": 0.12, "step": 0.04}}))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"time": {"end": 0.12, "step": 0.04}}))
     assert not simulation.note_of_repeats
     for _ in range(6):
         simulation.step()
@@ -94,7 +94,7 @@ def test_one_note_says_how_often_and_why(comm: MPI.Comm) -> None:
     assert found
     assert 0.0 < float(found[2]) < 0.04
     assert "6 steps were taken where 1 of the full Δt would do" in simulation.note_of_repeats
-    other = Simulation(comm, simulation.scene)  # as a run that is resumed
+    other = SteppedScene(comm, simulation.scene)  # as a run that is resumed
     other.resume(simulation.memory(), simulation.arrays())
     assert other.note_of_repeats == simulation.note_of_repeats
     simulation.destroy()

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel
 
@@ -26,7 +26,7 @@ def after_a_step(stiffness: float, comm: MPI.Comm) -> tuple[float, list[str]]:
         "handles": [{"nodes": [0, 8]}],
         "time": {"end": 0.005, "step": 0.005},
     }
-    simulation = Simulation(comm, scene_of(scene))
+    simulation = SteppedScene(comm, scene_of(scene))
     while not simulation.finished:
         simulation.step()
     points = simulation.problem.points

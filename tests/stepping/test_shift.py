@@ -15,7 +15,7 @@ from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import INCOMPLETE
 from lyra_petsc.stepping import diagonal_shift as shift
 from lyra_petsc.stepping.diagonal_shift import LARGEST, LEAST, DiagonalShift
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 KERSHAW = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
 """Positive definite, while its incomplete factors are not (Kershaw, J. Comput. Phys. 26, 1978, 43-65)."""
@@ -86,7 +86,7 @@ def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, l
     scene = scene_of(HANGING | {"time": {"end": 1.0, "step": step, "integrator": integrator}})
     if integrator == "semi-implicit":
         PETSc.Options().setValue("ksp_rtol", "1e-10")
-    simulation = Simulation(comm, scene)
+    simulation = SteppedScene(comm, scene)
     for _ in range(25):
         simulation.step()
     x = gathered(simulation.problem.points, simulation.problem.system.x)
@@ -137,7 +137,7 @@ def test_factors_are_made_once_a_step_of_the_jacobian_itself(comm: MPI.Comm, lag
     for name, value in options.items():
         PETSc.Options().setValue(name, value)
     try:
-        simulation = Simulation(comm, scene_of(scene))
+        simulation = SteppedScene(comm, scene_of(scene))
         assert simulation.stepper.preset in INCOMPLETE
         linear = simulation.stepper.linear
         assert isinstance(linear.operator, BlockMatrix)

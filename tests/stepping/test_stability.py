@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.stepping import equilibrium
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stability import Examination
 from lyra_petsc.terms import registry
 
@@ -42,16 +42,16 @@ def strip(weight: float) -> dict[str, Any]:
 
 
 @contextmanager
-def at_rest(comm: MPI.Comm, content: dict[str, Any]) -> Iterator[Simulation]:
+def at_rest(comm: MPI.Comm, content: dict[str, Any]) -> Iterator[SteppedScene]:
     """A scene's static analysis, done."""
-    simulation = Simulation(comm, scene_of(content))
+    simulation = SteppedScene(comm, scene_of(content))
     while not simulation.finished:
         simulation.step()
     yield simulation
     simulation.destroy()
 
 
-def shape(simulation: Simulation) -> Array:
+def shape(simulation: SteppedScene) -> Array:
     return gathered(simulation.problem.points, simulation.problem.system.x)
 
 
@@ -147,7 +147,7 @@ FOLLOWING: dict[str, dict[str, Any]] = {
 def test_the_hessian_is_the_slope_of_all_forces(name: str) -> None:
     """Its symmetric part where loads follow the shape; by finite differences of forces on free unknowns."""
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
-    simulation = Simulation(MPI.COMM_SELF, scene_of(scene))
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
     system = simulation.problem.system
     system.load_factor, system.unbalanced = 0.7, None
     system.x[:, 0] *= 0.95

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ SHEET: dict[str, Any] = {
 
 
 @contextmanager
-def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
+def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
     """A scene's static analysis, done."""
     with motion(comm, **(content | {"time": {"analysis": "static"} | content.get("time", {})})) as simulation:
         while not simulation.finished:
@@ -41,21 +41,21 @@ def at_rest(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
 
 
 @contextmanager
-def motion(comm: MPI.Comm, **content: Any) -> Iterator[Simulation]:
-    simulation = Simulation(comm, scene_of(SHEET | content))
+def motion(comm: MPI.Comm, **content: Any) -> Iterator[SteppedScene]:
+    simulation = SteppedScene(comm, scene_of(SHEET | content))
     yield simulation
     simulation.destroy()
     for name in simulation.stepper.our_options:
         PETSc.Options().delValue(name)
 
 
-def out_of_balance(simulation: Simulation) -> float:
+def out_of_balance(simulation: SteppedScene) -> float:
     """Largest force [N] on a free coordinate."""
     system = simulation.problem.system
     return float(simulation.comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
 
 
-def shape(simulation: Simulation) -> Array:
+def shape(simulation: SteppedScene) -> Array:
     return gathered(simulation.problem.points, simulation.problem.system.x)
 
 

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, gathered, grid, scene_of
 
-from lyra_petsc.stepping.simulation import Simulation
+from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel
 
@@ -28,7 +28,7 @@ def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:
     }
 
 
-def state_of(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+def state_of(simulation: SteppedScene) -> tuple[np.ndarray, np.ndarray]:
     return simulation.problem.system.x, simulation.problem.system.v
 
 
@@ -37,8 +37,8 @@ def state_of(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
 def test_positions_are_as_near_as_asked(
     stiffness: float, dt: float, tolerance: float, comm: MPI.Comm
 ) -> None:
-    asked = Simulation(comm, scene_of(sheet(stiffness, dt, tolerance)))
-    exact = Simulation(comm, scene_of(sheet(stiffness, dt, 1e-11)))
+    asked = SteppedScene(comm, scene_of(sheet(stiffness, dt, tolerance)))
+    exact = SteppedScene(comm, scene_of(sheet(stiffness, dt, 1e-11)))
     spacing = asked.problem.outline.spacing
     iterations = []
     while not asked.finished:

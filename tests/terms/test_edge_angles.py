@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from physics import CLOTH, SOLVERS, gathered, grid, rotation, scene_of
 
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.stepping.simulation import Simulation, StepReport
+from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms import registry
 from lyra_petsc.terms.term import Elastic
 
@@ -47,7 +47,7 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array,
     database = PETSc.Options()
     for name, value in petsc.items():
         database[name] = value
-    simulation = Simulation(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"solver": TIGHT} | scene))
     while not simulation.finished:
         simulation.step()
     budget, layout = simulation.budget, simulation.problem.points
@@ -109,7 +109,7 @@ def test_every_linear_solver(comm: MPI.Comm, name: str, monkeypatch: pytest.Monk
 
 def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> None:
     """Δ(kinetic + potential) = −½‖Δv‖² + E(x₁) − E(x₀) − ∇E(x₁)·Δx, of vertices and edges."""
-    simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS, "solver": TIGHT}))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"time": STEPS, "solver": TIGHT}))
     system = simulation.problem.system
     n, elastic = system.points.n_owned, system.elastic
 
@@ -136,7 +136,7 @@ def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> No
 
 def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
     """Gradient and Hessian against differences, with both kinds of unknowns, in the assembled matrix."""
-    simulation = Simulation(comm, scene_of(SCENE | {"time": STEPS}))
+    simulation = SteppedScene(comm, scene_of(SCENE | {"time": STEPS}))
     system, layout = simulation.problem.system, simulation.problem.points
     term = simulation.problem.terms["edge-angle"]
     assert isinstance(term, Elastic)
@@ -193,7 +193,7 @@ def test_a_run_goes_on_with_other_ranks(
     scene = SCENE | {"time": STEPS | {"integrator": integrator}, "solver": TIGHT}
     whole = outcome(comm, scene)[0]
     folder = shared_tmp / "run"
-    simulation = Simulation(comm, scene_of(scene))
+    simulation = SteppedScene(comm, scene_of(scene))
     recorder = Recorder(simulation)
     if comm.rank == 0:
         folder.mkdir()
@@ -208,7 +208,7 @@ def test_a_run_goes_on_with_other_ranks(
     # on one rank if they were several, else on this one again
     few = comm.Split(0 if comm.rank == 0 else 1)
     if comm.rank == 0:
-        resumed = Simulation(few, scene_of(scene))
+        resumed = SteppedScene(few, scene_of(scene))
         again = Recorder(resumed)
         again.resume(folder)
         assert resumed.step_number == 4
@@ -227,7 +227,7 @@ def test_a_run_goes_on_with_other_ranks(
 
 
 def test_without_it_there_are_no_unknowns_but_the_vertices(comm: MPI.Comm) -> None:
-    simulation = Simulation(comm, scene_of(SCENE))
+    simulation = SteppedScene(comm, scene_of(SCENE))
     layout = simulation.problem.points
     assert layout.n_owned == layout.n_vertices == len(layout.original)
     assert len(layout.padding) == len(layout.edges) == layout.n_edges_global == 0

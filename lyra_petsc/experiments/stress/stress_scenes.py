@@ -30,7 +30,7 @@ from lyra_petsc.scene.schema import Material, Scene
 from lyra_petsc.scene.text import parse_yaml
 
 if TYPE_CHECKING:
-    from lyra_petsc.experiments.stress.verdicts import Record
+    from lyra_petsc.experiments.stress.step_balance import Record
 
 Array = NDArray[np.float64]
 Content = dict[str, Any]

@@ -3,29 +3,49 @@
 ``--ranks P``: every case in an mpirun of its own.
 
 The families of cases, in the order in which ``stress`` runs them, and the modules that they are in.
+
+What ``stress`` tells: a line for each case, and a page on which the worst cases stand first.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import pickle
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.api.mpirun import last_words
-from lyra_petsc.errors import InputError, SolverError, nearest
+from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Bench, Trial, problem_of
-from lyra_petsc.experiments.case import Launcher, Outcome, Registry, Watch
-from lyra_petsc.experiments.stress.step_balance import Accountant, StageAccountant
-from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, NotHere, Scope, Setting, StressCase
-from lyra_petsc.experiments.stress.verdicts import LITTLE_LOST, Record, of_physics, speed
+from lyra_petsc.experiments.case import Launcher, Outcome, Watch
+from lyra_petsc.experiments.results import Line, View
+from lyra_petsc.experiments.stress.step_balance import (
+    LITTLE_LOST,
+    Accountant,
+    Record,
+    StageAccountant,
+    of_physics,
+    over,
+    speed,
+)
+from lyra_petsc.experiments.stress.stress_scenes import (
+    NotHere,
+    Scope,
+    Setting,
+    StressCase,
+    as_it_is,
+)
+from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
+from lyra_petsc.show.report.plots import Curve, over_time, surface
 
 Array = NDArray[np.float64]
 
@@ -262,51 +282,212 @@ def restore(folder: Path, case: StressCase) -> StressOutcome | None:
         return None
 
 
-FAMILIES: Registry[CaseFamily] = Registry(
-    "lyra_petsc.experiments.stress.cases",
-    {
-        "stiff-steps": "scaled",
-        "membrane": "scaled",
-        "bending": "scaled",
-        "time-step": "scaled",
-        "density": "scaled",
-        "anisotropy": "scaled",
-        "damping": "scaled",
-        "wind": "scaled",
-        "gravity": "scaled",
-        "handles": "shapes_and_handles",
-        "start": "shapes_and_handles",
-        "elements": "shapes_and_handles",
-        "free": "shapes_and_handles",
-        "compression": "shapes_and_handles",
-        "rigid-plate": "rigid_plate",
-        "chain": "chain",
-        "paper": "paper",
-        "products": "scaled",
-    },
-)
+PICTURES = 6
+"""Of the worst cases."""
+
+HEADINGS = {
+    "case": 28, "verdict": 7, "steps": 7, "rejected": 0, "least Δt": 8, "Newton": 8, "linear": 7,
+    "energy off [J]": 8, "tolerance [J]": 8, "stretch": 13, "step": 8, "over base": 0, "CPU": 5,
+}  # fmt: skip
+"""Heads of the table's columns, and how wide each is at least."""
 
 
-def selected(only: Sequence[str], level: Scope) -> list[StressCase]:
-    """The cases of a level, or those of the families and cases named, of whatever level.
+def row_of(outcome: StressOutcome) -> dict[str, Any]:
+    """The line of a case in the CSV; energies in J, times in s, NaN where there is nothing to tell."""
+    record = outcome.record
+    balances = record.balances
+    worst = max(balances, key=lambda b: over(abs(b.defect), b.tolerance), default=None)
+    momenta = [(over(b.momentum, b.momentum_tolerance), over(b.spin, b.spin_tolerance)) for b in balances]
+    nan = math.nan
+    return {
+        "case": outcome.case.name,
+        "family": outcome.case.family,
+        "passed": outcome.passed,
+        "converged": not record.stopped,
+        "why": record.stopped,
+        "steps": len(record.reports),
+        "steps_planned": record.planned,
+        "dt": record.nominal,
+        "smallest_dt": record.smallest_step,
+        "rejected": record.rejected,
+        "newton_median": record.median_newton,
+        "newton_worst": max(record.newton, default=0),
+        "linear_iterations": record.linear,
+        "residual_over_promised": max((over(b.residual, b.promised) for b in balances), default=nan),
+        "energy_defect": abs(worst.defect) if worst else nan,
+        "energy_tolerance": worst.tolerance if worst else nan,
+        "energy_turned_over": worst.moved if worst else nan,
+        "verdict": outcome.verdict,
+        "numerical_dissipation": record.lost,
+        "momentum_defect_over_tolerance": max(map(max, momenta), default=nan),
+        "smallest_stretch": record.stretches[0],
+        "largest_stretch": record.stretches[1],
+        "step_wall_seconds": record.median_seconds,
+        "step_over_base": outcome.ratio,
+        "step_over_base_cpu": outcome.busy_ratio,
+        "wall_seconds": outcome.seconds,
+        "failures": "; ".join(f"{name}: {verdict.words}" for name, verdict in outcome.failures.items()),
+    }
 
-    Raises
-    ------
-    InputError
-        For a name that is neither, with the nearest that is.
-    """
-    everything = [case for family in FAMILIES.all() for case in family.cases]
-    if not only:
-        return [case for case in everything if case.level <= level]
-    known = dict.fromkeys([*FAMILIES.modules, *(case.name for case in everything)])
-    for name in only:
-        if name not in known:
-            raise InputError(f"unknown case or family, {nearest(name, known)}; --list names all", key=name)
-    # a family brings those of its cases that the level has; a case that is named is run at any level
-    found = [
-        case for case in everything if case.name in only or (case.family in only and case.level <= level)
+
+def cells(outcome: StressOutcome) -> list[str]:
+    """A case's line of the table, by `HEADINGS`."""
+    row = row_of(outcome)
+    return [
+        outcome.case.name,
+        outcome.verdict,
+        f"{row['steps']}",
+        f"{row['rejected']}",
+        seconds(row["smallest_dt"]),
+        f"{short(row['newton_median'])}, {row['newton_worst']}",
+        f"{row['linear_iterations']}",
+        short(row["energy_defect"], 2),
+        short(row["energy_tolerance"], 2),
+        f"{short(row['smallest_stretch'])} – {short(row['largest_stretch'])}",
+        seconds(row["step_wall_seconds"]),
+        short(row["step_over_base"]),
+        short(row["step_over_base_cpu"]),
     ]
-    for name in only:
-        if not any(name in (case.family, case.name) for case in found):
-            raise InputError("has cases only with --full", key=name)
-    return found
+
+
+class Stress(View[StressOutcome]):
+    """A line for each case.
+
+    Parameters
+    ----------
+    setting : Setting
+    count : int
+        Cases to be run in all.
+    """
+
+    verb = "stress"
+    title = "Stress: stiff and extreme cases"
+    pictures = "pictures"
+    columns = tuple(row_of(StressOutcome(StressCase("", "", as_it_is))))
+
+    def __init__(self, setting: Setting, count: int) -> None:
+        self._setting, self._count = setting, count
+
+    def heading(self) -> str:
+        return _padded(list(HEADINGS))
+
+    def lines(self, outcome: StressOutcome) -> Iterable[Line]:
+        if outcome.left_out:
+            yield f"{outcome.case.name}: left out: {outcome.left_out}", "dim"
+            return
+        yield _padded(cells(outcome)), "" if outcome.passed else "bold red"
+        for name, verdict in outcome.failures.items():
+            yield f"    {name}: {verdict.words}", "red"
+
+    def summary(self, outcomes: Sequence[StressOutcome]) -> list[Sequence[str]]:
+        table: list[Sequence[str]] = [("family", "passed", "run time [s]")]
+        run = [outcome for outcome in outcomes if not outcome.left_out]
+        for family in dict.fromkeys(outcome.case.family for outcome in run):
+            mine = [outcome for outcome in run if outcome.case.family == family]
+            passed = f"{sum(outcome.passed for outcome in mine)} of {len(mine)}"
+            table.append((family, passed, f"{sum(outcome.seconds for outcome in mine):.1f}"))
+        return table
+
+    def ended(self, outcomes: Sequence[StressOutcome]) -> None:
+        """Free the shapes that the page will not show, since there are worse cases."""
+        for outcome in sorted(outcomes, key=badness, reverse=True)[PICTURES:]:
+            outcome.record.last = outcome.record.triangles = None
+
+    def rows(self, outcome: StressOutcome) -> Iterable[Mapping[str, Any]]:
+        yield row_of(outcome)
+
+    def told(self, outcome: StressOutcome) -> dict[str, Any]:
+        record = outcome.record
+        return row_of(outcome) | {
+            "notes": record.notes,
+            "newton_iterations": record.newton,
+            "times": record.times,
+            "energies": [record.start_energy, *record.energies],
+        }
+
+    def facts(self, outcomes: Sequence[StressOutcome]) -> dict[str, Any]:
+        left_out = {outcome.case.name: outcome.left_out for outcome in outcomes if outcome.left_out}
+        return {"complete": len(outcomes) == self._count, "left_out": left_out}
+
+    def page(self, report: Report, outcomes: Sequence[StressOutcome], summary: str, *, drawn: bool) -> None:
+        run = sorted((outcome for outcome in outcomes if not outcome.left_out), key=badness, reverse=True)
+        base = self._setting.base.get("title") or "without a title"
+        report.paragraph(
+            f"{summary} Base scene: {base}, Δt {seconds(self._setting.step)}. The worst cases stand first. "
+            "Newton iterations of a step: median, worst. Energy off: how far the worst step misses the "
+            "energy identity of backward Euler, and what its residual allows. Stretch: smallest and largest "
+            "principal stretch of any triangle. A case is right where the integrator takes at most 5 % of "
+            "the largest energy at work away, and solved where it takes more. Step: median wall time, and "
+            "how many times that of the base scene, measured before and after the case; "
+            "CPU: the same of CPU time."
+        )
+        report.table(list(HEADINGS), [cells(one) for one in run], marked=[not one.passed for one in run])
+        failed = [
+            f"{outcome.case.name} ({outcome.case.title}): {name}: {verdict.words}"
+            for outcome in run
+            for name, verdict in outcome.failures.items()
+        ]
+        if any(not outcome.passed for outcome in run):
+            report.heading("What failed")
+            report.bullets(failed)
+        report.heading("The worst cases")
+        for outcome in run[:PICTURES]:
+            report.paragraph(f"{outcome.case.name}: {outcome.case.title}.")
+            report.bullets(outcome.record.notes)
+            if drawn:
+                _figures(report, outcome)
+        report.heading("What was judged")
+        report.table(
+            ["case", "what", "verdict"],
+            [
+                [outcome.case.name, name, ("passed: " if verdict.passed else "FAILED: ") + verdict.words]
+                for outcome in run
+                for name, verdict in outcome.verdicts.items()
+            ],
+        )
+        left_out = [f"{one.case.name}: {one.left_out}" for one in outcomes if one.left_out]
+        if left_out:
+            report.heading("Left out")
+            report.bullets(left_out)
+
+
+def badness(outcome: StressOutcome) -> tuple[float, ...]:
+    """Cases that failed first, then those with the most trouble."""
+    record = outcome.record
+    return (
+        float(not outcome.passed),
+        float(bool(record.stopped)),
+        float(record.rejected),
+        float(max(record.newton, default=0)),
+    )
+
+
+def _padded(texts: Sequence[str]) -> str:
+    widths = [max(len(name), least) for name, least in HEADINGS.items()]
+    first, *others = zip(texts, widths, strict=True)
+    return "  ".join([first[0].ljust(first[1]), *(text.rjust(width) for text, width in others)]).rstrip()
+
+
+def _figures(report: Report, outcome: StressOutcome) -> None:
+    """The last shape, and the energy over time beside the work done."""
+    case, record = outcome.case, outcome.record
+    if record.last is not None and record.triangles is not None:
+        when = f"t = {seconds(record.times[-1])}" if record.times else "the start"
+        report.figure(
+            surface(
+                record.last, record.triangles, name=f"{PLOTS}/{case.name}-shape",
+                caption=f"{case.name}: {case.title}, {when}",
+            )
+        )  # fmt: skip
+    if len(record.times) > 1:
+        times = [0.0, *record.times]
+        curves = [Curve("kinetic + potential", times, [record.start_energy, *record.energies])]
+        if record.balances and record.integrator == "beuler":
+            work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
+            curves.append(Curve("energy at the start + work done", times, list(work)))
+        report.figure(
+            over_time(
+                curves, name=f"{PLOTS}/{case.name}-energy", caption=f"{case.name}: energy over time",
+                y_label="energy [J]",
+            )
+        )  # fmt: skip

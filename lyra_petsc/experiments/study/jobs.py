@@ -28,7 +28,7 @@ from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, OutputError, SolverError
 from lyra_petsc.experiments.bench import problem_of, simulated
 from lyra_petsc.experiments.case import Launcher, load_record, save_record
-from lyra_petsc.experiments.study.combinations import scene_of
+from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.recorder import Recorder
@@ -196,57 +196,6 @@ def fingerprint(*parts: Sequence[str] | str) -> str:
     """A short digest of texts."""
     text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
     return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-REQUEST_FILE = "request.json"
-
-
-@dataclass(frozen=True)
-class Request:
-    """A study as asked for.
-
-    Attributes
-    ----------
-    scene : str
-        Path of the scene.
-    settings : tuple of str
-        ``--set``.
-    vary : tuple of str
-        ``--vary``; empty: the default sweep.
-    reference : str
-        ``auto``, ``exact:NAME`` or ``run:DIR``.
-    quantities : str
-        Separated by commas; empty: all.
-    repeats : int
-        How often each combination is timed.
-    ranks : int or None
-        ``--ranks``: one mpirun per case; None: the communicator the study was started with.
-    """
-
-    scene: str
-    settings: tuple[str, ...] = ()
-    vary: tuple[str, ...] = ()
-    reference: str = "auto"
-    quantities: str = ""
-    repeats: int = 3
-    ranks: int | None = None
-
-
-def read_request(folder: Path) -> Request:
-    """The request that a study's folder was begun with.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it cannot be read.
-    """
-    path = folder / REQUEST_FILE
-    try:
-        return load_record(path, Request)
-    except OSError as error:
-        raise InputError(f"cannot be read: {reason(error)}", file=path, key="--resume") from None
-    except ValueError:
-        raise InputError("is damaged; begin the study anew with --force", file=path, key="--resume") from None
 
 
 CASES = "cases"

@@ -1,36 +1,271 @@
-"""study.csv and study.json.
+"""The rows of a study: errors that can be told, observed orders, the Pareto front.
+
+What to choose for an accuracy, in plain words and from what ran alone.
+
+study.csv and study.json.
 
 report.html and report.md of a study, with its diagrams.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+import os
+import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from mpi4py import MPI
+
 from lyra_petsc.experiments.results import csv_text
-from lyra_petsc.experiments.study.analysis import (
-    DEFAULT_TARGET,
-    Advice,
-    Order,
-    StudyRow,
-    extent,
-    families,
-    setting,
-)
-from lyra_petsc.experiments.study.combinations import Axis, described
-from lyra_petsc.experiments.study.plan import Plan, Quantity
-from lyra_petsc.experiments.study.references import SAFETY, Known, Physics, physics_of, refines_time
+from lyra_petsc.experiments.study.plan import Axis, Plan, Quantity, described
+from lyra_petsc.experiments.study.work import SAFETY, Known, Physics, StudyRow, Work, physics_of, refines_time
+from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.show.report.document import Drawing, Report
-from lyra_petsc.show.report.numbers import percent, seconds, short
-from lyra_petsc.show.report.plots import Series, convergence, work_precision
+from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.parallel import on_root
+from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
+from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
+
+
+def extent(row: StudyRow, axis: Axis) -> float:
+    """The length, time or tolerance that shrinks along a numeric axis: as it really was."""
+    if axis.path == "mesh":
+        return row.result.spacing
+    if axis.path == "time.step" and row.result.mean_step > 0.0:
+        return row.result.mean_step
+    value = row.combination.settings[axis.key]
+    return float(value) if isinstance(value, float) else math.nan
+
+
+def families(rows: Sequence[StudyRow], axis: Axis | None) -> dict[str, list[StudyRow]]:
+    """Rows that ran and differ in one axis alone, coarsest first; by what they share, in words."""
+    found: dict[str, list[StudyRow]] = {}
+    for row in rows:
+        if row.result.done:
+            found.setdefault(shared_label(row, axis), []).append(row)
+    if axis is not None:
+        for group in found.values():
+            group.sort(key=lambda row: -extent(row, axis))
+    return found
+
+
+def shared_label(row: StudyRow, axis: Axis | None) -> str:
+    """The settings of a row but for one axis, in words, with the integrator first."""
+    words = [row.line] if row.line else []
+    for other, value in zip(row.combination.axes, row.combination.values, strict=True):
+        if other is not axis and other.path != "time.integrator":
+            words.append(described(other.key, value))
+    return ", ".join(words)
+
+
+@dataclass(frozen=True)
+class Order:
+    """Observed order of convergence of one family of rows.
+
+    Attributes
+    ----------
+    axis, quantity, family : str
+    fitted : float
+        Least-squares slope over all resolved rows.
+    neighbours : tuple of float
+        Between neighbours, coarsest first.
+    """
+
+    axis: str
+    quantity: str
+    family: str
+    fitted: float
+    neighbours: tuple[float, ...]
+
+
+def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: Sequence[str]) -> list[Order]:
+    """Orders along every numeric axis; also noted in the rows."""
+    found = []
+    for axis in (axis for axis in axes if axis.refines):
+        for label, group in families(rows, axis).items():
+            for name in quantities:
+                told = [row for row in group if row.shown(name) > 0.0]
+                for coarse, fine in itertools.pairwise(told):
+                    a, b = extent(coarse, axis), extent(fine, axis)
+                    if a > b > 0.0:
+                        order = math.log(coarse.shown(name) / fine.shown(name)) / math.log(a / b)
+                        fine.orders[axis.key, name] = order
+                if len(told) >= 2:
+                    slope = fitted_slope([extent(r, axis) for r in told], [r.shown(name) for r in told])
+                    between = tuple(r.orders.get((axis.key, name), math.nan) for r in told[1:])
+                    found.append(Order(axis.key, name, label, slope, between))
+    return found
+
+
+def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
+    """Mark the rows that no other beats in both run time and error."""
+    able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
+    for row in able:
+        error = row.at_most(quantity)
+        row.on_front = not any(
+            other is not row
+            and other.run <= row.run
+            and other.at_most(quantity) <= error
+            and (other.run < row.run or other.at_most(quantity) < error)
+            for other in able
+        )
+
+
+TARGETS = (0.1, 0.01, 0.001)
+DEFAULT_TARGET = 0.01
+"""The accuracy that the diagram's recommended setting is for."""
+
+FINEST_TARGET = 1e-6
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to choose for an accuracy.
+
+    Attributes
+    ----------
+    target : float
+    row : StudyRow or None
+        The fastest that keeps it; None if none does.
+    words : str
+    """
+
+    target: float
+    row: StudyRow | None
+    words: str
+
+
+def advise(rows: Sequence[StudyRow], quantity: str, axis: Axis | None = None) -> list[Advice]:
+    """The fastest setting for each accuracy, among what ran; nothing is extrapolated.
+
+    Parameters
+    ----------
+    rows : sequence of StudyRow
+    quantity : str
+    axis : Axis, optional
+        Along it a winner may be the coarsest that ran, which the words then say.
+    """
+    able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
+    if not able:
+        return []
+    best = min(row.at_most(quantity) for row in able)
+    targets = list(TARGETS)
+    while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
+        targets.append(targets[-1] / 10.0)
+    coarsest: list[StudyRow] = []
+    if axis is not None:
+        coarsest = [group[0] for group in families(able, axis).values()]
+    return [_advice(able, quantity, float(f"{target:.3g}"), coarsest) for target in targets]
+
+
+def _advice(rows: Sequence[StudyRow], quantity: str, target: float, coarsest: Sequence[StudyRow]) -> Advice:
+    good = [row for row in rows if row.at_most(quantity) <= target]
+    if not good:
+        best = min(rows, key=lambda row: row.at_most(quantity))
+        return Advice(
+            target,
+            None,
+            f"For {percent(target)} nothing that ran is accurate enough; the most accurate is "
+            f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run)}.",
+        )
+    winner = min(good, key=lambda row: row.run)
+    tried = ", the coarsest that ran" if any(row is winner for row in coarsest) else ""
+    words = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run)}"
+    words += f" ({_error(winner, quantity)}{tried})"
+    high = max(winner.result.run_seconds())
+    ties = [
+        row
+        for row in good
+        if row is not winner and row.line == winner.line and min(row.result.run_seconds()) <= high
+    ]
+    if ties:
+        words += (
+            f", or as fast within the spread, {setting(min(ties, key=lambda row: row.at_most(quantity)))}"
+        )
+    for line in dict.fromkeys(row.line for row in rows):
+        if line != winner.line:
+            words += "; " + _beside(line, [row for row in rows if row.line == line], quantity, target)
+    return Advice(target, winner, words + ".")
+
+
+def _beside(line: str, rows: Sequence[StudyRow], quantity: str, target: float) -> str:
+    good = [row for row in rows if row.at_most(quantity) <= target]
+    if good:
+        row = min(good, key=lambda row: row.run)
+        return f"{line} needs {seconds(row.run)} ({_without_line(row)})"
+    best = min(rows, key=lambda row: row.at_most(quantity))
+    return f"{line} did not reach it ({_without_line(best)}: {_error(best, quantity)}, {seconds(best.run)})"
+
+
+def setting(row: StudyRow) -> str:
+    """All settings of a row, in words, with the integrator first."""
+    return shared_label(row, None) or row.combination.label
+
+
+def _without_line(row: StudyRow) -> str:
+    return setting(row).removeprefix(row.line).removeprefix(", ") or row.line
+
+
+def _error(row: StudyRow, quantity: str) -> str:
+    if quantity in row.unresolved:
+        words = f"error below {percent(row.at_most(quantity))}"
+    else:
+        words = f"error {percent(row.errors[quantity])}"
+    largest = row.at_most("position_max")
+    if quantity == "position_l2" and math.isfinite(largest):
+        words += f", at most {percent(largest)} anywhere"
+    return words
+
+
+def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
+    """Mark the setting that the diagram's star names: the fastest for 1 %; none if no setting keeps that."""
+    for one in advice:
+        if one.row is not None and math.isclose(one.target, DEFAULT_TARGET):
+            one.row.recommended = True
+            return one.row
+    return None
+
 
 PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
 """Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
+
+
+@dataclass
+class StudyOutcome:
+    """What came of a study.
+
+    Attributes
+    ----------
+    plan : Plan
+    rows : list of StudyRow
+    known : dict of physics → Known
+        References as they came out.
+    orders : list of Order
+    advice : dict of physics → list of Advice
+    facts : dict
+        What the files say of scene, command, ranks, machine and versions.
+    """
+
+    plan: Plan
+    rows: list[StudyRow]
+    known: dict[Physics, Known]
+    orders: list[Order]
+    advice: dict[Physics, list[Advice]]
+    facts: dict[str, Any]
+
+    @property
+    def failed(self) -> list[StudyRow]:
+        """Rows without a result."""
+        return [row for row in self.rows if not row.result.done]
+
+    def of(self, physics: Physics) -> list[StudyRow]:
+        """The rows of one physical scene."""
+        return [row for row in self.rows if physics_of(row.combination) == physics]
 
 
 def order_axes(plan: Plan) -> list[str]:
@@ -112,9 +347,9 @@ def _told(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def write_csv(folder: Path, plan: Plan, rows: Sequence[StudyRow]) -> None:
+def write_csv(folder: Path, study: StudyOutcome) -> None:
     """Write ``study.csv``. Call on one rank."""
-    rows_told = [record(plan, row) for row in rows]
+    rows_told = [record(study.plan, row) for row in study.rows]
     replace_text(folder / "study.csv", csv_text(list(rows_told[0]), rows_told, _cell))
 
 
@@ -126,17 +361,11 @@ def _cell(value: Any) -> str:
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 
-def content(
-    plan: Plan,
-    rows: Sequence[StudyRow],
-    known: Mapping[Physics, Known],
-    orders: Sequence[Order],
-    advice: Mapping[Physics, Sequence[Advice]],
-    facts: Mapping[str, Any],
-) -> dict[str, Any]:
+def content(study: StudyOutcome) -> dict[str, Any]:
     """What ``study.json`` holds: all of the table, the repeats, the references, orders and advice."""
+    plan = study.plan
     return {
-        **facts,
+        **study.facts,
         "request": asdict(plan.request),
         "axes": {axis.key: list(axis.values) for axis in plan.axes},
         "quantities": {quantity.name: quantity.title for quantity in plan.quantities},
@@ -154,7 +383,7 @@ def content(
                 },
                 "notes": one.notes,
             }
-            for physics, one in known.items()
+            for physics, one in study.known.items()
         ],
         "combinations": [
             {
@@ -164,9 +393,9 @@ def content(
                 "timings": [asdict(timing) for timing in row.result.timings],
                 "notes": row.result.notes,
             }
-            for row in rows
+            for row in study.rows
         ],
-        "orders": [asdict(order) for order in orders],
+        "orders": [asdict(order) for order in study.orders],
         "advice": [
             {
                 "scene": dict(physics),
@@ -174,8 +403,8 @@ def content(
                 "combination": one.row.combination.name if one.row is not None else None,
                 "words": one.words,
             }
-            for physics, list_ in advice.items()
-            for one in list_
+            for physics, advice in study.advice.items()
+            for one in advice
         ],
     }
 
@@ -183,35 +412,27 @@ def content(
 BELOW = "below what the reference can tell"
 
 
-def make_report(
-    plan: Plan,
-    rows: Sequence[StudyRow],
-    known: Mapping[Physics, Known],
-    orders: Sequence[Order],
-    advice: Mapping[Physics, Sequence[Advice]],
-    facts: Mapping[str, Any],
-) -> Report:
+def make_report(study: StudyOutcome) -> Report:
     """The whole report."""
+    plan, known, facts = study.plan, study.known, study.facts
     report = Report(f"Error against run time: {plan.base.title or facts['scene']}")
-    failed = [row for row in rows if not row.result.done]
     for physics, one in known.items():
-        _advise(report, plan, physics, one, advice.get(physics, ()))
+        _advise(report, plan, physics, one, study.advice[physics])
     report.heading("What was run")
-    report.bullets(_what(plan, rows, facts))
+    report.bullets(_what(study))
     report.bullets([*plan.notes, *(note for one in known.values() for note in one.notes)])
     for number, (physics, one) in enumerate(known.items(), start=1):
-        mark = "" if len(known) == 1 else f"-{number}"
-        mine = [row for row in rows if physics_of(row.combination) == physics]
         report.heading("Diagrams" + (f" for {_scene_words(physics)}" if physics else ""))
-        for drawing in drawings(plan, mine, one, mark):
+        for drawing in drawings(plan, study.of(physics), one, "" if len(known) == 1 else f"-{number}"):
             report.figure(drawing)
     report.heading("Errors and run times")
-    _tables(report, plan, rows)
-    _orders(report, orders)
-    _references(report, plan, known)
-    if failed:
+    _tables(report, plan, study.rows)
+    _orders(report, study.orders)
+    _references(report, known)
+    if study.failed:
         report.heading("What failed")
-        report.table(["combination", "why"], [[row.combination.label, row.result.problem] for row in failed])
+        why = [[row.combination.label, row.result.problem] for row in study.failed]
+        report.table(["combination", "why"], why)
     report.heading("To repeat it")
     report.code(str(facts["command"]))
     report.table(["", "version"], [[name, text] for name, text in facts["versions"].items()])
@@ -253,7 +474,8 @@ def _left_out(plan: Plan, known: Known) -> str:
     return "The errors are those of the mesh and of all else that is solved."
 
 
-def _what(plan: Plan, rows: Sequence[StudyRow], facts: Mapping[str, Any]) -> list[str]:
+def _what(study: StudyOutcome) -> list[str]:
+    plan, rows, facts = study.plan, study.rows, study.facts
     done = [row for row in rows if row.result.done]
     values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
     varied = "; ".join(f"{key} = {', '.join(told)}" for key, told in values.items())
@@ -284,7 +506,7 @@ def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     for row in done:
         result, times = row.result, row.result.run_seconds()
         body.append(
-            [setting(row) + (" ★" if row.recommended else ""), *(_error(row, name) for name in names),
+            [setting(row) + (" ★" if row.recommended else ""), *(_error_cell(row, name) for name in names),
              seconds(row.run), f"{seconds(min(times))} – {seconds(max(times))}", seconds(row.total),
              result.steps, result.rejected, result.newton_iterations, result.linear_iterations]
         )  # fmt: skip
@@ -312,7 +534,7 @@ def _short_title(quantity: Quantity) -> str:
     return "error in " + words.get(quantity.name, quantity.name.replace("_", " ", 1))
 
 
-def _error(row: StudyRow, name: str) -> str:
+def _error_cell(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
         return f"< {short(SAFETY * row.own[name])}"
     value = row.errors.get(name, math.nan)
@@ -333,7 +555,7 @@ def _orders(report: Report, orders: Sequence[Order]) -> None:
     )  # fmt: skip
 
 
-def _references(report: Report, plan: Plan, known: Mapping[Physics, Known]) -> None:
+def _references(report: Report, known: Mapping[Physics, Known]) -> None:
     report.heading("Reference")
     for physics, one in known.items():
         where = f"{_scene_words(physics)}: " if physics else ""
@@ -444,3 +666,84 @@ def _convergence(
 
 def _file(name: str) -> str:
     return "".join(sign if sign.isalnum() or sign in "-." else "-" for sign in name).strip("-")
+
+
+# -- the whole study ---
+
+
+def conduct(comm: MPI.Comm, work: Work, command: str) -> StudyOutcome:
+    """Run what is not finished, compare, and write tables, diagrams and reports; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    work : Work
+    command : str
+        That repeats the study.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if something cannot be written.
+    """
+    plan, folder = work.plan, work.folder
+    plan.notes += busy(plan.request.ranks or comm.size)
+    rows = work.rows()
+    known = work.compare(rows)
+    names = [quantity.name for quantity in plan.quantities]
+    facts: dict[str, Any] = {
+        "scene": plan.request.scene,
+        "title": plan.base.title,
+        "command": command,
+        "ranks": plan.request.ranks or comm.size,
+        "machine": machine(),
+        "versions": all_versions(),
+    }
+    study = StudyOutcome(plan, rows, known, observed_orders(rows, plan.axes, names), {}, facts)
+    for physics in known:
+        mark_front(study.of(physics), names[0])
+        study.advice[physics] = advise(study.of(physics), names[0], main_axis(plan.axes))
+        choose_recommended(study.advice[physics])
+    on_root(comm, lambda: write_csv(folder, study))
+    write_summary(folder / "study.json", content(study), comm)
+    on_root(comm, lambda: make_report(study).write(folder))
+    return study
+
+
+def all_versions() -> dict[str, str]:
+    """Versions of the program and all that takes part."""
+    found = versions()
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def busy(ranks: int) -> list[str]:
+    """A note where other processes leave too few cores of this machine idle for so many ranks."""
+    cores = os.cpu_count() or 1
+    try:
+        load = os.getloadavg()[0]
+    except OSError:
+        return []
+    if load + ranks <= cores + 0.5:
+        return []
+    return [
+        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
+        "run times may be larger and spread more than on an idle one"
+    ]
+
+
+def machine() -> str:
+    """Processor and cores, in words."""
+    model = platform.machine()
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                model = line.split(":", 1)[1].strip()
+                break
+    except OSError:
+        pass
+    return f"{model}, {os.cpu_count() or 1} cores"

@@ -1,4 +1,14 @@
-"""A study at work: runs what is not finished, compares all with the references.
+"""Which reference each physical scene of a study gets; decided before anything runs, on rank 0.
+
+The reference where nothing is exact: which runs to make, finer than all that is studied.
+
+A second-order integrator at a quarter of the smallest Δt, and solver tolerances of a hundredth of the
+tightest. Where element sizes vary, half the smallest; and where nothing of the time integration varies
+beside them, that stays as it is, so that the errors are those of the mesh. Beside it stand coarser runs,
+each coarser in one thing by a factor of two from the next, from which its own error is estimated
+(Richardson).
+
+A study at work: runs what is not finished, compares all with the references.
 
 A whole study: runs, comparisons, and what it leaves in its folder.
 """
@@ -8,59 +18,471 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-import os
-import platform
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.analysis import (
-    Advice,
-    StudyRow,
-    advise,
-    choose_recommended,
-    mark_front,
-    mark_unresolved,
-    observed_orders,
-)
-from lyra_petsc.experiments.study.combinations import LEAN, Combination, scene_of
+from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
 from lyra_petsc.experiments.study.comparison import (
     Errors,
+    History,
     Party,
+    RestSurface,
     against_motion,
     against_run,
     history_against_run,
+    overall,
+    read_here,
     read_samples,
+    read_surface,
 )
 from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, fingerprint, read_result
-from lyra_petsc.experiments.study.plan import Plan
-from lyra_petsc.experiments.study.references import (
-    Chosen,
-    Estimate,
-    Known,
-    Physics,
-    ReferenceRun,
-    ReferenceRuns,
-    integrators,
-    joined,
-    make_family,
-    of_chain,
-    physical_overrides,
-    physics_of,
-    refines_time,
+from lyra_petsc.experiments.study.plan import (
+    LEAN,
+    MEAN_SQUARE,
+    Combination,
+    Plan,
+    Value,
+    mesh_overrides,
+    overrides,
+    scene_of,
+    time_overrides,
 )
-from lyra_petsc.experiments.study.study_report import content, main_axis, make_report, write_csv
-from lyra_petsc.extras import PACKAGES
-from lyra_petsc.output.summary import versions, write_summary
+from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.show.report.document import seconds
+
+Physics = tuple[tuple[str, Value], ...]
+"""The settings that make a scene another one, in the axes' order."""
+
+NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
+"""Keys in which the scene of a run to compare with may differ without a note."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The reference of one physical scene.
+
+    Attributes
+    ----------
+    kind : str
+        ``exact``, ``run`` or ``finer``.
+    words : str
+        What it is; empty for ``finer`` until it is known which run it became.
+    motion : ExactMotion or None
+    folder : Path or None
+    notes : tuple of str
+    """
+
+    kind: str
+    words: str = ""
+    motion: ExactMotion | None = None
+    folder: Path | None = None
+    notes: tuple[str, ...] = ()
+
+
+def physics_of(combination: Combination) -> Physics:
+    """Key of the physical scene that a combination belongs to."""
+    return tuple(combination.physics.items())
+
+
+def physical_overrides(plan: Plan, physics: Physics) -> list[str]:
+    """What makes one physical scene of the study's scene, with what the whole study sets."""
+    axes = [axis for axis in plan.axes if axis.physical]
+    return [f"output.every={plan.every!r}", *overrides(plan.base, axes, [value for _, value in physics])]
+
+
+def choose_references(plan: Plan) -> dict[Physics, Chosen]:
+    """The reference of every physical scene of a study. For rank 0.
+
+    Raises
+    ------
+    InputError
+        Unknown reference, an exact solution that does not hold, a run that does not fit.
+    """
+    text = plan.request.reference
+    kind, colon, name = text.partition(":")
+    key = f"--reference {text}"
+    groups = list(dict.fromkeys(physics_of(combination) for combination in plan.combinations))
+    if kind == "auto" and not colon:
+        return {physics: _automatic(_scene(plan, physics)) for physics in groups}
+    if kind == "exact" and name:
+        found = {}
+        for physics in groups:
+            motion = exact_motion(name, Body(_scene(plan, physics)))
+            found[physics] = Chosen("exact", _exact_words(name), motion)
+        return found
+    if kind == "run" and name:
+        if len(groups) > 1:
+            listed = ", ".join(axis.key for axis in plan.axes if axis.physical)
+            raise InputError(
+                f"one run cannot be the reference of different scenes ({listed} varies)", key=key
+            )
+        return {groups[0]: _of_run(plan, Path(name), key)}
+    raise InputError("must be auto, exact:NAME or run:DIR", key=key)
+
+
+def _scene(plan: Plan, physics: Physics) -> Scene:
+    return scene_of(Path(plan.request.scene), plan.request.settings, physical_overrides(plan, physics))
+
+
+def _exact_words(name: str) -> str:
+    return f"exact: {name} ({SOLUTIONS[name].title})"
+
+
+def _automatic(scene: Scene) -> Chosen:
+    if scene.handles or scene.loads:
+        return Chosen("finer")  # no exact solution has any: the mesh need not be built to know
+    body = Body(scene)
+    solution = matching(body)
+    if solution is None:
+        return Chosen("finer")
+    return Chosen("exact", _exact_words(solution.name), solution.motion(body))
+
+
+def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
+    if not folder.is_dir():
+        raise InputError("no such folder", file=folder, key=key)
+    try:
+        samples = read_here(folder, plan.sample_times(), plan.every)
+        stored = read_surface(folder)
+    except InputError as error:
+        raise InputError(error.message, file=error.file, key=key) from None
+    axis = plan.axis("mesh")
+    for value in axis.values if axis is not None else [None]:
+        further = overrides(plan.base, [axis], [value]) if axis is not None and value is not None else []
+        scene = scene_of(Path(plan.request.scene), plan.request.settings, further)
+        mesh = build_mesh(scene.mesh, file=scene.source)
+        built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+        if not built.same_as(stored):
+            raise InputError(
+                f"is a run of another mesh ({len(stored.rest)} vertices, {len(stored.triangles)} triangles; "
+                f"the study's has {mesh.n_vertices} and {mesh.n_triangles}, or others)",
+                file=folder,
+                key=key,
+            )
+    lacking = [
+        quantity.probe
+        for quantity in plan.quantities
+        if quantity.probe is not None and quantity.probe not in samples.probes
+    ]
+    if lacking and plan.request.quantities:
+        raise InputError(f"has no probe '{lacking[0]}'", file=folder, key=key)
+    notes = [f"the reference run has no probe '{name}': its error is not told" for name in lacking]
+    return Chosen("run", f"run {folder}", folder=folder, notes=(*notes, *_differences(plan, folder)))
+
+
+def _differences(plan: Plan, folder: Path) -> Sequence[str]:
+    """What the scene of a run has that the study's has not, beside how it was solved."""
+    try:
+        other = load_scene(folder / "scene.yaml")
+    except InputError:
+        return ["the reference run's scene cannot be read, so it is unknown whether it is the same"]
+    keys = [
+        name
+        for name in type(plan.base).model_fields
+        if name not in NUMERICAL_BLOCKS and getattr(plan.base, name) != getattr(other, name)
+    ]
+    return [f"the reference run is of another scene: {', '.join(keys)} differ"] if keys else []
+
+
+FINER = 4
+"""How many times smaller than the smallest Δt of the study the reference's is."""
+
+SECOND_ORDER = ("bdf2", "alpha2", "midpoint")
+TIGHTER = 100.0
+TIGHTEST = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
+TIMES = ("time.step", "time.integrator", "time.tolerance", "time.spectral_radius")
+
+SAFETY = 2.0
+"""An error below so many times the reference's own cannot be told from it."""
+
+LARGEST_SAFETY = 1.25
+"""Factor on the estimates of largest errors."""
+
+SLOWEST = 0.5
+"""Order of convergence below which an estimate is not trusted to follow it."""
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """One run of the reference's family.
+
+    Attributes
+    ----------
+    name : str
+        The folder.
+    label : str
+        In words.
+    overrides : tuple of str
+    weight : float
+        Its cost beside a run at the study's finest.
+    """
+
+    name: str
+    label: str
+    overrides: tuple[str, ...]
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Runs that differ in one thing by factors of two, finest first.
+
+    Attributes
+    ----------
+    levels : tuple of ReferenceRun
+    order : int
+        Expected; 0 where none is.
+    """
+
+    levels: tuple[ReferenceRun, ...]
+    order: int
+
+
+@dataclass
+class ReferenceRuns:
+    """All runs of a reference.
+
+    Attributes
+    ----------
+    chains : list of Chain
+        Their finest differ from each other only where meshes are refined too.
+    """
+
+    chains: list[Chain]
+
+    @property
+    def best(self) -> ReferenceRun:
+        """The reference."""
+        return self.chains[0].levels[0]
+
+    @property
+    def levels(self) -> list[ReferenceRun]:
+        """Each run once, cheapest last."""
+        return list({level.name: level for chain in self.chains for level in chain.levels}.values())
+
+
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> ReferenceRuns:
+    """The runs of the reference of one physical scene.
+
+    Parameters
+    ----------
+    plan : Plan
+    physics : sequence of str
+        Overrides that make this scene, and what the whole study sets.
+    smallest : float or None
+        Smallest Δt [s] among the runs, where the time integration is refined.
+    integrator : str
+        With which it is.
+    """
+    common = [*physics, *_tolerances(plan, TIGHTER)]
+    mesh = plan.axis("mesh")
+    meshes: list[float | None] = [None]
+    if mesh is not None:
+        size = min(float(value) for value in mesh.values)
+        meshes = [size / 2.0, size, 2.0 * size]
+    if smallest is None or plan.static:
+        smallest, integrator = None, ""
+        fixed = [axis for axis in plan.axes if axis.path in TIMES and len(axis.values) == 1]
+        common += overrides(plan.base, fixed, [axis.values[0] for axis in fixed])
+
+    def chain(order: int, *sizes: tuple[float | None, float | None]) -> Chain:
+        return Chain(tuple(_level(plan.base, common, h, step, integrator) for h, step in sizes), order)
+
+    if smallest is None:
+        if mesh is not None:
+            return ReferenceRuns([chain(2, *((h, None) for h in meshes))])
+        tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
+        loose = ReferenceRun("reference-loose", "tolerances ten times larger", tolerances)
+        return ReferenceRuns([Chain((*chain(0, (None, None)).levels, loose), 0)])
+    finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
+    order = 2 if integrator in SECOND_ORDER else 1
+    in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
+    return ReferenceRuns([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
+
+
+def refines_time(plan: Plan) -> bool:
+    """Whether the reference integrates time more finely: always, but where meshes alone are compared."""
+    if plan.static:
+        return False
+    varies = any(axis.path in TIMES and len(axis.values) > 1 for axis in plan.axes)
+    return varies or plan.axis("mesh") is None
+
+
+def integrators(plan: Plan) -> list[str]:
+    """Those to try for the reference, in order."""
+    # the scene's own first
+    return [*sorted(SECOND_ORDER, key=lambda name: name != plan.base.time.integrator), "beuler"]
+
+
+def _level(
+    base: Scene, common: list[str], h: float | None, step: float | None, integrator: str
+) -> ReferenceRun:
+    further, words, name, weight = [], [], ["reference"], 1.0
+    if step is not None:
+        chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
+        further += [f"time.integrator={integrator}", f"time.step={step!r}", *time_overrides(base, chosen)]
+        words += [integrator, f"Δt {seconds(step, 6)}"]
+        name += [integrator, f"dt{step:.6g}"]
+        weight /= step
+    if h is not None:
+        further += mesh_overrides(base, h)
+        words.append(f"h {h:g} m")
+        name.append(f"h{h:.6g}")
+        weight *= h**-2
+    return ReferenceRun(
+        "-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight
+    )
+
+
+def _tolerances(plan: Plan, tighter: float) -> list[str]:
+    """Solver tolerances below the tightest of the study."""
+    found = []
+    for name, least in TIGHTEST.items():
+        axis = plan.axis(f"solver.{name}")
+        values = [float(v) for v in axis.values] if axis else [float(getattr(plan.base.solver, name))]
+        found.append(f"solver.{name}={max(least, min(values) / tighter)!r}")
+    for axis in plan.axes:
+        if axis.path.startswith("petsc.") and axis.numeric and axis.path.endswith(("tol", "_atol")):
+            least = min(float(value) for value in axis.values)
+            found.append(f"{axis.path}={max(1e-13, least / tighter)!r}")
+    return found
+
+
+# -- its own error -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Own error of a reference in one quantity.
+
+    Attributes
+    ----------
+    error : float
+        Relative, as the errors measured against it.
+    order : float
+        Observed; NaN where two runs agree, or only two were made.
+    trusted : bool
+        Whether the runs converge.
+    """
+
+    error: float
+    order: float
+    trusted: bool
+
+
+@dataclass
+class Known:
+    """A reference as it came out.
+
+    Attributes
+    ----------
+    kind : str
+        ``exact``, ``run``, ``finer`` or ``none``.
+    words : str
+    own : dict of str to Estimate
+        Own error by quantity; empty where it is unknown.
+    seconds : float
+        Wall time [s] of its steps, where it was run here.
+    notes : list of str
+    """
+
+    kind: str
+    words: str
+    own: dict[str, Estimate] = field(default_factory=dict)
+    seconds: float = math.nan
+    notes: list[str] = field(default_factory=list)
+
+
+def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:
+    """Own error of the finest of three runs.
+
+    Differences that fall faster than the order allows do so by chance, where errors of several causes cancel
+    or the place of the largest error changes. The estimate is therefore never below what the coarser pair
+    alone says at the expected order.
+
+    Parameters
+    ----------
+    first, second : float
+        Differences of the two finest runs, and of the finest but one from the third.
+    ratio : float
+        Factor by which each is coarser than the one before.
+    order : int
+        Expected; the observed one is used where it is smaller.
+    """
+    if math.isnan(first) or math.isnan(second):
+        return Estimate(math.nan, math.nan, False)
+    if first == second == 0.0:
+        return Estimate(0.0, math.nan, True)
+    observed = math.inf if first == 0.0 else -math.inf
+    if first > 0.0 < second:
+        observed = math.log(second / first) / math.log(ratio)
+    used = min(float(order), max(observed, SLOWEST))
+    trusted = observed >= SLOWEST
+    largest = first if trusted else max(first, second)
+    error = largest / (ratio**used - 1.0)
+    if order > 0:
+        error = max(error, second / ratio**order / (ratio**order - 1.0))
+    return Estimate(error, observed, trusted)
+
+
+def joined(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
+    """Sums of the errors in time and in space."""
+    names = dict.fromkeys(name for estimate in estimates for name in estimate)
+    found = {}
+    for name in names:
+        parts = [estimate[name] for estimate in estimates]
+        found[name] = Estimate(
+            math.fsum(part.error for part in parts),
+            parts[0].order if len(parts) == 1 else math.nan,
+            all(part.trusted for part in parts),
+        )
+    return found
+
+
+def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -> dict[str, Estimate]:
+    """Own error of a chain's finest run, by quantity.
+
+    A largest error wanders over the sheet and in time, so that the differences of the largest ones tell
+    nothing certain of its order: it is estimated at every sample by itself, and raised by the factor of
+    safety of Roache's grid convergence index for three grids [1]_.
+
+    Parameters
+    ----------
+    differences : sequence of History
+        Between neighbours, finest first.
+
+    References
+    ----------
+    .. [1] P. J. Roache, Verification and Validation in Computational Science and Engineering, 1998, ch. 5.
+    """
+    sums = [overall(history) for history in differences]
+    found = {}
+    for name, first in sums[0].items():
+        if len(differences) == 1:
+            found[name] = Estimate(first, math.nan, True)
+            continue
+        found[name] = whole = richardson(first, sums[1][name], ratio, chain.order)
+        if name != MEAN_SQUARE and not math.isnan(whole.error):
+            pairs = zip(differences[0][name], differences[1][name], strict=True)
+            each = [
+                richardson(float(fine), float(coarse), ratio, chain.order).error for fine, coarse in pairs
+            ]
+            found[name] = replace(whole, error=LARGEST_SAFETY * max(whole.error, *each))
+    return found
+
 
 ROUND_OFF = 1e-13
 """Own error of an exact reference."""
@@ -83,6 +505,70 @@ class Observer(Protocol):
 
     def note(self, text: str) -> None:
         """Something the user should know."""
+
+
+@dataclass
+class StudyRow:
+    """A combination with what came of it.
+
+    Attributes
+    ----------
+    combination : Combination
+    result : Result
+    errors : dict of str to float
+        By quantity; NaN where nothing can be told.
+    own : dict of str to float
+        The reference's own error, NaN where it is unknown.
+    unresolved : set of str
+        Quantities whose error cannot be told from the reference's.
+    orders : dict of (axis key, quantity) to float
+        Observed, from the next coarser row that differs in that axis alone.
+    on_front, recommended : bool
+    """
+
+    combination: Combination
+    result: Result
+    errors: dict[str, float] = field(default_factory=dict)
+    own: dict[str, float] = field(default_factory=dict)
+    unresolved: set[str] = field(default_factory=set)
+    orders: dict[tuple[str, str], float] = field(default_factory=dict)
+    on_front: bool = False
+    recommended: bool = False
+
+    @property
+    def run(self) -> float:
+        """Median wall time [s] of the steps alone; NaN for a failed row."""
+        return statistics.median(self.result.run_seconds()) if self.result.timings else math.nan
+
+    @property
+    def total(self) -> float:
+        """Median wall time [s] with set-up."""
+        return statistics.median(self.result.total_seconds()) if self.result.timings else math.nan
+
+    def shown(self, quantity: str) -> float:
+        """The error as a number, NaN where it is not resolved."""
+        return math.nan if quantity in self.unresolved else self.errors.get(quantity, math.nan)
+
+    def at_most(self, quantity: str) -> float:
+        """What the true error is at most, with the reference's own error; NaN where nothing is known."""
+        own = self.own.get(quantity, 0.0)
+        own = 0.0 if math.isnan(own) else own
+        if quantity in self.unresolved:
+            return (SAFETY + 1.0) * own
+        return self.errors.get(quantity, math.nan) + own
+
+    @property
+    def line(self) -> str:
+        """What its line in a diagram is called: its integrator."""
+        return self.result.integrator or str(self.combination.settings.get("integrator", ""))
+
+
+def mark_unresolved(row: StudyRow) -> None:
+    """Note the quantities whose error is below the reference's own, with a margin."""
+    for name, error in row.errors.items():
+        own = row.own.get(name, 0.0)
+        if not math.isnan(error) and not math.isnan(own) and own > 0.0 and error < SAFETY * own:
+            row.unresolved.add(name)
 
 
 class Work:
@@ -115,7 +601,6 @@ class Work:
         self._done = 0.0
         self._whole = sum(self._weight(combination) for combination in plan.combinations)
         self._whole += sum(self._guessed(physics) for physics in chosen)
-        self.reused = 0
 
     # -- how much work there is --------------------------------------------------------------------------
 
@@ -178,8 +663,6 @@ class Work:
             self._warm.add(kind)
             if found.problem:
                 self._observer.note(f"{label} failed: {found.problem}")
-        else:
-            self.reused += 1
         self._done += level.weight
         self._observer.progress(self._done, self._whole)
         return found
@@ -314,112 +797,3 @@ class Work:
             row.errors = errors_of(party)
             row.own = {name: estimate.error for name, estimate in known.own.items()}
             mark_unresolved(row)
-
-
-@dataclass
-class StudyOutcome:
-    """What came of a study.
-
-    Attributes
-    ----------
-    rows : list of StudyRow
-    known : dict of physics → Known
-        References as they came out.
-    advice : dict of physics → list of Advice
-    reused : int
-        Cases that were found finished.
-    """
-
-    rows: list[StudyRow]
-    known: dict[Physics, Known]
-    advice: dict[Physics, list[Advice]] = field(default_factory=dict)
-    reused: int = 0
-
-    @property
-    def failed(self) -> list[StudyRow]:
-        """Rows without a result."""
-        return [row for row in self.rows if not row.result.done]
-
-
-def conduct(comm: MPI.Comm, work: Work, command: str) -> StudyOutcome:
-    """Run what is not finished, compare, and write tables, diagrams and reports; collective.
-
-    Parameters
-    ----------
-    comm : MPI.Comm
-    work : Work
-    command : str
-        That repeats the study.
-
-    Raises
-    ------
-    OutputError
-        On every rank, if something cannot be written.
-    """
-    plan, folder = work.plan, work.folder
-    plan.notes += busy(plan.request.ranks or comm.size)
-    rows = work.rows()
-    known = work.compare(rows)
-    outcome = StudyOutcome(rows, known, reused=work.reused)
-    main = plan.quantities[0].name
-    for physics in known:
-        mine = [row for row in rows if physics_of(row.combination) == physics]
-        mark_front(mine, main)
-        outcome.advice[physics] = advise(mine, main, main_axis(plan.axes))
-        choose_recommended(outcome.advice[physics])
-    orders = observed_orders(rows, plan.axes, [quantity.name for quantity in plan.quantities])
-    facts: dict[str, Any] = {
-        "scene": plan.request.scene,
-        "title": plan.base.title,
-        "command": command,
-        "ranks": plan.request.ranks or comm.size,
-        "machine": machine(),
-        "versions": all_versions(),
-    }
-    on_root(comm, lambda: write_csv(folder, plan, rows))
-    write_summary(folder / "study.json", content(plan, rows, known, orders, outcome.advice, facts), comm)
-
-    def pages() -> None:
-        make_report(plan, rows, known, orders, outcome.advice, facts).write(folder)
-
-    on_root(comm, pages)
-    return outcome
-
-
-def all_versions() -> dict[str, str]:
-    """Versions of the program and all that takes part."""
-    found = versions()
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
-def busy(ranks: int) -> list[str]:
-    """A note where other processes leave too few cores of this machine idle for so many ranks."""
-    cores = os.cpu_count() or 1
-    try:
-        load = os.getloadavg()[0]
-    except OSError:
-        return []
-    if load + ranks <= cores + 0.5:
-        return []
-    return [
-        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
-        "run times may be larger and spread more than on an idle one"
-    ]
-
-
-def machine() -> str:
-    """Processor and cores, in words."""
-    model = platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                model = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass
-    return f"{model}, {os.cpu_count() or 1} cores"

@@ -15,7 +15,7 @@ from pathlib import Path
 from lyra_petsc.errors import InputError, OutputError, nearest
 from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
 from lyra_petsc.show.export.exported_states import choose
 
@@ -112,7 +112,7 @@ def export_run(
         able = ", ".join(name for name, form in FORMATS.items() if form.fields)
         raise InputError(f"{to} holds positions alone; take --to {able}", key="--displacement")
     require(f"export --to {to}", FORMATS[to].packages, "export")
-    found = Run(run)
+    found = StoredRun(run)
     folder = out if out is not None else found.folder / to
     check_folder(folder, force=force)
     states = replace(choose(found, times, every), displacement=displacement)

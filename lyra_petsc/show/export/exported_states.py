@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 Array = NDArray[np.float64]
 
@@ -26,14 +26,14 @@ class ExportedStates:
 
     Attributes
     ----------
-    run : Run
+    run : StoredRun
     chosen : tuple of int
         Numbers of the states, ascending.
     displacement : bool
         Whether the displacement from the run's first state is among the fields, if it was not written.
     """
 
-    run: Run
+    run: StoredRun
     chosen: tuple[int, ...]
     displacement: bool = False
 
@@ -88,12 +88,12 @@ class ExportedStates:
         return round(1.0 / float(np.median(spacing)), 6) if len(spacing) else SINGLE_RATE
 
 
-def choose(run: Run, times: str | None, every: int | None) -> ExportedStates:
+def choose(run: StoredRun, times: str | None, every: int | None) -> ExportedStates:
     """The states nearest to some times, every nth state, or all.
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     times : str or None
         ``--times``: numbers [s] with commas between.
     every : int or None
@@ -113,7 +113,7 @@ def choose(run: Run, times: str | None, every: int | None) -> ExportedStates:
     return ExportedStates(run, tuple(sorted({run.at(time) for time in _numbers(times, run)})))
 
 
-def _numbers(text: str, run: Run) -> list[float]:
+def _numbers(text: str, run: StoredRun) -> list[float]:
     first, last = float(run.times[0]), float(run.times[-1])
     slack = SAME_TIME * (last - first)
     numbers = []

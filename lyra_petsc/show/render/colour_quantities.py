@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS, plane_components
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ class ColourQuantity:
             low = 0.0
         return colour_limits(float(low), float(high))
 
-    def on_vertices(self, run: Run) -> ColourQuantity:
+    def on_vertices(self, run: StoredRun) -> ColourQuantity:
         """The same with values on vertices: the means of their triangles', weighted by rest area.
 
         Constant strain triangles alternate from one to the next around the field that they stand for; the
@@ -150,7 +150,7 @@ def colour_limits(low: float, high: float) -> tuple[float, float]:
     return middle, middle + max(1e-12, 1e-6 * abs(middle))
 
 
-def quantity(run: Run, name: str) -> ColourQuantity:
+def quantity(run: StoredRun, name: str) -> ColourQuantity:
     """The quantity of a name.
 
     Raises
@@ -180,7 +180,7 @@ _SIGNED = {"curvature"}
 _NAMES = {"rank"}
 
 
-def _speed(run: Run, name: str) -> ColourQuantity:
+def _speed(run: StoredRun, name: str) -> ColourQuantity:
     if "velocity" not in run.fields:
         raise InputError(
             f"{name} needs the velocities, which this run did not write; add velocity to the scene's "
@@ -192,12 +192,12 @@ def _speed(run: Run, name: str) -> ColourQuantity:
     return ColourQuantity(_label("speed", "m/s"), lambda i: _magnitude(stored[i]))
 
 
-def _displacement(run: Run, name: str) -> ColourQuantity:
+def _displacement(run: StoredRun, name: str) -> ColourQuantity:
     start = run.positions[0]
     return ColourQuantity(_label(name, "m"), lambda i: _magnitude(run.positions[i] - start))
 
 
-def _strain(run: Run, name: str) -> ColourQuantity:
+def _strain(run: StoredRun, name: str) -> ColourQuantity:
     triangles, inverse = run.triangles, np.linalg.inv(_edges(material_coordinates(run)))
 
     def values(state: int) -> Array:
@@ -210,7 +210,7 @@ def _strain(run: Run, name: str) -> ColourQuantity:
     return ColourQuantity(_label("largest principal strain", "%"), values, on_triangles=True)
 
 
-DERIVED: dict[str, Callable[[Run, str], ColourQuantity]] = {
+DERIVED: dict[str, Callable[[StoredRun, str], ColourQuantity]] = {
     "speed": _speed,
     "displacement": _displacement,
     "strain": _strain,
@@ -218,7 +218,7 @@ DERIVED: dict[str, Callable[[Run, str], ColourQuantity]] = {
 """Quantities computed from positions and velocities, besides the fields that the run has written."""
 
 
-def material_coordinates(run: Run) -> Array:
+def material_coordinates(run: StoredRun) -> Array:
     """(F, 3, 2) material coordinates of the triangles' corners [m]: ``vt``, or the flattened rest shape."""
     return run.mesh.corner_uv
 

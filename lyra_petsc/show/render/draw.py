@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.output.agreement import on_each
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.camera import Fit, upwards
 from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
@@ -98,12 +98,14 @@ def _shown(plan: RenderPlan) -> ColourQuantity | None:
     return found if plan.options.cells else found.on_vertices(plan.run)
 
 
-def extent(run: Run, states: list[int], normals: Array, shown: ColourQuantity | None) -> tuple[Array, Array]:
+def extent(
+    run: StoredRun, states: list[int], normals: Array, shown: ColourQuantity | None
+) -> tuple[Array, Array]:
     """How far states reach and which values they have.
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     states : list of int
     normals : (n, 3) float64
     shown : ColourQuantity or None

@@ -6,7 +6,7 @@ from pathlib import Path
 from string import Template
 
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.camera import upwards
 from lyra_petsc.show.render.render_plan import run_line_of_sight
 
@@ -107,7 +107,7 @@ def write_script(folder: Path) -> Path:
     OutputError
         If it cannot be written.
     """
-    run = Run(folder)
+    run = StoredRun(folder)
     scene = run.scene
     path = run.folder / SCRIPT
     names = run.fields

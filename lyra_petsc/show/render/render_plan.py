@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.render.camera import line_of_sight, upwards
@@ -95,7 +95,7 @@ class RenderPlan:
     Attributes
     ----------
     options : RenderOptions
-    run : Run
+    run : StoredRun
     scene : Scene
         The run's, with the camera as changed by ``--set``.
     size : (int, int)
@@ -113,7 +113,7 @@ class RenderPlan:
     """
 
     options: RenderOptions
-    run: Run
+    run: StoredRun
     scene: Scene
     size: tuple[int, int]
     colors: tuple[str, str]
@@ -144,7 +144,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     InputError
         For whatever cannot be drawn; only the folder of ``--out`` may have been created.
     """
-    run = Run(options.run)
+    run = StoredRun(options.run)
     scene = scene_shown(run, options.settings)
     static = scene.time.analysis == "static"
     size = _size(options.size)
@@ -184,7 +184,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     return RenderPlan(options, run, scene, size, colors, pictures, film, sheet, texture, limits)
 
 
-def scene_shown(run: Run, settings: Sequence[str]) -> Scene:
+def scene_shown(run: StoredRun, settings: Sequence[str]) -> Scene:
     """The scene of a run, with its camera changed by ``--set``.
 
     Raises
@@ -247,7 +247,7 @@ def _check_speeds(options: RenderOptions) -> None:
         raise InputError(f"must be > 0, not {options.speed:g}", key="--speed")
 
 
-def run_line_of_sight(run: Run, scene: Scene) -> Array:
+def run_line_of_sight(run: StoredRun, scene: Scene) -> Array:
     """Unit vector from the sheet to the camera, chosen from a few states of the whole run."""
     shapes = (run.positions[state] for state in spread_states(run.times, SIGHT_STATES))
     return line_of_sight(scene, upwards(scene), shapes, run.triangles)

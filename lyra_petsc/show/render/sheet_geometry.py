@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Window
 
@@ -60,7 +60,7 @@ class HeldVertices:
         If the run's mesh.h5 does not hold what a handle names.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: StoredRun) -> None:
         mesh, path = _stored_mesh(run), run.folder / MESH_FILE
         self._n_vertices = mesh.n_vertices
         self._handles = [
@@ -79,7 +79,7 @@ class HeldVertices:
         return np.flatnonzero(held), self._edges[held[self._edges].all(axis=1)]
 
 
-def _stored_mesh(run: Run) -> Mesh:
+def _stored_mesh(run: StoredRun) -> Mesh:
     """Start positions and groups, from which the handles are selected."""
     start = run.rest if run.mesh.start is None else run.mesh.start
     no_uv, no_rest = np.empty((0, 3, 2)), np.empty(0, dtype=bool)

@@ -1,4 +1,6 @@
-"""A report as a list of blocks, written as self-contained HTML and as Markdown.
+"""Numbers as a reader wants them: few digits, handy units.
+
+A report as a list of blocks, written as self-contained HTML and as Markdown.
 
 ::
 
@@ -8,22 +10,67 @@
     report.table(["integrator", "error"], [["beuler", 0.01]], caption="Errors")
     report.figure(drawing)              # from report.plots
     report.write(Path("studies/flag"))  # report.html, report.md, the figures' PNG and SVG
+
+How the pages about cases end, and how they are written with or without the packages for pictures.
 """
 
 from __future__ import annotations
 
 import base64
+import math
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from lyra_petsc.errors import OutputError
+from lyra_petsc.extras import missing, remedy
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.show.report.numbers import cell
+
+
+def short(value: float, digits: int = 3) -> str:
+    """So many significant digits, without needless zeros; ``–`` for what is not finite."""
+    if not math.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    size = abs(value)
+    if 1e-3 <= size < 1e5:
+        text = f"{value:.{max(0, digits - 1 - math.floor(math.log10(size)))}f}"
+        return text.rstrip("0").rstrip(".") if "." in text else text
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
+
+
+def seconds(value: float, digits: int = 3) -> str:
+    """A time with its unit: ``3.1 s``, ``4 ms``, ``25 µs``."""
+    if not math.isfinite(value):
+        return "–"
+    for limit, factor, unit in ((1.0, 1.0, "s"), (1e-3, 1e3, "ms"), (0.0, 1e6, "µs")):
+        if abs(value) >= limit * (1.0 - 1e-12) and (value != 0.0 or unit == "µs"):
+            return f"{short(value * factor, digits)} {unit}"
+    return f"{value:g} s"
+
+
+def percent(fraction: float) -> str:
+    """A fraction as per cent with two significant digits."""
+    if not math.isfinite(fraction):
+        return "–"
+    return f"{float(f'{100.0 * fraction:.2g}'):g} %"
+
+
+def cell(value: Any) -> str:
+    """The text of a table's cell."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return short(value) if isinstance(value, float) else str(value)
+
 
 _NUMBER = r"-?\d[\d.]*(e[+-]?\d+)?( ?(s|ms|µs|%))?"
 NUMBER = re.compile(rf"(|–|[<≤] {_NUMBER}|{_NUMBER}( – {_NUMBER})?)")
@@ -51,7 +98,7 @@ class Drawing:
 
 
 @dataclass
-class Block:
+class ReportBlock:
     """One piece of a report; which fields count depends on ``kind``."""
 
     kind: str
@@ -74,24 +121,24 @@ class Report:
 
     def __init__(self, title: str) -> None:
         self.title = title
-        self.blocks: list[Block] = []
+        self.blocks: list[ReportBlock] = []
 
     def heading(self, text: str) -> None:
         """A section's title."""
-        self.blocks.append(Block("heading", text))
+        self.blocks.append(ReportBlock("heading", text))
 
     def paragraph(self, text: str) -> None:
         """Plain text."""
-        self.blocks.append(Block("paragraph", text))
+        self.blocks.append(ReportBlock("paragraph", text))
 
     def bullets(self, items: Sequence[str]) -> None:
         """A list of plain sentences; nothing if there are none."""
         if items:
-            self.blocks.append(Block("bullets", items=list(items)))
+            self.blocks.append(ReportBlock("bullets", items=list(items)))
 
     def code(self, text: str) -> None:
         """A command, to be copied."""
-        self.blocks.append(Block("code", text))
+        self.blocks.append(ReportBlock("code", text))
 
     def table(
         self,
@@ -118,12 +165,12 @@ class Report:
             for i in range(len(columns))
         ]
         bold = list(marked) if marked is not None else [False] * len(rows)
-        block = Block("table", caption, columns=list(columns), rows=texts, numeric=numeric, marked=bold)
+        block = ReportBlock("table", caption, columns=list(columns), rows=texts, numeric=numeric, marked=bold)
         self.blocks.append(block)
 
     def figure(self, drawing: Drawing) -> None:
         """A figure with its caption."""
-        self.blocks.append(Block("figure", drawing.caption, drawing=drawing))
+        self.blocks.append(ReportBlock("figure", drawing.caption, drawing=drawing))
 
     @property
     def drawings(self) -> list[Drawing]:
@@ -187,7 +234,7 @@ def _plain(text: str) -> str:
     return text
 
 
-def _table_markdown(block: Block) -> str:
+def _table_markdown(block: ReportBlock) -> str:
     lines = [f"{_plain(block.text)}\n"] if block.text else []
     lines.append("| " + " | ".join(_plain(name) for name in block.columns) + " |")
     lines.append("|" + "|".join(" ---: " if right else " --- " for right in block.numeric) + "|")
@@ -197,7 +244,7 @@ def _table_markdown(block: Block) -> str:
     return "\n".join(lines)
 
 
-def _figure_markdown(block: Block) -> str:
+def _figure_markdown(block: ReportBlock) -> str:
     assert block.drawing is not None
     return f"![{_plain(block.text)}]({block.drawing.name}.png)\n\n{_plain(block.text)}"
 
@@ -210,3 +257,37 @@ _MARKDOWN = {
     "table": _table_markdown,
     "figure": _figure_markdown,
 }
+
+
+PLOTS = "plots"
+"""Folder of the figures."""
+
+PACKAGES = ("matplotlib", "jinja2")
+
+
+def lacking() -> list[str]:
+    """Packages that pictures and ``report.html`` need and that are not there."""
+    return missing(PACKAGES)
+
+
+def close(
+    report: Report, folder: Path, versions: Mapping[str, str], command: Sequence[str], *, pictures: str
+) -> str:
+    """Add versions and command, and write ``report.md``, where nothing is lacking with all else. On one rank.
+
+    Returns
+    -------
+    str
+        What is missing (``pictures`` is their name) and how to get it; empty if nothing is.
+    """
+    report.heading("Versions")
+    report.table(["package", "version"], [list(pair) for pair in versions.items()])
+    report.paragraph("To repeat it:")
+    report.code(shlex.join(command))
+    packages = lacking()
+    if packages:
+        replace_text(folder / "report.md", report.markdown())
+        return f"no {pictures} and no report.html: {remedy(packages)}"
+    (folder / PLOTS).mkdir(exist_ok=True)
+    report.write(folder)
+    return ""

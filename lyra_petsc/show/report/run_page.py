@@ -1,19 +1,412 @@
-"""The page about one run: pictures, energy, steps, time, settings, notes, what to change."""
+"""What the files of a run say about how it went: sums and shares of its history and its summary.
+
+Figures of one run: energies, their balance, steps and iterations, wall time by phase.
+
+What to change about a run that was slow or inaccurate, as its history tells.
+
+The page about one run: pictures, energy, steps, time, settings, notes, what to change.
+
+report.html of a run, with pictures as ``render`` draws them where that can be.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lyra_petsc.output.read_run import Run
-from lyra_petsc.show.report.document import Drawing, Report
-from lyra_petsc.show.report.numbers import percent, seconds, short
-from lyra_petsc.show.report.run_advice import advice
-from lyra_petsc.show.report.run_facts import ENERGIES, Facts
-from lyra_petsc.show.report.run_figures import balance, effort, energies, phases
-from lyra_petsc.show.report.shapes import surface
+from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.extras import missing
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.history import HISTORY_COLUMNS
+from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.output.run_folder import in_use
+from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
+from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
+from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure, surface
+
+Array = NDArray[np.float64]
+
+ENERGIES = {
+    "kinetic_energy": "kinetic",
+    "membrane_energy": "membrane",
+    "bending_energy": "bending",
+    "potential_energy": "potential",
+}
+"""Names of the columns of energies [J] in words."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """A run in numbers.
+
+    Attributes
+    ----------
+    run : StoredRun
+    columns : dict of str to (n,) array
+        The history; row 0 is the initial state.
+    summary : dict
+        summary.json; empty where it is missing.
+    """
+
+    run: StoredRun
+    columns: dict[str, Array]
+    summary: dict[str, Any]
+
+    @classmethod
+    def of(cls, run: StoredRun) -> Facts:
+        """Read the history and the summary of a run."""
+        history = run.history
+        return cls(run, {name: np.asarray(history[name], float) for name in HISTORY_COLUMNS}, run.summary)
+
+    def steps(self, name: str) -> Array:
+        """A column without the row of the initial state."""
+        return self.columns[name][1:]
+
+    @property
+    def static(self) -> bool:
+        """Whether it seeks an equilibrium: time is the load factor then."""
+        return self.run.scene.time.analysis == "static"
+
+    @cached_property
+    def outcome(self) -> str:
+        """``done``, ``running``, ``killed``, ``unknown``, or the words with which it stopped."""
+        words = str(self.summary.get("outcome", "unknown"))
+        return "killed" if words == "running" and not in_use(self.run.folder) else words
+
+    @property
+    def failed(self) -> bool:
+        """Whether the solver gave up."""
+        return "failure" in self.summary
+
+    # -- energy --------------------------------------------------------------------------------------
+
+    @cached_property
+    def total_energy(self) -> Array:
+        """(n,) kinetic + elastic + potential energy [J]."""
+        return np.asarray(np.sum([self.columns[name] for name in ENERGIES], axis=0))
+
+    @cached_property
+    def scheme_loss(self) -> Array:
+        """(n,) energy [J] that neither loads nor damping account for: what the time scheme took away."""
+        gain = self.columns["external_work"] - self.columns["dissipation"]
+        return np.asarray(self.total_energy[0] + gain - self.total_energy)
+
+    @cached_property
+    def turnover(self) -> float:
+        """The largest change [J] of any energy or work over the run."""
+        names = [*ENERGIES, "external_work", "dissipation"]
+        return max(float(np.ptp(self.columns[name])) for name in names)
+
+    # -- effort --------------------------------------------------------------------------------------
+
+    @property
+    def n_steps(self) -> int:
+        """Accepted steps."""
+        return len(self.columns["step"]) - 1
+
+    @property
+    def step_seconds(self) -> float:
+        """Wall time [s] of all steps, those before a resumption included."""
+        return float(self.steps("wall_seconds").sum())
+
+    @property
+    def newton_per_step(self) -> float:
+        """Mean Newton iterations of a step, attempts that were rejected included."""
+        return float(self.steps("newton_iterations").mean()) if self.n_steps else 0.0
+
+    @property
+    def linear_per_newton(self) -> float:
+        """Mean linear iterations of a Newton iteration."""
+        newton = float(self.steps("newton_iterations").sum())
+        return float(self.steps("linear_iterations").sum()) / newton if newton else 0.0
+
+    @property
+    def rejected(self) -> int:
+        """Attempts at a step that were repeated."""
+        return int(self.steps("rejected").sum())
+
+    @property
+    def phases(self) -> dict[str, float]:
+        """Wall time [s] by phase, of the last start of the run; empty while it goes on."""
+        return {} if self.outcome in ("running", "killed") else dict(self.summary.get("wall_seconds", {}))
+
+    def share(self, phase: str) -> float:
+        """Part of the wall time that a phase took."""
+        total = sum(self.phases.values())
+        return self.phases.get(phase, 0.0) / total if total else 0.0
+
+
+MANY_POINTS = 3000
+"""Points of a line from which it is drawn as pixels."""
+
+
+def energies(facts: Facts) -> Drawing:
+    """Energies over time, the potential one from its start."""
+    figure, (axes,) = _axes(facts, ["energy [J]"], 0.75 * HEIGHT)
+    for number, (column, name) in enumerate(ENERGIES.items()):
+        values = facts.columns[column]
+        if column == "potential_energy":
+            values, name = values - values[0], "potential, change"
+        if values.any():
+            _line(axes, facts.columns["time"], values, number, name)
+    if axes.lines:
+        axes.legend(fontsize=8)
+    return drawn(figure, "energies", f"Energies over {_abscissa(facts)}")
+
+
+def balance(facts: Facts) -> Drawing:
+    """Where the energy came from and where it went."""
+    figure, (axes,) = _axes(facts, ["energy [J]"], 0.75 * HEIGHT)
+    time = facts.columns["time"]
+    _line(axes, time, facts.total_energy - facts.total_energy[0], 0, "change of the total energy")
+    _line(axes, time, facts.columns["external_work"], 3, "work of loads and handles")
+    _line(axes, time, -facts.columns["dissipation"], 1, "taken by damping")
+    _line(axes, time, -facts.scheme_loss, 4, "taken by the time scheme")
+    axes.legend(fontsize=8)
+    caption = "Energy balance: the first line is the sum of the other three"
+    return drawn(figure, "balance", caption)
+
+
+def effort(facts: Facts) -> Drawing:
+    """Δt, iterations and wall time of each step."""
+    time, newton = facts.steps("time"), facts.steps("newton_iterations")
+    panels = {
+        "increment" if facts.static else "Δt [s]": facts.steps("dt"),
+        "Newton its": newton,
+        "linear its": facts.steps("linear_iterations") / np.maximum(newton, 1.0),
+        "wall [s]": facts.steps("wall_seconds"),
+    }
+    figure, axes = _axes(facts, list(panels), 1.5 * HEIGHT)
+    for panel, values in zip(axes, panels.values(), strict=True):
+        _line(panel, time, values, 0, "")
+        panel.set_ylim(bottom=0)
+    rejected = facts.steps("rejected") > 0
+    if rejected.any():
+        at, dt = time[rejected], facts.steps("dt")[rejected]
+        axes[0].plot(at, dt, "x", color=colour(1), ms=5, label="after rejected attempts")
+        axes[0].legend(fontsize=8)
+    caption = "Each step: its length, Newton iterations, linear iterations of a Newton iteration, wall time"
+    return drawn(figure, "steps", caption)
+
+
+def phases(wall: Mapping[str, float]) -> Drawing:
+    """Wall time by phase, as one bar."""
+    figure = empty_figure(1.4)
+    axes = figure.add_subplot()
+    left = 0.0
+    for number, (name, value) in enumerate(wall.items()):
+        axes.barh(0, value, left=left, color=colour(number), label=name)
+        left += value
+    axes.set_yticks([])
+    axes.set_xlabel("wall time [s]")
+    axes.legend(fontsize=8, ncols=len(wall), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
+    return drawn(figure, "phases", "Wall time by phase")
+
+
+def _abscissa(facts: Facts) -> str:
+    return "load factor" if facts.static else "time"
+
+
+def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]:
+    """A figure of panels above each other that share the time axis."""
+    figure = empty_figure(height)
+    axes = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, label in zip(axes, labels, strict=True):
+        panel.set_ylabel(label)
+        panel.grid(True, color="#dfe3e8", lw=0.8)
+        for side in ("top", "right"):
+            panel.spines[side].set_visible(False)
+    axes[-1].set_xlabel("load factor" if facts.static else "time [s]")
+    return figure, axes
+
+
+def _line(axes: Any, x: Array, y: Array, number: int, name: str) -> None:
+    pixels = len(x) > MANY_POINTS
+    axes.plot(x, y, color=colour(number), label=name or None, lw=1.4, rasterized=pixels)
+
+
+MANY_REJECTED = 0.05
+"""Rejected attempts over accepted steps."""
+
+MANY_NEWTON = 8.0
+"""Newton iterations of a step, on average."""
+
+MANY_LINEAR = 100.0
+"""Linear iterations of a Newton iteration, on average."""
+
+MUCH_OUTPUT = 0.2
+MUCH_MESHING = 0.25
+"""Shares of the wall time."""
+
+FEW_VERTICES = 300
+"""Of a rank."""
+
+LOSSY = 0.05
+"""Energy lost by the time scheme over what moved."""
+
+SLOW_FIRST_STEP = 5.0
+"""Seconds that the first step takes longer than the median."""
+
+OPTIONS = {
+    "block-jacobi": "-pc_type pbjacobi",
+    "ilu": "-pc_type ilu",
+    "block-ilu": "-pc_type bjacobi -sub_pc_type ilu",
+    "multigrid": "-pc_type python",
+    "multigrid-w": "-pc_type python -pc_mg_w_from 2",
+    "gamg": "-pc_type gamg",
+    "direct": "-pc_type cholesky",
+    "cholesky": "-pc_type cholesky",
+}
+"""What to write on the command line for each linear solver; the program adds what goes with it."""
+
+Rule = Callable[[Facts], Iterator[str]]
+
+
+def advice(facts: Facts) -> list[str]:
+    """Sentences, each with what was seen and what to change; empty if nothing stands out."""
+    return [words for rule in RULES for words in rule(facts)]
+
+
+def _how_it_ended(facts: Facts) -> Iterator[str]:
+    folder = facts.run.folder
+    again = f"mpirun -n {facts.summary.get('ranks', 1)} lyra-petsc run --resume --out {folder}"
+    if facts.failed:
+        for hint in facts.summary["failure"].get("advice", []):
+            yield f"The solver stopped. Try {hint}."
+    elif facts.outcome == "killed":
+        yield f"The run was killed before its end. It goes on from the newest checkpoint with: {again}"
+    elif facts.outcome not in ("done", "running", "unknown"):
+        yield f"The run was stopped before its end. It goes on with: {again}"
+
+
+def _rejected_steps(facts: Facts) -> Iterator[str]:
+    if facts.n_steps == 0 or facts.rejected <= MANY_REJECTED * facts.n_steps:
+        return
+    seen = f"{facts.rejected} attempts at a step were rejected over {facts.n_steps} accepted steps"
+    time, usual = facts.run.scene.time, float(np.median(facts.steps("dt")))
+    if time.adaptive:
+        yield f"{seen}: each costs a solve. A larger time.tolerance rejects fewer."
+    elif facts.static:
+        yield f"{seen}. A smaller time.step (first increment of the load factor) saves the attempts."
+    elif usual < 0.99 * float(time.step):
+        yield f"{seen}. Set time.step to {short(usual)} s, the median of the steps that were accepted."
+    else:
+        yield f"{seen}, a few hard moments of the motion. time.step: auto takes small steps only there."
+
+
+def _taken_over(facts: Facts) -> Iterator[str]:
+    changed = [note for note in facts.summary.get("notes", []) if "going on with" in note]
+    name = facts.summary.get("linear_solver", "")
+    if changed and name in OPTIONS:
+        yield (
+            f"The linear solver was changed during the run ({changed[-1]}). To start with it: "
+            f"{OPTIONS[name]}, or the same in the scene's petsc block."
+        )
+
+
+def _newton(facts: Facts) -> Iterator[str]:
+    mean = facts.newton_per_step
+    if facts.static or mean <= MANY_NEWTON:
+        return
+    yield (
+        f"A step takes {short(mean)} Newton iterations on average. A smaller time.step needs fewer; so does "
+        "more material.damping, if the material allows it. "
+        "lyra-petsc study SCENE finds the Δt and the integrator that give an accuracy in the least time."
+    )
+
+
+def _linear(facts: Facts) -> Iterator[str]:
+    mean = facts.linear_per_newton
+    if mean <= MANY_LINEAR:
+        return
+    used = str(facts.summary.get("linear_solver", ""))
+    incomplete = "ilu" if facts.summary.get("ranks", 1) == 1 else "block-ilu"
+    tries = "; ".join(
+        OPTIONS[name] for name in (incomplete, "multigrid", "direct") if not used.startswith(name)
+    )
+    yield (
+        f"A Newton iteration takes {short(mean)} linear iterations on average with '{used}'. Try, comparing "
+        f"wall times: {tries}; or a looser -ksp_rtol."
+    )
+
+
+def _output(facts: Facts) -> Iterator[str]:
+    share = facts.share("output")
+    if share > MUCH_OUTPUT:
+        yield (
+            f"Writing took {percent(share)} of the wall time. A longer output.every and fewer output.fields "
+            "write less."
+        )
+
+
+def _meshing(facts: Facts) -> Iterator[str]:
+    share = facts.share("mesh")
+    if share > MUCH_MESHING and facts.phases["mesh"] > 1.0:
+        made = any(source.file and source.file.suffix.lower() == ".geo" for source in facts.run.scene.mesh)
+        remedy = " Mesh the .geo once (gmsh -2 FILE.geo) and name the .msh in the scene." if made else ""
+        yield f"Reading the mesh took {percent(share)} of the wall time.{remedy}"
+
+
+def _compilation(facts: Facts) -> Iterator[str]:
+    wall = facts.steps("wall_seconds")
+    if len(wall) < 3:
+        return
+    first, usual = float(wall[0]), float(np.median(wall))
+    if first - usual > SLOW_FIRST_STEP:
+        yield (
+            f"The first step took {seconds(first)}, a later one {seconds(usual)}: kernels were compiled. The "
+            "next run loads them."
+        )
+
+
+def _ranks(facts: Facts) -> Iterator[str]:
+    ranks, vertices = facts.summary.get("ranks", 1), len(facts.run.rest)
+    if ranks > 1 and vertices < FEW_VERTICES * ranks:
+        yield (
+            f"{ranks} ranks share {vertices} vertices, {vertices // ranks} each: too few to pay. "
+            "Try fewer ranks."
+        )
+
+
+def _accuracy(facts: Facts) -> Iterator[str]:
+    time = facts.run.scene.time
+    error, tolerance = facts.summary.get("estimated_error"), time.tolerance
+    if error is not None and tolerance is not None and error > tolerance:
+        yield (
+            f"The estimated error of the positions, {short(error)} of the sheet's size, is beyond "
+            f"time.tolerance, {short(tolerance)}: a smaller -ts_adapt_dt_min lets the steps follow it."
+        )
+    if facts.static or facts.turnover == 0.0 or time.scheme not in ("beuler", "semi-implicit"):
+        return
+    lost = float(facts.scheme_loss[-1])
+    if lost > LOSSY * facts.turnover:
+        yield (
+            f"The time scheme ({time.scheme}) took away {short(lost)} J, {percent(lost / facts.turnover)} of "
+            "the largest change of an energy. A smaller time.step loses less, and so do bdf2, midpoint and "
+            "alpha2 as time.integrator."
+        )
+
+
+RULES: tuple[Rule, ...] = (
+    _how_it_ended,
+    _rejected_steps,
+    _taken_over,
+    _newton,
+    _linear,
+    _output,
+    _meshing,
+    _compilation,
+    _ranks,
+    _accuracy,
+)
+
 
 SLOWEST = 5
 """Steps that are listed."""
@@ -21,12 +414,12 @@ SLOWEST = 5
 PICTURES = 3
 
 
-def run_page(run: Run, pictures: Sequence[Drawing]) -> Report:
+def run_page(run: StoredRun, pictures: Sequence[Drawing]) -> Report:
     """The page of a run that goes on, has ended, failed, or was killed.
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     pictures : sequence of Drawing
         Of the sheet.
     """
@@ -49,13 +442,13 @@ def run_page(run: Run, pictures: Sequence[Drawing]) -> Report:
     return page
 
 
-def chosen_states(run: Run) -> list[int]:
+def chosen_states(run: StoredRun) -> list[int]:
     """Numbers of the states that are shown: the first, the last, and one half-way in time."""
     half = run.at(0.5 * float(run.times[0] + run.times[-1]))
     return sorted({0, half, len(run) - 1})
 
 
-def plain_pictures(run: Run) -> list[Drawing]:
+def plain_pictures(run: StoredRun) -> list[Drawing]:
     """The sheet at a few times, drawn by matplotlib."""
     return [
         surface(run.positions[i], run.triangles, name=f"state-{i}", caption=state_caption(run, i))
@@ -63,7 +456,7 @@ def plain_pictures(run: Run) -> list[Drawing]:
     ]
 
 
-def state_caption(run: Run, i: int) -> str:
+def state_caption(run: StoredRun, i: int) -> str:
     """What a picture of state ``i`` shows."""
     static = run.scene.time.analysis == "static"
     return f"Load factor {run.times[i]:g}" if static else f"t = {run.times[i]:g} s"
@@ -206,3 +599,48 @@ def _settings(page: Report, facts: Facts) -> None:
         page.code("\n".join(f"-{name} {value or ''}".rstrip() for name, value in sorted(options.items())))
     page.heading("Versions")
     page.table(["package", "version"], [list(pair) for pair in facts.summary.get("versions", {}).items()])
+
+
+PAGE = "report.html"
+PICTURE_SIZE = "960x540"
+
+
+def write_page(folder: Path, out: Path | None) -> Path:
+    """Write the page of a run; the file's path. On one rank.
+
+    Raises
+    ------
+    InputError
+        If the folder is none of a run.
+    OutputError
+        If the page cannot be written.
+    """
+    path = folder / PAGE if out is None else out
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        what = "is a folder; name a file" if path.is_dir() else "cannot be written: there is no such folder"
+        raise InputError(what, file=path, key="--out")
+    run = StoredRun(folder)
+    pictures = _rendered(run) or plain_pictures(run)
+    replace_text(path, run_page(run, pictures).html())
+    return path
+
+
+def _rendered(run: StoredRun) -> list[Drawing]:
+    """Pictures of a few states as ``render`` draws them; none where that cannot be."""
+    if missing(PACKAGES):
+        return []
+    from mpi4py import MPI
+
+    from lyra_petsc.show.render.draw import draw
+
+    states = chosen_states(run)
+    with tempfile.TemporaryDirectory() as folder:
+        times = ",".join(repr(float(run.times[i])) for i in states)
+        options = RenderOptions(run.folder, at=times, out=Path(folder), size=PICTURE_SIZE, label=False)
+        try:
+            plan = make_plan(options)
+            draw(MPI.COMM_SELF, plan, lambda done, count: None)
+            drawn = {state: path.read_bytes() for path, state in plan.pictures}
+        except LyraError:  # no OpenGL: the page has plain pictures
+            return []
+    return [Drawing(f"state-{i}", state_caption(run, i), drawn[i], b"") for i in states]

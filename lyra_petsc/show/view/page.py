@@ -19,7 +19,7 @@ from trame.widgets import vuetify3 as v
 from trame_vtk.modules.vtk.serializers import SynchronizationContext
 
 from lyra_petsc.errors import InputError, LyraError
-from lyra_petsc.output.read_run import Run, read_history
+from lyra_petsc.output.read_run import StoredRun, read_history
 from lyra_petsc.output.run_folder import in_use
 from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
@@ -87,7 +87,7 @@ class Look:
     range: str | None = None
     settings: tuple[str, ...] = ()
 
-    def check(self, run: Run) -> None:
+    def check(self, run: StoredRun) -> None:
         """Check that the run can be shown so.
 
         Raises
@@ -109,7 +109,7 @@ class Page:
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     access : Access
         Counts the open pages.
     look : Look
@@ -120,7 +120,7 @@ class Page:
     cloth : Cloth
     """
 
-    def __init__(self, run: Run, access: Access, look: Look = AS_USUAL) -> None:
+    def __init__(self, run: StoredRun, access: Access, look: Look = AS_USUAL) -> None:
         self._run, self._access, self._asked = run, access, look
         SynchronizationContext.check_for_arrays_to_release = release_oldest
         self.server = get_server("lyra-petsc")

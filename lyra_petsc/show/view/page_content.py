@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.colour_quantities import DERIVED, ColourQuantity, ColourRange, quantity
 
 Colours = NDArray[np.uint8]
@@ -49,7 +49,7 @@ class Player:
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Player:
         Set when another state is wanted.
     """
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: StoredRun) -> None:
         self._run = run
         self.shown = 0 if run.finished else len(run) - 1
         self.speed = first_speed(run)
@@ -137,7 +137,7 @@ class Player:
         return True
 
 
-def first_speed(run: Run) -> float:
+def first_speed(run: StoredRun) -> float:
     """Real time for motions that are neither short nor long, else the power of ten that takes about 10 s."""
     span = float(run.times[-1] - run.times[0])
     if span <= 0 or SHORTEST <= span <= LONGEST:
@@ -145,7 +145,7 @@ def first_speed(run: Run) -> float:
     return float(10.0 ** round(math.log10(span / USUAL)))
 
 
-def names(run: Run) -> list[str]:
+def names(run: StoredRun) -> list[str]:
     """Names of the quantities by which a run's states can be coloured."""
     derived = [name for name in DERIVED if name != "speed" or "velocity" in run.fields]
     return derived + [name for name in run.fields if name not in {"velocity", *derived}]
@@ -156,12 +156,12 @@ class Probe:
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     vertex : int
         Its number in the mesh file, from 0.
     """
 
-    def __init__(self, run: Run, vertex: int) -> None:
+    def __init__(self, run: StoredRun, vertex: int) -> None:
         self._run, self.vertex = run, vertex
         self._quantities = {name: quantity(run, name).on_vertices(run) for name in names(run)}
 
@@ -180,7 +180,7 @@ class Palette:
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     name : str
         One of `names`.
     asked : ColourRange, optional
@@ -198,7 +198,7 @@ class Palette:
 
     def __init__(
         self,
-        run: Run,
+        run: StoredRun,
         name: str,
         asked: ColourRange | None = None,
         colour_map: str = "",

@@ -17,7 +17,7 @@ from typing import Any
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.read_run import Run, read_history
+from lyra_petsc.output.read_run import StoredRun, read_history
 from lyra_petsc.show.view.access import Access
 
 LOCAL = "127.0.0.1"
@@ -58,7 +58,7 @@ def _refusal(host: str, port: int, error: BaseException) -> InputError:
 
 
 async def serve(
-    run: Run,
+    run: StoredRun,
     host: str,
     port: int,
     ready: Callable[[str], None],
@@ -69,7 +69,7 @@ async def serve(
 
     Parameters
     ----------
-    run : Run
+    run : StoredRun
     host : str
         The address to listen on.
     port : int
@@ -191,14 +191,14 @@ def open_browser(address: str) -> bool:
     return (known or sys.platform == "darwin") and webbrowser.open(address)
 
 
-def find_run(folder: Path) -> Run:
+def find_run(folder: Path) -> StoredRun:
     """The run in a folder, of which all that the page needs can be read.
 
     Raises
     ------
     InputError
     """
-    run = Run(folder)
+    run = StoredRun(folder)
     for needed in ("triangles", "rest", "scene"):
         getattr(run, needed)
     run.positions[0]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from lyra_petsc.experiments.stress.cases import selected
+from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
@@ -18,8 +20,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     damp,
     sheet,
 )
-from lyra_petsc.experiments.stress.trials import StressOutcome, run_case, selected
-from lyra_petsc.experiments.stress.verdicts import Record
+from lyra_petsc.experiments.stress.trials import StressOutcome, run_case
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 

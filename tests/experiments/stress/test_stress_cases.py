@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.stress.cases import chain, rigid_plate, shapes_and_handles
+from lyra_petsc.experiments.stress.cases import FAMILIES, chain, rigid_plate, selected, shapes_and_handles
 from lyra_petsc.experiments.stress.stress_scenes import (
     NotHere,
     Scope,
@@ -23,7 +23,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     setting_of,
     sheet,
 )
-from lyra_petsc.experiments.stress.trials import FAMILIES, selected
 from lyra_petsc.scene.schema import Scene
 
 CLOTH = """\

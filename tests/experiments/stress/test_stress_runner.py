@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.experiments.stress import trials
-from lyra_petsc.experiments.stress.stress_report import PICTURES, Stress, row_of
+from lyra_petsc.experiments.stress.cases import selected
 from lyra_petsc.experiments.stress.stress_scenes import (
     Scope,
     Setting,
@@ -18,7 +18,16 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     setting_of,
     sheet,
 )
-from lyra_petsc.experiments.stress.trials import BaseClock, StressOutcome, restore, run_case, save, selected
+from lyra_petsc.experiments.stress.trials import (
+    PICTURES,
+    BaseClock,
+    Stress,
+    StressOutcome,
+    restore,
+    row_of,
+    run_case,
+    save,
+)
 
 SMALL = Setting(sheet(6), False, Scope.QUICK)
 

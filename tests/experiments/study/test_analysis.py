@@ -7,17 +7,23 @@ import math
 import numpy as np
 import pytest
 
-from lyra_petsc.experiments.study.analysis import (
-    StudyRow,
+from lyra_petsc.experiments.study.jobs import Result, Timing
+from lyra_petsc.experiments.study.plan import Axis, combinations
+from lyra_petsc.experiments.study.study_report import (
     advise,
     choose_recommended,
     mark_front,
-    mark_unresolved,
     observed_orders,
 )
-from lyra_petsc.experiments.study.combinations import Axis, combinations
-from lyra_petsc.experiments.study.jobs import Result, Timing
-from lyra_petsc.experiments.study.references import Chain, Estimate, joined, of_chain, richardson
+from lyra_petsc.experiments.study.work import (
+    Chain,
+    Estimate,
+    StudyRow,
+    joined,
+    mark_unresolved,
+    of_chain,
+    richardson,
+)
 
 AXES = [
     Axis("integrator", "time.integrator", ("beuler", "bdf2")),

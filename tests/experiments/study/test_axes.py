@@ -7,8 +7,7 @@ import re
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.study.combinations import combinations, described, parse_axes
-from lyra_petsc.experiments.study.plan import chosen
+from lyra_petsc.experiments.study.plan import chosen, combinations, described, parse_axes
 
 MANY = ",".join(str(k + 1) for k in range(101))
 

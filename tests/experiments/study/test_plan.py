@@ -9,9 +9,8 @@ import pytest
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import save_record
-from lyra_petsc.experiments.study.jobs import Request
-from lyra_petsc.experiments.study.plan import Plan, make_plan
-from lyra_petsc.experiments.study.references import (
+from lyra_petsc.experiments.study.plan import Plan, Request, make_plan
+from lyra_petsc.experiments.study.work import (
     choose_references,
     make_family,
     physical_overrides,
@@ -193,7 +192,7 @@ def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
 
 
 def test_requests_survive_their_file(tmp_path: Path) -> None:
-    from lyra_petsc.experiments.study.jobs import read_request
+    from lyra_petsc.experiments.study.plan import read_request
 
     request = Request("a.yaml", ("time.end=1",), ("dt=0.1,0.2",), "auto", "position", 2, 4)
     save_record(tmp_path / "request.json", request)
@@ -204,7 +203,7 @@ def test_requests_survive_their_file(tmp_path: Path) -> None:
 
 
 def test_a_busy_machine_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
-    from lyra_petsc.experiments.study import work as conduct
+    from lyra_petsc.experiments.study import study_report as conduct
 
     monkeypatch.setattr(conduct.os, "cpu_count", lambda: 4)
     monkeypatch.setattr(conduct.os, "getloadavg", lambda: (2.1, 0.0, 0.0))

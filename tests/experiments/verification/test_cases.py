@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from lyra_petsc.experiments.verification.answers import CASES, run_case
+from lyra_petsc.experiments.verification.answers import run_case
+from lyra_petsc.experiments.verification.cases import CASES
 
 SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
 """Cases that are run whatever is selected: each takes no more than a second or two."""

@@ -12,7 +12,6 @@ from mpi4py import MPI
 from lyra_petsc.errors import InputError, Interrupted, SolverError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.answers import (
-    CASES,
     Claim,
     Converges,
     ErrorRow,
@@ -23,6 +22,7 @@ from lyra_petsc.experiments.verification.answers import (
     observed_order,
     run_case,
 )
+from lyra_petsc.experiments.verification.cases import CASES
 
 
 def row(n: float, error: float) -> ErrorRow:

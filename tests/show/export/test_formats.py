@@ -10,7 +10,7 @@ from written_run import REST, TRIANGLES, position, scene, stress, velocity, writ
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.obj_file import read_obj
 from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.show.export.export_run import export_run
 from lyra_petsc.show.export.exported_states import turned_up
@@ -225,7 +225,7 @@ def test_npz(tmp_path, vt):
     done = export_run(written(tmp_path / "run", states=4, vt=vt), "npz")
     found = np.load(done.folder / "run.npz")
 
-    np.testing.assert_array_equal(found["time"], Run(tmp_path / "run").times)
+    np.testing.assert_array_equal(found["time"], StoredRun(tmp_path / "run").times)
     np.testing.assert_array_equal(found["position"], [position(i) for i in range(4)])
     np.testing.assert_array_equal(found["velocity"], [velocity(i) for i in range(4)])
     np.testing.assert_array_equal(found["stress"], [stress(i) for i in range(4)])

@@ -7,7 +7,7 @@ import pytest
 from written_run import REST, TRIANGLES, position, scene, stress, velocity, written
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.show.render.colour_quantities import (
@@ -22,8 +22,8 @@ from lyra_petsc.show.render.sheet_geometry import HeldVertices
 
 
 @pytest.fixture
-def run(tmp_path) -> Run:
-    return Run(written(tmp_path / "run", vt="none"))
+def run(tmp_path) -> StoredRun:
+    return StoredRun(written(tmp_path / "run", vt="none"))
 
 
 def test_speed_and_displacement(run):
@@ -37,7 +37,7 @@ def test_speed_and_displacement(run):
 
 @pytest.mark.parametrize("vt", ["none", "seam"])
 def test_strain_is_the_largest_principal_green_strain(tmp_path, vt):
-    run = Run(written(tmp_path, vt=vt))
+    run = StoredRun(written(tmp_path, vt=vt))
     strain = quantity(run, "strain")
     assert strain.label == "largest principal strain [%]"
     assert strain.on_triangles
@@ -60,7 +60,7 @@ def test_written_fields(run):
 def test_what_is_not_there_is_said(run, tmp_path):
     with pytest.raises(InputError, match="no field 'spede', did you mean 'speed'"):
         quantity(run, "spede")
-    bare = Run(written(tmp_path / "bare", fields=False))
+    bare = StoredRun(written(tmp_path / "bare", fields=False))
     with pytest.raises(
         InputError, match=r"speed needs the velocities, .* add velocity to the scene's output.fields"
     ):
@@ -133,7 +133,7 @@ def test_held_vertices_follow_the_windows_of_handles(tmp_path):
     data = scene().model_dump(exclude_none=True, by_alias=True)
     data["handles"] = [{"nodes": [0, 2, 6], "until": 0.1}, {"box": [[0, 3, 0], [3, 3, 0]]}]
     (folder / "scene.yaml").write_text(dump_scene(Scene.model_validate(data)), encoding="utf-8")
-    held = HeldVertices(Run(folder))
+    held = HeldVertices(StoredRun(folder))
 
     vertices, edges = held.at(0.05)
     assert vertices.tolist() == [0, 1, 2, 3, 6]

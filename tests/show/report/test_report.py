@@ -12,8 +12,7 @@ import pytest
 
 from lyra_petsc import extras
 from lyra_petsc.errors import InputError
-from lyra_petsc.show.report.document import Report
-from lyra_petsc.show.report.numbers import percent, seconds, short
+from lyra_petsc.show.report.document import Report, percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
 
 pytest.importorskip("matplotlib")

@@ -25,9 +25,7 @@ from launch import SCENE, done, finish, lyra, start, without_pictures, write_sce
 
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.show.report.page_file import write_page
-from lyra_petsc.show.report.run_advice import OPTIONS, advice
-from lyra_petsc.show.report.run_facts import Facts
+from lyra_petsc.show.report.run_page import OPTIONS, Facts, advice, write_page
 
 FAILING = SCENE.replace("c11: 800, c22: 800", "c11: 8.0e+9, c22: 8.0e+9") + "solver: {max_iterations: 2}\n"
 
@@ -77,16 +75,16 @@ def test_the_page_does_without_what_draws_films(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = copied(finished, tmp_path)
-    monkeypatch.setattr("lyra_petsc.show.report.page_file.PACKAGES", ("no_such_package",))
+    monkeypatch.setattr("lyra_petsc.show.report.run_page.PACKAGES", ("no_such_package",))
     write_page(run, None)
     page = (run / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/svg+xml") == 3 + 2 + 1 + 1
 
 
 def test_the_energies_of_the_page_are_those_of_the_history(finished: Path) -> None:
-    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.output.read_run import StoredRun
 
-    facts = Facts.of(Run(finished))
+    facts = Facts.of(StoredRun(finished))
     table = np.loadtxt(finished / "history.csv", delimiter=",", skiprows=1)
     column = {name: table[:, i] for i, name in enumerate(HISTORY_COLUMNS)}
     energy = sum(column[f"{kind}_energy"] for kind in ("kinetic", "membrane", "bending", "potential"))
@@ -172,9 +170,9 @@ def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
 
 def told(finished: Path, summary: dict[str, Any] | None = None, **columns: float) -> str:
     """The advice for the finished run with another summary or other columns of its history."""
-    from lyra_petsc.output.read_run import Run
+    from lyra_petsc.output.read_run import StoredRun
 
-    run = Run(finished)
+    run = StoredRun(finished)
     facts = Facts.of(run)
     for name, value in columns.items():
         facts.columns[name][1:] = value

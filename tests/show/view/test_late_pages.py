@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from written_run import written
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 
 pytest.importorskip("trame")
 
@@ -49,7 +49,7 @@ def test_the_page_waits_for_who_draws_and_says_so(tmp_path, monkeypatch) -> None
 
     monkeypatch.setattr(module, "SLOW_DRAWING", 0.05)
     access = SimpleNamespace(watching=1)
-    page = module.Page(Run(written(tmp_path / "run", states=9)), access)
+    page = module.Page(StoredRun(written(tmp_path / "run", states=9)), access)
     state = page.server.state
 
     async def watch() -> None:
@@ -76,9 +76,9 @@ def test_a_run_that_is_late_is_said_to_be(tmp_path, monkeypatch) -> None:
     from lyra_petsc.show.view import page as module
 
     monkeypatch.setattr(module, "in_use", lambda folder: True)
-    run = Run(written(tmp_path / "run", states=3))
+    run = StoredRun(written(tmp_path / "run", states=3))
     page = module.Page(run, SimpleNamespace(watching=1))
-    monkeypatch.setattr(Run, "summary", {"outcome": "running"})
+    monkeypatch.setattr(StoredRun, "summary", {"outcome": "running"})
     run.__dict__.pop("summary", None)
     assert page._outcome().endswith(" running")
     page._news -= 7.0

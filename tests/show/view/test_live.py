@@ -10,7 +10,7 @@ import pytest
 from launch import SCENE, done, finish, lyra, start, write_scene
 from written_run import Writer
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.view.live import NICENESS, LivePage
 
 SLOW = SCENE.replace("end: 0.05, step: 0.01", "end: 500, step: 0.01").replace("every: 0.02", "every: 0.1")
@@ -70,7 +70,7 @@ def test_the_page_goes_with_the_run(tmp_path, ranks, number):
         until(lambda: not pages(tmp_path), "the page outlives its run")
     finally:
         finish(process)
-    assert len(Run(tmp_path / "out")) > 1
+    assert len(StoredRun(tmp_path / "out")) > 1
 
 
 @pytest.mark.slow
@@ -103,8 +103,8 @@ def test_a_run_ends_as_without_a_page(tmp_path):
     write_scene(tmp_path)
     left = done(["run", "scene.yaml", "--out", tmp_path / "out", "--live", "--no-browser"], tmp_path)
 
-    assert len(Run(tmp_path / "out")) == 4
-    assert Run(tmp_path / "out").finished
+    assert len(StoredRun(tmp_path / "out")) == 4
+    assert StoredRun(tmp_path / "out").finished
     assert "note: no page" not in left.err
     assert f"lyra-petsc view {tmp_path / 'out'}" in left.out
     until(lambda: not pages(tmp_path), "the page outlives its run")

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from written_run import TRIANGLES, velocity, written
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.colour_quantities import ColourRange
 from lyra_petsc.show.view import page_content as plots
 from lyra_petsc.show.view.page_content import Palette, _number, names, sample
 
 
 def test_colours_follow_the_values(tmp_path):
-    run = Run(written(tmp_path))
+    run = StoredRun(written(tmp_path))
     assert {"speed", "displacement", "strain", "stress"} <= set(names(run))
     palette = Palette(run, "speed")
     colours, on_triangles = palette.colours(0)
@@ -24,7 +24,7 @@ def test_colours_follow_the_values(tmp_path):
 
 
 def test_the_bar_names_quantity_unit_and_range(tmp_path):
-    run = Run(written(tmp_path))
+    run = StoredRun(written(tmp_path))
     bar = Palette(run, "speed").bar()
     assert bar["title"] == "speed [m/s]"
     ticks = [float(tick) for tick in bar["ticks"]]
@@ -56,7 +56,7 @@ def test_numbers_of_the_bar_are_short(value, span, text):
 
 
 def test_without_velocities_there_is_no_speed(tmp_path):
-    run = Run(written(tmp_path, fields=False))
+    run = StoredRun(written(tmp_path, fields=False))
     assert names(run) == ["displacement", "strain"]
     run.fields = ("displacement", "stress")
     assert names(run) == ["displacement", "strain", "stress"]
@@ -65,7 +65,7 @@ def test_without_velocities_there_is_no_speed(tmp_path):
 
 
 def test_a_quantity_that_is_the_same_everywhere_has_a_colour(tmp_path):
-    run = Run(written(tmp_path, states=1))
+    run = StoredRun(written(tmp_path, states=1))
     colours, _ = Palette(run, "displacement").colours(0)
     assert (colours == colours[0]).all()
 

@@ -5,7 +5,7 @@ import math
 import pytest
 from written_run import Writer, written
 
-from lyra_petsc.output.read_run import Run
+from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.view import page_content as module
 from lyra_petsc.show.view.page_content import Player, first_speed
 
@@ -26,7 +26,7 @@ def clock(monkeypatch):
 
 
 def test_playing_keeps_to_the_times_of_the_states(tmp_path, clock):
-    player = Player(Run(written(tmp_path, states=6)))  # 0.1 s apart
+    player = Player(StoredRun(written(tmp_path, states=6)))  # 0.1 s apart
     player.go(0)
     assert math.isinf(player.next_due())
 
@@ -39,7 +39,7 @@ def test_playing_keeps_to_the_times_of_the_states(tmp_path, clock):
 
 
 def test_the_speed_changes_from_there_on(tmp_path, clock):
-    player = Player(Run(written(tmp_path, states=6)))
+    player = Player(StoredRun(written(tmp_path, states=6)))
     player.go(0)
     player.play()
     clock.now = 0.201
@@ -53,7 +53,7 @@ def test_the_speed_changes_from_there_on(tmp_path, clock):
 
 
 def test_scrubbing_stays_within_the_states_and_goes_on_from_there(tmp_path, clock):
-    player = Player(Run(written(tmp_path, states=6)))
+    player = Player(StoredRun(written(tmp_path, states=6)))
     player.go(-3)
     assert player.due() == 0
     player.go(99)
@@ -68,7 +68,7 @@ def test_scrubbing_stays_within_the_states_and_goes_on_from_there(tmp_path, cloc
 
 
 def test_play_at_the_end_begins_anew(tmp_path, clock):
-    player = Player(Run(written(tmp_path, states=3)))
+    player = Player(StoredRun(written(tmp_path, states=3)))
     player.go(2)
     player.play()
     assert player.due() == 0
@@ -79,7 +79,7 @@ def test_a_run_that_goes_on_is_followed_by_who_looks_at_its_newest_state(tmp_pat
     writer = Writer(tmp_path)
     writer.write()
     writer.write()
-    player = Player(Run(tmp_path))
+    player = Player(StoredRun(tmp_path))
     assert player.due() == 1  # it is not finished: the newest is what one comes for
     assert not player.follow()
     writer.write()

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import QUICK, USUAL, Content, Setting, StressCase, family
-from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.experiments.verification.answers import isotropic
 from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     USUAL,
@@ -22,7 +23,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     family,
     scale,
 )
-from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.dump import dump_scene

@@ -15,6 +15,7 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
     QUICK,
@@ -25,7 +26,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     StressCase,
     family,
 )
-from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.experiments.verification.answers import isotropic
 
 LENGTH, G, DENSITY, CELLS = 1.0, 9.8, 0.15, 16

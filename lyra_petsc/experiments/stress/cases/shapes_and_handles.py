@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     CELLS,
     QUICK,
@@ -28,7 +29,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     release,
     scale,
 )
-from lyra_petsc.experiments.stress.verdicts import Record
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 
 Array = NDArray[np.float64]
