@@ -10,8 +10,6 @@ with the stretch λ of a St. Venant-Kirchhoff strip without lateral contraction 
 Sources: Bisshopp and Drucker, Quart. Appl. Math. 3 (1945) 272-275 (tip load); heavy elastica: Romero et
 al., ACM TOG 40(4):66 (2021), the cantilever test.
 
-A heavy clamped strip whose bending twists it: exact shape in space, numpy only.
-
 A narrow strip is a rod that cannot bend in its own plane. On a mesh of single diagonals bending and twist
 are coupled; with the lateral curvature relaxed, hinges give square cells the energy per area::
 
@@ -29,8 +27,9 @@ Problems of Elasticity, 2nd ed., chapter 8.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +38,10 @@ Array = NDArray[np.float64]
 
 NODES = 160
 """Collocation points: 1e-11 for weights up to 1e4 B/L³, whose boundary layer is 0.01 L wide."""
+
+
+PACE = 0.7
+"""Steps of the load in a doubling of it."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +84,25 @@ def cantilever(weight: float, tip_load: float = 0.0, stretch: float = 0.0) -> Ca
     ArithmeticError
         If Newton's method does not converge.
     """
-    s, derivative, integral = chebyshev(NODES)
-    theta = np.zeros(len(s))
-    second = derivative @ derivative
-    load = max(weight, tip_load)
-    steps = max(1, math.ceil(2.0 * math.log2(1.0 + load)))
-    for step in range(1, steps + 1):
-        part = ((1.0 + load) ** (step / steps) - 1.0) / load if load > 0.0 else 1.0
+    s, _, integral = chebyshev(NODES)
+
+    def bent(state: Array, part: float) -> tuple[Array, Array]:
+        """Force and stretch along the strip under this part of the load."""
         force = part * (tip_load + weight * (1.0 - s))
-        theta = _newton(theta, force, stretch, second, derivative)
-    length = stretches(force * np.sin(theta), stretch)[0]
+        return force, stretches(force * np.sin(state[:, 0]), stretch)
+
+    def rates(state: Array, part: float) -> Array:
+        force, length = bent(state, part)
+        return np.stack([state[:, 1], -length * force * np.cos(state[:, 0])], axis=1)
+
+    # θ and θ'
+    state = _grown(rates, np.zeros(2), 1, NODES, load=max(weight, tip_load))
+    theta, length = state[:, 0], bent(state, 1.0)[1]
     return Cantilever(
         reach=float(integral @ (length * np.cos(theta))),
         drop=float(integral @ (length * np.sin(theta))),
         angle=float(theta[-1]),
-        clamp_curvature=float(derivative[0] @ theta),
+        clamp_curvature=float(state[0, 1]),
     )
 
 
@@ -118,35 +125,65 @@ def _slope(weight: float) -> float:
     return tip.drop / tip.reach
 
 
-def _newton(theta: Array, force: Array, stretch: float, second: Array, derivative: Array) -> Array:
-    for _ in range(40):
-        tension = force * np.sin(theta)
-        length, by_tension = stretches(tension, stretch)
-        shear = force * np.cos(theta)
-        residual = second @ theta + length * shear
-        jacobian = second + np.diag(by_tension * shear * shear - length * tension)
-        residual[0], jacobian[0] = theta[0], 0.0
-        jacobian[0, 0] = 1.0
-        residual[-1], jacobian[-1] = derivative[-1] @ theta, derivative[-1]
-        change = np.linalg.solve(jacobian, residual)
-        theta = theta - change
-        # what round-off leaves of a second derivative on so many nodes
-        if np.abs(change).max() < 1e-10:
-            return theta
-    raise ArithmeticError(f"no equilibrium found at load {force.max():g}")
+def _grown(
+    rates: Callable[[Array, float], Array], start: Array, held: int, nodes: int, *, load: float
+) -> Array:
+    """The state (nodes + 1, m) of a rod that has grown with its load, by Newton's method.
+
+    Parameters
+    ----------
+    rates : callable
+        Derivatives (nodes + 1, m) along the rod, of a state and the part of the load.
+    start : (m,)
+        Unknowns everywhere in the straight rod.
+    held : int
+        So many of them keep their values at the clamp; the others are zero at the free end.
+    load : float
+        Its size.
+
+    Raises
+    ------
+    ArithmeticError
+        If Newton's method does not converge.
+    """
+    n, m = nodes + 1, len(start)
+    linear = np.einsum("ij,ab->iajb", chebyshev(nodes)[1], np.eye(m))
+    linear[0, :held] = linear[-1, held:] = 0.0
+    for a in range(m):
+        linear[0 if a < held else -1, a, 0 if a < held else -1, a] = 1.0
+    inside = np.ones((n, m))
+    inside[0, :held] = inside[-1, held:] = 0.0
+    ends = np.zeros((n, m))
+    ends[0, :held] = start[:held]
+    state, steps = np.tile(start, (n, 1)), max(1, math.ceil(PACE * math.log2(1.0 + load)))
+    for step in range(1, steps + 1):
+        part = ((1.0 + load) ** (step / steps) - 1.0) / load if load > 0.0 else 1.0
+        for _ in range(40):
+            residual = np.tensordot(linear, state) - ends - inside * rates(state, part)
+            jacobian = linear.copy()
+            for a in range(m):
+                moved = np.zeros_like(state)
+                moved[:, a] = size = 1e-6 * (1.0 + np.abs(state[:, a]).max())
+                slope = (rates(state + moved, part) - rates(state - moved, part)) / (2.0 * size)
+                jacobian[np.arange(n), :, np.arange(n), a] -= inside * slope
+            change = np.linalg.solve(jacobian.reshape(n * m, n * m), residual.reshape(-1))
+            state = state - change.reshape(n, m)
+            if np.abs(change).max() < 1e-9 * (1.0 + np.abs(state).max()):
+                break
+        else:
+            raise ArithmeticError(f"no equilibrium found at load {part * load:g}")
+    return state
 
 
-def stretches(tension: Array, compliance: float) -> tuple[Array, Array]:
-    """Stretch λ of ½ (λ³ − λ) = tension × compliance and its derivative by the tension."""
+def stretches(tension: Array, compliance: float) -> Array:
+    """Stretch λ of ½ (λ³ − λ) = tension × compliance."""
     length = np.ones_like(tension)
-    if compliance == 0.0:
-        return length, np.zeros_like(tension)
     for _ in range(50):
         change = (0.5 * (length**3 - length) - compliance * tension) / (1.5 * length**2 - 0.5)
         length = length - change
         if np.abs(change).max() < 1e-15:
             break
-    return length, compliance / (1.5 * length**2 - 0.5)
+    return length
 
 
 def chebyshev(n: int) -> tuple[Array, Array, Array]:
@@ -171,8 +208,6 @@ def chebyshev(n: int) -> tuple[Array, Array, Array]:
 
 
 COUPLED_NODES = 64
-UNKNOWNS = 7
-"""Quaternion of the frame, and the moment in space."""
 
 
 @cache
@@ -191,49 +226,17 @@ def heavy_coupled_strip(weight: float, stretch: float = 0.0) -> tuple[float, flo
     ArithmeticError
         If Newton's method does not converge.
     """
-    s, derivative, integral = chebyshev(COUPLED_NODES)
-    state = np.zeros((COUPLED_NODES + 1, UNKNOWNS))
-    state[:, 0] = 1.0
-    linear = np.einsum("ij,ab->iajb", derivative, np.eye(UNKNOWNS))
-    steps = max(1, math.ceil(1.5 * math.log2(1.0 + weight)))
-    for step in range(1, steps + 1):
-        part = (1.0 + weight) ** (step / steps) - 1.0
-        force = np.zeros((COUPLED_NODES + 1, 3))
-        force[:, 2] = -part * (1.0 - s)
-        state = _coupled_newton(state, force, stretch, linear)
+    s, _, integral = chebyshev(COUPLED_NODES)
+    force = np.zeros((COUPLED_NODES + 1, 3))
+    force[:, 2] = -weight * (1.0 - s)
+    # quaternion of the frame, and the moment in space
+    start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    rates = partial(_rates, force=force, stretch=stretch)
+    state = _grown(rates, start, 4, COUPLED_NODES, load=weight)
     along = _frame(state)[0]
-    length, _ = stretches((along * force).sum(axis=1), stretch)
+    length = stretches((along * force).sum(axis=1), stretch)
     reach, sideways, up = integral @ (length[:, None] * along)
     return float(reach), float(sideways), float(-up)
-
-
-def _coupled_newton(state: Array, force: Array, stretch: float, linear: Array) -> Array:
-    n = len(state)
-    clamped = np.array([1.0, 0.0, 0.0, 0.0])
-    for _ in range(40):
-        rates = _rates(state, force, stretch)
-        residual = np.tensordot(linear, state) - rates
-        jacobian = linear.copy()
-        for column in range(UNKNOWNS):
-            size = 1e-6 * (1.0 + np.abs(state[:, column]).max())
-            moved = np.zeros_like(state)
-            moved[:, column] = size
-            slope = (_rates(state + moved, force, stretch) - _rates(state - moved, force, stretch)) / (
-                2 * size
-            )
-            jacobian[np.arange(n), :, np.arange(n), column] -= slope
-        jacobian[0, :4] = 0.0
-        jacobian[0, range(4), 0, range(4)] = 1.0
-        jacobian[-1, 4:] = 0.0
-        jacobian[-1, range(4, UNKNOWNS), -1, range(4, UNKNOWNS)] = 1.0
-        residual[0, :4] = state[0, :4] - clamped
-        residual[-1, 4:] = state[-1, 4:]
-        size_of_all = n * UNKNOWNS
-        change = np.linalg.solve(jacobian.reshape(size_of_all, size_of_all), residual.reshape(-1))
-        state = state - change.reshape(state.shape)
-        if np.abs(change).max() < 1e-9 * (1.0 + np.abs(state).max()):
-            return state
-    raise ArithmeticError(f"no equilibrium found at load {np.abs(force).max():g}")
 
 
 def _frame(state: Array) -> tuple[Array, Array]:
@@ -244,14 +247,15 @@ def _frame(state: Array) -> tuple[Array, Array]:
     return one, two
 
 
-def _rates(state: Array, force: Array, stretch: float) -> Array:
+def _rates(state: Array, part: float, force: Array, stretch: float) -> Array:
     """Derivatives of the state along the strip, lengths over L and moments over B/L."""
+    force = part * force
     one, two = _frame(state)
     moment = state[:, 4:]
     about_one, about_two = (moment * one).sum(axis=1), (moment * two).sum(axis=1)
     twist = 0.25 * (about_one + about_two)
     bend = -about_two - twist
-    length, _ = stretches((one * force).sum(axis=1), stretch)
+    length = stretches((one * force).sum(axis=1), stretch)
     w, x, y, z = state[:, :4].T
     # ½ q ω with ω = (twist, −bend, 0) in the frame
     turning = 0.5 * np.stack(
