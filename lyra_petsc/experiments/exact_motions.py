@@ -219,16 +219,19 @@ def _freely(start: Array, g: Array, t: float) -> tuple[Array, Array]:
     return start * t + 0.5 * g * t * t, start + g * t
 
 
-def _in_still_air(body: Body) -> list[str]:
-    found = body.forced()
+def _in_still_air(body: Body, drag: str) -> list[str]:
+    """What contradicts a fall through still air; ``drag`` is the key of the wind that brakes it."""
+    found, wind = body.forced(), body.scene.wind
     if not body.gravity.any():
         found.append("no gravity")
     if body.start_velocity.any():
         found.append("initial.velocity")
     if not body.has_wind:
         found.append("no air (wind with velocity [0, 0, 0])")
-    elif body.scene.wind is not None and any(body.scene.wind.velocity):
+    elif wind is not None and any(wind.velocity):
         found.append("wind that is not still")
+    if wind is not None and getattr(wind, drag) == 0.0:
+        found.append(f"wind.{drag} 0")
     densities = body.rest.per_triangle("density")
     if np.ptp(densities) > SAME * densities.max():
         found.append("materials of different densities")
@@ -243,12 +246,8 @@ def _cosines(body: Body) -> Array:
 
 def flat_fall_obstacles(body: Body) -> list[str]:
     """What of a scene contradicts a level sheet falling flat in still air, in words."""
-    found = _in_still_air(body)
-    if body.gravity.any() and np.abs(np.abs(_cosines(body)) - 1.0).max() > SAME:
-        found.append("a sheet that is not flat and level")
-    if body.scene.wind is not None and body.scene.wind.density == 0.0:
-        found.append("wind.density 0")
-    return found
+    level = not body.gravity.any() or np.abs(np.abs(_cosines(body)) - 1.0).max() <= SAME
+    return _in_still_air(body, "density") + ([] if level else ["a sheet that is not flat and level"])
 
 
 def flat_fall(body: Body) -> ExactMotion:
@@ -256,10 +255,13 @@ def flat_fall(body: Body) -> ExactMotion:
 
     Drag grows with the square of the velocity.
     """
-    assert body.scene.wind is not None
+    return _translation(body, partial(_flat, math.sqrt(_terminal(body, "density")), body.gravity))
+
+
+def _terminal(body: Body, drag: str) -> float:
+    """Weight of the sheet over the coefficient of its drag."""
     density = float(body.rest.per_triangle("density")[0])
-    terminal = math.sqrt(density * float(np.linalg.norm(body.gravity)) / body.scene.wind.density)
-    return _translation(body, partial(_flat, terminal, body.gravity))
+    return density * float(np.linalg.norm(body.gravity)) / float(getattr(body.scene.wind, drag))
 
 
 def _flat(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
@@ -272,12 +274,8 @@ def _flat(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
 
 def edge_fall_obstacles(body: Body) -> list[str]:
     """What of a scene contradicts an upright sheet falling edge-on in still air, in words."""
-    found = _in_still_air(body)
-    if body.gravity.any() and np.abs(_cosines(body)).max() > SAME:
-        found.append("a sheet that is not upright")
-    if body.scene.wind is not None and body.scene.wind.drag == 0.0:
-        found.append("wind.drag 0")
-    return found
+    upright = not body.gravity.any() or np.abs(_cosines(body)).max() <= SAME
+    return _in_still_air(body, "drag") + ([] if upright else ["a sheet that is not upright"])
 
 
 def edge_fall(body: Body) -> ExactMotion:
@@ -285,10 +283,7 @@ def edge_fall(body: Body) -> ExactMotion:
 
     Drag grows with the velocity.
     """
-    assert body.scene.wind is not None
-    density = float(body.rest.per_triangle("density")[0])
-    terminal = density * float(np.linalg.norm(body.gravity)) / body.scene.wind.drag
-    return _translation(body, partial(_edge_on, terminal, body.gravity))
+    return _translation(body, partial(_edge_on, _terminal(body, "drag"), body.gravity))
 
 
 def _edge_on(terminal: float, gravity: Array, t: float) -> tuple[Array, Array]:
