@@ -145,20 +145,14 @@ def _widest_turn(terms: Terms, x0: Array, dx: Array) -> float:
     return widest
 
 
-CHUNK = 4096
-"""Elements whose Hessians are held at once."""
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StepBalance:
     """The balances of one step; J, N, kg m/s and kg m²/s, the same on every rank.
 
     Attributes
     ----------
-    energy : float
-        Kinetic + potential after the step.
     change : float
-        Of it in the step.
+        Of kinetic + potential energy in the step.
     numerical, viscous : float
         ½ ‖Δv‖²_M and Δt v'ᵀ D v'.
     bracket, work : float
@@ -178,12 +172,11 @@ class StepBalance:
         Hinges turned too far to follow; their part of the bracket is from their energies.
     """
 
-    energy: float
     change: float
-    numerical: float
-    viscous: float
+    numerical: float = 0.0
+    viscous: float = 0.0
     bracket: float
-    work: float
+    work: float = 0.0
     defect: float
     tolerance: float
     residual: float
@@ -193,8 +186,8 @@ class StepBalance:
     push: float
     momentum: float
     momentum_tolerance: float
-    spin: float
-    spin_tolerance: float
+    spin: float = 0.0
+    spin_tolerance: float = 0.0
     jumped: bool = False
 
     @property
@@ -248,7 +241,6 @@ class Accountant:
         dx, dv = x1 - x0, v1[:n] - v0[:n]
         free = ~system.prescribed.mask[:n]
         parts = self._parts(report, dv / dt)
-        total = np.asarray(sum(parts.values()))
         reaction = self._simulation.ledger.reaction
         weight = self._gravity(report)
         moved = dx[:n]
@@ -262,36 +254,28 @@ class Accountant:
         energy_now, energy_then = energy(self._shell, x1), energy(self._shell, x0)
         turned = energy_then - self._energy
         mass = system.mass[:, None]
-        sums = comm.allreduce(
-            np.array(
-                [
-                    0.5 * float(np.sum(mass * v0[:n] ** 2)),
-                    0.5 * float(np.sum(mass * v1[:n] ** 2)),
-                    energy_now - energy_then,
-                    turned,
-                    energy_now,
-                    sum(load.potential(x0) for load in system.loads),
-                    sum(load.potential(x1) for load in system.loads),
-                    0.5 * float(np.sum(mass * dv**2)),
-                    float(np.vdot(parts["damping"], moved)),
-                    float(np.vdot(parts["internal"], moved)),
-                    float(np.vdot(outside - weight, moved)),
-                    float(np.sum(total**2, where=free)),
-                    float(np.sum(moved**2, where=free)),
-                    float(np.sum(moved**2)),
-                    self._energy_roundoff(x1) + self._energy_roundoff(x0),
-                    float(sum(np.abs(part).sum() for part in parts.values())),
-                    float(sum(np.abs(part * moved).sum() for part in parts.values())),
-                    float(np.abs(mass * np.abs(system.x[:n])).sum()) * self._gravity_size(),
-                ]
-            )
-        )
-        (kinetic0, kinetic1, elastic, turn, stored, fallen0, fallen1, numerical, viscous, inner, outer,
-         left, free_way, way, energy_noise, forces, powers, heights) = map(float, sums)  # fmt: skip
+        (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
+         free_way, way, energy_noise, forces, powers, heights) = system.points.summed(
+            0.5 * float(np.sum(mass * v0[:n] ** 2)),
+            0.5 * float(np.sum(mass * v1[:n] ** 2)),
+            energy_now - energy_then,
+            turned,
+            sum(load.potential(x0) for load in system.loads),
+            sum(load.potential(x1) for load in system.loads),
+            0.5 * float(np.sum(mass * dv**2)),
+            float(np.vdot(parts["damping"], moved)),
+            float(np.vdot(parts["internal"], moved)),
+            float(np.vdot(outside - weight, moved)),
+            float(np.sum(moved**2, where=free)),
+            float(np.sum(moved**2)),
+            self._energy_roundoff(x1) + self._energy_roundoff(x0),
+            float(sum(np.abs(part).sum() for part in parts.values())),
+            float(sum(np.abs(part * moved).sum() for part in parts.values())),
+            float(np.abs(mass * np.abs(system.x[:n])).sum()) * self._gravity_size(),
+        ).tolist()  # fmt: skip
         reach = largest(comm, x1)
-        promised, floor, driving = self._promise(parts, reach)
-        residual = float(np.sqrt(left))
-        solved = residual * np.sqrt(free_way) + floor * np.sqrt(way)
+        left = self._left(parts, reach, dt)
+        solved = left["residual"] * np.sqrt(free_way) + left["floor"] * np.sqrt(way)
         # positions are rounded, too: x' − x is Δt v' only to their last digit
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
@@ -301,11 +285,9 @@ class Accountant:
         work = outer + turn
         defect = change - (-numerical - viscous + bracket + work)
         gap = mass * dv - dt * (outside - pushed - slowed)
-        p, p_tol, spin, spin_tol = self._momenta(
-            gap, gap + dt * (parts["damping"] - slowed), dt, residual + floor, forces, reach
-        )
+        unsolved = left["residual"] + left["floor"]
+        damped = gap + dt * (parts["damping"] - slowed)
         return StepBalance(
-            energy=kinetic1 + stored + fallen1,
             change=change,
             numerical=numerical,
             viscous=viscous,
@@ -313,27 +295,28 @@ class Accountant:
             work=work,
             defect=defect,
             tolerance=tolerance,
-            residual=residual,
-            promised=promised,
-            floor=floor,
-            driving=driving,
-            push=largest(comm, np.where(free, moved - dt * v0[:n], 0.0)),
-            momentum=p,
-            momentum_tolerance=p_tol,
-            spin=spin,
-            spin_tolerance=spin_tol,
             jumped=jumped,
+            **left,
+            **self._momenta(gap, damped, dt, unsolved, forces, reach),
         )
 
-    def _promise(self, parts: Mapping[str, Array], reach: float) -> tuple[float, float, float]:
-        """What the solver promised for the residual, its floor of round-off, and the driving forces [N]."""
+    def _left(self, parts: Mapping[str, Array], reach: float, dt: float) -> dict[str, float]:
+        """Norms [N] of what is left of the forces, of what the solver promised, its floor of round-off and
+        the driving forces, and how far they moved the sheet [m]; by the names of `StepBalance`."""
         system, simulation = self._system, self._simulation
         free = ~system.prescribed.mask[: system.points.n_owned]
-        squares = np.array([float(np.sum(part**2, where=free)) for part in parts.values()])
-        norms = dict(zip(parts, np.sqrt(system.points.comm.allreduce(squares)).tolist(), strict=True))
+        everything = [*parts.values(), np.asarray(sum(parts.values()))]
+        squares = system.points.summed(*(float(np.sum(part**2, where=free)) for part in everything))
+        *each, residual = np.sqrt(squares).tolist()
         floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
-        promised = max(simulation.scene.solver.force_tolerance * max(norms.values()), floor)
-        return promised, floor, max(norm for name, norm in norms.items() if name != "internal")
+        way = (system.x - self._x - dt * self._v)[: len(free)]
+        return {
+            "residual": residual,
+            "promised": max(simulation.scene.solver.force_tolerance * max(each), floor),
+            "floor": floor,
+            "driving": max(norm for name, norm in zip(parts, each, strict=True) if name != "internal"),
+            "push": largest(system.points.comm, np.where(free, way, 0.0)),
+        }
 
     # -- parts ---------------------------------------------------------------------------------------
 
@@ -396,7 +379,7 @@ class Accountant:
 
     def _momenta(
         self, gap: Array, damped: Array, dt: float, left: float, forces: float, reach: float
-    ) -> tuple[float, float, float, float]:
+    ) -> dict[str, float]:
         """Defects of linear and angular momentum and their tolerances.
 
         ``gap`` (n_owned, 3) is m Δv less Δt times the forces from outside, ``damped`` also less those of
@@ -412,12 +395,12 @@ class Accountant:
         noise = EPSILON * forces * dt
         linear = dt * left * np.sqrt(count) + noise
         angular = dt * left * np.sqrt(longest) + noise * reach
-        return (
-            float(np.abs(sums[:3]).max()),
-            float(linear),
-            float(np.abs(sums[3:]).max()),
-            float(angular),
-        )
+        return {
+            "momentum": float(np.abs(sums[:3]).max()),
+            "momentum_tolerance": float(linear),
+            "spin": float(np.abs(sums[3:]).max()),
+            "spin_tolerance": float(angular),
+        }
 
 
 class StageAccountant(Accountant):
@@ -438,45 +421,27 @@ class StageAccountant(Accountant):
         if not any(term.registration.moving for term in self._shell):
             # clamps push from outside, and cannot be told from the sheet's own forces here
             gap = gap - parts["internal"] - parts.get("damping", 0.0)
-        free = ~system.prescribed.mask[:n]
-        sums = comm.allreduce(
-            np.array(
-                [
-                    float(np.sum(total**2, where=free)),
-                    energy(self._shell, x1) - energy(self._shell, x0),
-                    self._energy_roundoff(x1) + self._energy_roundoff(x0),
-                    float(sum(np.abs(part).sum() for part in parts.values())),
-                    float(np.sum((x1 - x0)[:n] ** 2)),
-                    *gap.sum(axis=0),
-                ]
-            )
-        )
-        left, change, noise, forces, way = map(float, sums[:5])
+        change, noise, forces, way, *gaps = system.points.summed(
+            energy(self._shell, x1) - energy(self._shell, x0),
+            self._energy_roundoff(x1) + self._energy_roundoff(x0),
+            float(sum(np.abs(part).sum() for part in parts.values())),
+            float(np.sum((x1 - x0)[:n] ** 2)),
+            *gap.sum(axis=0),
+        ).tolist()
         reach = largest(comm, x1)
-        promised, floor, driving = self._promise(parts, reach)
-        residual = math.sqrt(left)
-        tolerance = EPSILON * (noise + forces * reach) + floor * math.sqrt(way)
+        left = self._left(parts, reach, dt)
+        unsolved = (left["residual"] + left["floor"]) * math.sqrt(system.points.n_global)
+        tolerance = EPSILON * (noise + forces * reach) + left["floor"] * math.sqrt(way)
         along, jumped = force_along(comm, n, self._shell, x0, x1 - x0, enough=0.1 * tolerance)
-        count = system.points.n_global
         return StepBalance(
-            energy=math.nan,
             change=change,
-            numerical=0.0,
-            viscous=0.0,
             bracket=along,
-            work=0.0,
             defect=change - along,
             tolerance=tolerance,
-            residual=residual,
-            promised=promised,
-            floor=floor,
-            driving=driving,
-            push=largest(comm, np.where(free, (x1 - x0 - dt * self._v)[:n], 0.0)),
-            momentum=dt * float(np.abs(sums[5:]).max()),
-            momentum_tolerance=dt * ((residual + floor) * math.sqrt(count) + EPSILON * forces),
-            spin=0.0,
-            spin_tolerance=0.0,
+            momentum=dt * max(map(abs, gaps)),
+            momentum_tolerance=dt * (unsolved + EPSILON * forces),
             jumped=jumped,
+            **left,
         )
 
     def _prepare(self, at: float) -> None:

@@ -40,8 +40,6 @@ from lyra_petsc.stepping.problem import Outline
 from lyra_petsc.stepping.simulation import StepReport
 
 RESULT_FILE = "result.json"
-SET_UP = ("mesh", "partition", "assembly")
-"""Phases of a run before its first step; the solver's objects are set up in them too."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from lyra_petsc.experiments.stress.trials import StressOutcome
 from lyra_petsc.stepping.simulation import StepReport
 
 GOOD = StepBalance(
-    energy=1.0, change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
+    change=-0.5, numerical=0.3, viscous=0.1, bracket=-0.2, work=0.1, defect=1e-10,
     tolerance=1e-9, residual=1e-6, promised=2e-6, floor=1e-12, driving=1.0, push=1e-3, momentum=1e-8,
     momentum_tolerance=1e-7, spin=1e-8, spin_tolerance=1e-7,
 )  # fmt: skip
