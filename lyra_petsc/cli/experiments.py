@@ -17,11 +17,11 @@ from rich.text import Text
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.progress import duration
+from lyra_petsc.cli.run import tell_unused
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Launcher, Outcome, passed_of
 from lyra_petsc.experiments.results import Results, View, aligned
-from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
 
@@ -74,14 +74,6 @@ def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | No
     return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_words())
 
 
-def tell_unused() -> None:
-    """Warn of PETSc options that nothing has used. On one rank."""
-    left = unused([])
-    if left:
-        listed = ", ".join(f"-{name}" for name in left)
-        print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
-
-
 class Terminal:
     """Shows the progress of cases on the terminal; on rank 0 only.
 
@@ -121,7 +113,8 @@ class Terminal:
     def close(self, results: Results[Any], note: str) -> None:
         """The end: a table, what passed, where results are, what is missing, options that nothing used."""
         outcomes = results.outcomes
-        self.print()
+        if self._view.heading():  # the lines of the cases are a table, too
+            self.print()
         for line in aligned(self._view.summary(outcomes), len(self._view.summary(outcomes)[0]) - 1):
             self.print(line)
         total = duration(sum(outcome.seconds for outcome in outcomes))
@@ -131,7 +124,7 @@ class Terminal:
         if note:
             self.print(f"note: {note}")
         if self._speaks:
-            tell_unused()
+            tell_unused([])
 
 
 def verify(

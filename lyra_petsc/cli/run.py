@@ -120,9 +120,8 @@ class TerminalProgress(ProgressCallbacks):
             text = f"compiling kernels, about 15 s in every run: {NO_PLACE}"
         if self._progress is not None:
             self._progress.say(text)
-            return
-        with suppress(OSError):
-            print(text, file=sys.stderr, flush=True)
+        else:
+            say(text)
 
     def begin(self, simulation: SteppedScene, folder: Path) -> None:
         """Start the progress bar, and show the run on the page."""
@@ -169,13 +168,18 @@ class TerminalProgress(ProgressCallbacks):
         closing_table(self._comm, simulation.phases.seconds(), folder, outcome)
         if self._page is not None:
             print(f"look again   lyra-petsc view {folder}", flush=True)
-        left = unused(simulation.stepper.our_options)
-        if left and self._comm.rank == 0:
-            listed = ", ".join(f"-{name}" for name in left)
-            print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)
+        if self._comm.rank == 0:
+            tell_unused(simulation.stepper.our_options)
 
 
 def petsc_speaks() -> bool:
     """Whether PETSc prints while the run goes on, which would spoil a progress bar."""
     names = PETSc.Options().getAll()
     return any(word in name for name in names for word in ("monitor", "converged_reason", "_view", "info"))
+
+
+def tell_unused(ours: list[str]) -> None:
+    """Warn of PETSc options, beside ours, that nothing has used. On one rank."""
+    if left := unused(ours):
+        listed = ", ".join(f"-{name}" for name in left)
+        print(f"lyra-petsc: warning: PETSc options that nothing used: {listed}", file=sys.stderr)

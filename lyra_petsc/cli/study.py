@@ -10,9 +10,9 @@ from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.cli.experiments import case_launcher, command, tell_unused, watched
+from lyra_petsc.cli.experiments import case_launcher, command, watched
 from lyra_petsc.cli.progress import StudyProgress
-from lyra_petsc.cli.run import petsc_speaks
+from lyra_petsc.cli.run import petsc_speaks, tell_unused
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.case import load_record, save_record
 from lyra_petsc.experiments.study.jobs import STUDY, Job, Result, launched, report_progress, run_case
@@ -99,7 +99,7 @@ def _close(comm: MPI.Comm, outcome: StudyOutcome, folder: Path) -> None:
         done = len(outcome.rows) - len(outcome.failed)
         print(f"{done} of {len(outcome.rows)} combinations done, {len(outcome.failed)} failed")
         print(f"report       {folder / 'report.html'}", flush=True)
-        tell_unused()
+        tell_unused([])
     if not any(row.result.done for row in outcome.rows):
         raise SolverError(
             f"all {len(outcome.rows)} combinations failed; the first: {outcome.rows[0].result.problem}",

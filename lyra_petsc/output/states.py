@@ -22,14 +22,21 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.background import Background
-from lyra_petsc.output.growing_xdmf import GrowingXdmf
 from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.self_contained import LeadsOutError
 from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
-from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE, StoredField, TimeSeries, WrittenState, group_name
+from lyra_petsc.output.xdmf import (
+    MESH_FILE,
+    XDMF_FILE,
+    GrowingXdmf,
+    StoredField,
+    TimeSeries,
+    WrittenState,
+    group_name,
+)
 from lyra_petsc.parallel import on_root
 
 FEWEST, MOST = 4, 512

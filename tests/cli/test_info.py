@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.cli import info as module
-from lyra_petsc.cli.info import info, launched_ranks
-from lyra_petsc.cli.installation_checks import Installation, misfits
+from lyra_petsc.cli.info import Installation, info, launched_ranks, misfits
 
 
 def test_names_the_versions_in_use(comm):

@@ -7,7 +7,7 @@ import pytest
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.output import growing_xdmf, hdf5
+from lyra_petsc.output import hdf5, xdmf
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
@@ -243,7 +243,7 @@ def test_few_files_and_a_document_that_grows(comm, shared_tmp, monkeypatch):
     """Files double; the document is copied now and then only, and is whole after every write to it."""
     write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
     run, copies, whole = Run(comm, shared_tmp), [], []
-    make, pwrite = growing_xdmf.GrowingXdmf._make, os.pwrite
+    make, pwrite = xdmf.GrowingXdmf._make, os.pwrite
 
     def counted(self, *arguments, **keywords):
         copies.append(1)
@@ -255,8 +255,8 @@ def test_few_files_and_a_document_that_grows(comm, shared_tmp, monkeypatch):
             whole.append(len(ElementTree.parse(shared_tmp / XDMF_FILE).findall("./Domain/Grid/Grid")))
         return done
 
-    monkeypatch.setattr(growing_xdmf.GrowingXdmf, "_make", counted)
-    monkeypatch.setattr(growing_xdmf.os, "pwrite", checked)
+    monkeypatch.setattr(xdmf.GrowingXdmf, "_make", counted)
+    monkeypatch.setattr(xdmf.os, "pwrite", checked)
     for step in range(90):
         run.write(step)
     assert len(list(shared_tmp.glob("states-*.h5"))) == 6
