@@ -14,7 +14,7 @@ import click
 
 from lyra_petsc.cli.arguments import help_asked, petsc_cannot_start, split
 from lyra_petsc.cli.verbs import verbs
-from lyra_petsc.errors import InputError, LyraError, SolverError
+from lyra_petsc.errors import InputError, LyraError, SolverError, with_short_words
 from lyra_petsc.parallel import take_back_signals
 
 PROGRAM = "lyra-petsc"
@@ -133,5 +133,6 @@ def _report_unexpected(comm: Any, error: BaseException) -> int:
 
 def _in_one_line(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption):
-        return f"{error.option_name}: no such option; see --help (PETSc options have one dash)"
-    return error.format_message()
+        name = with_short_words(error.option_name)
+        return f"{name}: no such option; see --help (PETSc options have one dash)"
+    return with_short_words(error.format_message())

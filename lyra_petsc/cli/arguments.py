@@ -61,8 +61,11 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
 
 
 def petsc_cannot_start(words: Sequence[str]) -> str:
-    """Why PETSc would fail or crash while it reads these options and PETSC_OPTIONS; or nothing."""
+    """Why PETSc would fail or crash while it reads these options, PETSC_OPTIONS and its files; or nothing."""
     every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
+    if "-skip_petscrc" not in every:
+        places = [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
+        every += [word for place in places if os.path.isfile(place) for word in ("-options_file", place)]
     for option, value in itertools.pairwise([*every, ""]):
         name = option.lstrip("-").lower()
         if name in ("options_file", "options_file_yaml"):
@@ -73,10 +76,17 @@ def petsc_cannot_start(words: Sequence[str]) -> str:
                 why = getattr(error, "strerror", None) or "it is no text"
                 return f"-{name}: cannot read '{value}': {why}"
             if name == "options_file":
-                wrong = _wrong_line(text)
+                given = re.sub(r"(?m)#.*$", "", text).split()
+                wrong = _wrong_line(text) or _trapping(given)
                 if wrong:
                     return f"-{name}: {value}: {wrong}"
-        if name == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
+    return _trapping(every)
+
+
+def _trapping(words: Sequence[str]) -> str:
+    """Why no run survives ``-fp_trap``, if that is among the options."""
+    for option, value in itertools.pairwise([*words, ""]):
+        if option.lstrip("-").lower() == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
             return "-fp_trap: ends Python at numbers that overflow, which here make a step fail; leave it out"
     return ""
 

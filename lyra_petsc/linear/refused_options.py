@@ -58,10 +58,6 @@ def check_options() -> None:
             raise InputError(
                 "regularisation needs the entries of the exact Jacobian; leave it out", key=f"-{name}"
             )
-    if _is_on("fp_trap"):
-        raise InputError(
-            "ends Python at numbers that overflow, which here make a step fail; leave it out", key="-fp_trap"
-        )
     kind = options.getString("snes_type", "")
     if is_set("snes_type") and kind not in SNES_TYPES:
         allowed = " and ".join(SNES_TYPES)
