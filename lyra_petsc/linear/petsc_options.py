@@ -63,12 +63,16 @@ def refused(error: Exception) -> InputError:
     return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
 
 
+def quoted(error: Exception) -> list[str]:
+    """The options whose value an error of PETSc quotes."""
+    told = re.split(r"[\s;:,]+", last_words(error))
+    return [f"-{name}" for name, value in PETSc.Options().getAll().items() if value and value.strip() in told]
+
+
 def culprits(error: Exception) -> str:
     """The options that an error is about: those whose value it quotes, as it does not tell their names."""
-    told = re.split(r"[\s;:,]+", last_words(error))
     options = PETSc.Options().getAll()
-    names = [f"-{name}" for name, value in options.items() if value and value.strip() in told]
-    names = names or [f"-{name}" for name in options if name.endswith("python_type")]
+    names = quoted(error) or [f"-{name}" for name in options if name.endswith("python_type")]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
     return " or ".join(sorted(names)) or "PETSc options"
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+from pathlib import Path
 
 from petsc4py import PETSc
 
@@ -25,6 +27,10 @@ without entries)."""
 
 MOST_DENSE = 3000
 """Unknowns up to which work on dense matrices of that size is done."""
+
+FLAGS_AT_END = ("options_view", "mpidump", "get_total_flops")
+FILES_AT_END = ("log", "log_view", "malloc_view", "citations")
+"""What PETSc reads only when a run is over."""
 
 DENSE = ("pc_type svd", "snes_test_jacobian")
 """What is done with dense matrices."""
@@ -49,6 +55,7 @@ def check_options() -> None:
             # -pc_type python alone is the program's multigrid
             if name not in ("pc_type", "mat_type") and not is_set(f"{stem}python_type"):
                 raise InputError(f"python needs -{stem}python_type package.module.Class", key=f"-{name}")
+    _check_end()
     if is_set("ts_init_time"):
         raise InputError(
             "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
@@ -95,6 +102,29 @@ def check_size(unknowns: int) -> None:
 def _is_on(name: str) -> bool:
     """Whether an option is set, and not to false."""
     return is_set(name) and PETSc.Options().getString(name, "").lower() not in ("0", "false", "no", "off")
+
+
+def _check_end() -> None:
+    """Refuse what PETSc would stumble over at its end, which must not see it either."""
+    options = PETSc.Options()
+    for name in (*FLAGS_AT_END, *FILES_AT_END):
+        value = options.getString(name, "")
+        if why := _wrong_at_end(name, value):
+            options.delValue(name)
+            raise InputError(why, key=f"-{name}")
+
+
+def _wrong_at_end(name: str, value: str) -> str:
+    if name in FLAGS_AT_END:
+        known = value.lower() in ("", "1", "0", "true", "false", "yes", "no", "on", "off")
+        return "" if known else f"is true or false, not '{value}'"
+    if name == "log_view":
+        kind, _, value = value.partition(":")
+        if kind not in ("", "ascii"):
+            return f"is written as ascii, not as '{kind}'"
+        value = value.partition(":")[0]
+    folder = Path(value).parent
+    return f"cannot write into '{folder}'" if value and not os.access(folder, os.W_OK) else ""
 
 
 def _finite(text: str) -> bool:
