@@ -64,9 +64,20 @@ def refused(error: Exception) -> InputError:
 
 
 def quoted(error: Exception) -> list[str]:
-    """The options whose value an error of PETSc quotes."""
+    """The options that an error of PETSc names, or whose value it quotes."""
     told = re.split(r"[\s;:,]+", last_words(error))
-    return [f"-{name}" for name, value in PETSc.Options().getAll().items() if value and value.strip() in told]
+    options = {f"-{name}": (value or "").strip() for name, value in PETSc.Options().getAll().items()}
+    named = [name for name in options if name in told]
+    named = named or [name for name, value in options.items() if value and value in told]
+    numbers = set(map(_number, told)) - {None}  # PETSc quotes -1 as -1. and 1e30 as 1e+30
+    return named or [name for name, value in options.items() if _number(value) in numbers]
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def culprits(error: Exception) -> str:

@@ -21,6 +21,12 @@ SNES_TYPES = ("newtonls", "ksponly")
 JACOBIANS = ("snes_mf", "snes_mf_operator", "snes_fd", "snes_fd_color")
 """Options that replace the assembled Jacobian."""
 
+WITHOUT_GRID = (
+    *("snes_grid_sequence", "snes_convergence_estimate", "snes_monitor_fields", "snes_fd_function"),
+    *("ts_convergence_estimate", "ksp_view_diagonal_scale"),
+)
+"""Options by which PETSc reads what belongs to grids of its own (DM), and crashes."""
+
 NEEDS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
 """Preconditioners that without an option take for ever (sweeps that are not symmetric), or crash (an operator
 without entries)."""
@@ -48,8 +54,10 @@ def check_options() -> None:
     for name, value in options.getAll().items():
         if not all(map(_finite, (value or "").split(","))):
             raise InputError(f"must be a finite number, not {value}", key=f"-{name}")
-        if name.endswith("python_type"):
-            _check_class(name, value)
+        if name.endswith("_type") and not value:
+            raise InputError("needs a type after it", key=f"-{name}")
+        if name.endswith(("python_type", "monitor_python")):
+            _check_class(name, value or "")
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
             # -pc_type python alone is the program's multigrid
@@ -60,6 +68,11 @@ def check_options() -> None:
         raise InputError(
             "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
         )
+    for name in WITHOUT_GRID:
+        if _is_on(name):
+            raise InputError(
+                "PETSc crashes by it where it has no grid of its own; leave it out", key=f"-{name}"
+            )
     for name in JACOBIANS:
         if _is_on(name):
             raise InputError(
