@@ -171,6 +171,7 @@ def stress(
     force: bool,
     ranks: int | None,
     job: Path | None,
+    trust_mesh: bool,
 ) -> int:
     """Run the cases of ``stress`` or list them; the exit code; collective.
 
@@ -194,7 +195,7 @@ def stress(
     if listed:
         count = f"{len(cases)} of {known} cases; --full has all"
         return _list(comm, cases, count, lambda c: f"{c.family}: {FAMILIES.load(c.family).title}")
-    setting = on_root(comm, lambda: setting_of(scene, settings, level))
+    setting = on_root(comm, lambda: setting_of(scene, settings, level, trust_mesh=trust_mesh))
     launcher = case_launcher(comm, "stress", ranks)
     first = FOLDER / (scene.stem if scene is not None else "sheet")
     folder = out or on_root(comm, lambda: first if force else free_name(first))
@@ -211,6 +212,7 @@ def stress(
         setting = replace(setting, size=clock.size)
     asked = [] if scene is None else [str(scene)]
     asked += [word for text in settings for word in ("--set", text)]
+    asked += ["--trust-mesh"] if trust_mesh else []
     asked += [f"--{level.name.lower()}"] if level != Scope.USUAL else []
 
     def run(case: StressCase) -> trials.StressOutcome:

@@ -34,6 +34,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
         The options of these names.
     **said
         Fields of `Request` as the command line gives them; None or empty where nothing was said.
+        ``trust_mesh`` is always said: it is not taken from a folder, which may be another's.
 
     Raises
     ------
@@ -87,6 +88,7 @@ def _command(comm: MPI.Comm, plan: Plan) -> str:
     words += ["--quantities", request.quantities] if request.quantities else []
     words += ["--repeats", str(request.repeats)]
     words += ["--ranks", str(request.ranks)] if request.ranks is not None else []
+    words += ["--trust-mesh"] if request.trust_mesh else []
     return shlex.join(command(comm, "study", words))
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -60,16 +61,23 @@ class Setting:
     level : Scope
     size : float
         Diagonal of the rest shape's bounding box [m].
+    trust_mesh : bool
+        Give gmsh the scene's scripts whatever they say.
     """
 
     base: Content
     given: bool
     level: Scope
     size: float = math.sqrt(2.0)
+    trust_mesh: bool = False
 
     def content(self) -> Content:
         """A copy of the base scene, to be changed."""
         return copy.deepcopy(self.base)
+
+    def bench(self, comm: MPI.Comm, watch: Callable[[], None] | None) -> Bench:
+        """Where its scenes run as a user's do."""
+        return Bench(comm, watch, exact=False, trust_mesh=self.trust_mesh)
 
     @property
     def step(self) -> float:
@@ -181,7 +189,9 @@ def sheet(cells: int) -> Content:
     }
 
 
-def setting_of(scene: Path | None, settings: Sequence[str], level: Scope) -> Setting:
+def setting_of(
+    scene: Path | None, settings: Sequence[str], level: Scope, *, trust_mesh: bool = False
+) -> Setting:
     """What the cases start from. On one rank.
 
     Raises
@@ -210,7 +220,7 @@ def setting_of(scene: Path | None, settings: Sequence[str], level: Scope) -> Set
         content["time"].pop("tolerance")
     for key in ("output", "probes"):
         content.pop(key, None)
-    return Setting(content, scene is not None, level)
+    return Setting(content, scene is not None, level, trust_mesh=trust_mesh)
 
 
 KEPT = ("group", "damping", "warp_degrees", "rest_curvature")

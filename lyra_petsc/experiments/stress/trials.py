@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments.bench import Bench, Trial, problem_of
+from lyra_petsc.experiments.bench import Trial, problem_of
 from lyra_petsc.experiments.case import Launcher, Outcome, Watch
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
@@ -116,7 +116,7 @@ class BaseClock:
         content = self._setting.content()
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
         seconds: list[tuple[float, float]] = []
-        with Bench(self._comm, self._watch, exact=False) as bench, bench.simulation(content) as trial:
+        with self._setting.bench(self._comm, self._watch) as bench, bench.simulation(content) as trial:
             self.size = trial.simulation.problem.outline.size
             while not trial.simulation.finished:
                 began = time.process_time()
@@ -153,7 +153,7 @@ def run_case(
     began = time.perf_counter()
     before = clock.latest if clock is not None else None
     outcome = StressOutcome(case, record=Record(case.steps))
-    with Bench(comm, watch, exact=False) as bench:
+    with setting.bench(comm, watch) as bench:
         try:
             content = case.content(setting, bench)
         except NotHere as why:

@@ -29,7 +29,6 @@ from lyra_petsc.errors import InputError, OutputError, SolverError
 from lyra_petsc.experiments.bench import problem_of, simulated
 from lyra_petsc.experiments.case import Launcher, load_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
-from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderKind, checkpoint_files
@@ -58,6 +57,8 @@ class Job:
         How often it is timed; the first repeat writes the states.
     fingerprint : str
         Of everything the result depends on.
+    trust_mesh : bool
+        Give gmsh the scene's scripts whatever they say.
     """
 
     scene: str
@@ -65,6 +66,7 @@ class Job:
     folder: str
     repeats: int
     fingerprint: str
+    trust_mesh: bool = False
 
 
 @dataclass
@@ -141,10 +143,10 @@ class Result:
         """Mean Δt [s]; 0 without steps."""
         return self.end / self.steps if self.steps else 0.0
 
-    def describe(self, outline: Outline, sheets: Sequence[int]) -> None:
-        """Note the mesh; ``sheets`` are the vertices of its sources, if it has several."""
+    def describe(self, outline: Outline) -> None:
+        """Note the mesh."""
         self.vertices, self.triangles = outline.n_vertices, outline.n_triangles
-        self.spacing, self.sheets = outline.spacing, list(sheets) or [outline.n_vertices]
+        self.spacing, self.sheets = outline.spacing, [each.n_vertices for each in outline.sources]
 
     def count(self, reports: Sequence[StepReport]) -> None:
         """Note the steps of a run."""
@@ -261,7 +263,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     on_root(comm, lambda: empty_case(folder))
     result = Result(job.fingerprint, ranks=comm.size)
     try:
-        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides))
+        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides, trust_mesh=job.trust_mesh))
         result.integrator = str(scene.time.scheme)
         if warm:
             _warm_up(comm, scene)
@@ -291,7 +293,7 @@ def _repeat(
         set_up = time.perf_counter() - began
         recorder = None
         if repeat == 0:
-            result.describe(simulation.problem.outline, _sheets(comm, scene))
+            result.describe(simulation.problem.outline)
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)
@@ -325,14 +327,6 @@ def _repeat(
         # phases are entered together, so that all ranks have the same
         by_phase = {name: slowest(seconds) for name, seconds in phases.seconds().items()}
         result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
-
-
-def _sheets(comm: MPI.Comm, scene: Scene) -> list[int]:
-    """Vertices of each mesh source, where there are several."""
-    if len(scene.mesh) == 1:
-        return []
-    work = lambda: [build_mesh([source], file=scene.source).n_vertices for source in scene.mesh]  # noqa: E731
-    return on_root(comm, work)
 
 
 def _forget_checkpoints(folder: Path) -> None:

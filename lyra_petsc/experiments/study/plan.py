@@ -21,7 +21,7 @@ from typing import Any
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.experiments.case import load_record
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.scene.load import load_scene
@@ -345,7 +345,7 @@ def _text(value: Value) -> str:
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
-def scene_of(path: Path, given: Sequence[str], further: Sequence[str]) -> Scene:
+def scene_of(path: Path, given: Sequence[str], further: Sequence[str], *, trust_mesh: bool = False) -> Scene:
     """The scene with ``--set`` and a combination's overrides, without what a study need not write.
 
     Raises
@@ -354,13 +354,14 @@ def scene_of(path: Path, given: Sequence[str], further: Sequence[str]) -> Scene:
         As ``load_scene`` does; what comes from the combination says so.
     """
     try:
-        return load_scene(path, [*given, *LEAN, *further])
+        scene = load_scene(path, [*given, *LEAN, *further])
     except InputError as error:
         option, key = "--vary", error.key
         if key is not None and key.startswith("--set "):
             key = option + key.removeprefix("--set")
         message = error.message.replace("(from --set)", "(from --set or --vary)")
         raise InputError(message, file=error.file, key=key) from None
+    return scene.trusting_meshes() if trust_mesh else scene
 
 
 KINDS = ("position", "energy", "probes")
@@ -472,6 +473,8 @@ class Request:
         How often each combination is timed.
     ranks : int or None
         ``--ranks``: one mpirun per case; None: the communicator the study was started with.
+    trust_mesh : bool
+        ``--trust-mesh``.
     """
 
     scene: str
@@ -481,6 +484,17 @@ class Request:
     quantities: str = ""
     repeats: int = 3
     ranks: int | None = None
+    trust_mesh: bool = False
+
+    def with_changes(self, overrides: Sequence[str]) -> Scene:
+        """The scene with its settings and further overrides.
+
+        Raises
+        ------
+        InputError
+            If they do not go together.
+        """
+        return scene_of(Path(self.scene), self.settings, overrides, trust_mesh=self.trust_mesh)
 
 
 def read_request(folder: Path) -> Request:
@@ -567,7 +581,7 @@ class Plan:
         InputError
             If its settings do not go together.
         """
-        return scene_of(Path(self.request.scene), self.request.settings, self.overrides(combination))
+        return self.request.with_changes(self.overrides(combination))
 
 
 def is_static(scene: Scene) -> bool:
@@ -583,11 +597,10 @@ def make_plan(request: Request) -> Plan:
     InputError
         Whatever in the request, the scene or its meshes cannot be used.
     """
-    path = Path(request.scene)
     if request.repeats < 1:
         raise InputError(f"must be at least 1, not {request.repeats}", key="--repeats")
     axes = parse_axes(request.vary)
-    base = scene_of(path, request.settings, [])
+    base = request.with_changes([])
     quantities = chosen(request.quantities, base.probes)
     notes: list[str] = []
     if not axes:
@@ -607,7 +620,7 @@ def make_plan(request: Request) -> Plan:
 def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
     """Without ``--vary``: integrators and halved steps (or tolerances); for an equilibrium, meshes."""
     if is_static(base):
-        size = mean_edge_length(build_mesh(base.mesh, file=base.source))
+        size = mean_edge_length(mesh_of(base))
         h = float(f"{_given_size(base) or size:.3g}")
         mesh_overrides(base, h)
         notes.append(f"no --vary: element sizes {2 * h:g}, {h:g} and {h / 2:g} m")
@@ -694,7 +707,7 @@ def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
     for value in axis.values:
         found = overrides(base, [axis], [value])
         try:
-            scene_of(Path(request.scene), request.settings, found)
+            request.with_changes(found)
         except InputError as error:
             if not _needs_company(request, axis):
                 raise

@@ -56,7 +56,7 @@ from lyra_petsc.experiments.study.plan import (
     scene_of,
     time_overrides,
 )
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
@@ -134,7 +134,7 @@ def choose_references(plan: Plan) -> dict[Physics, Chosen]:
 
 
 def _scene(plan: Plan, physics: Physics) -> Scene:
-    return scene_of(Path(plan.request.scene), plan.request.settings, physical_overrides(plan, physics))
+    return plan.request.with_changes(physical_overrides(plan, physics))
 
 
 def _exact_words(name: str) -> str:
@@ -162,8 +162,8 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
     axis = plan.axis("mesh")
     for value in axis.values if axis is not None else [None]:
         further = overrides(plan.base, [axis], [value]) if axis is not None and value is not None else []
-        scene = scene_of(Path(plan.request.scene), plan.request.settings, further)
-        mesh = build_mesh(scene.mesh, file=scene.source)
+        scene = plan.request.with_changes(further)
+        mesh = mesh_of(scene)
         built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
         if not built.same_as(stored):
             raise InputError(
@@ -642,7 +642,9 @@ class Work:
 
         def look() -> tuple[Job, Result | None, bool]:
             digest = self._fingerprint(level.overrides, repeats)
-            job = Job(self.plan.request.scene, tuple(level.overrides), str(folder), repeats, digest)
+            request = self.plan.request
+            overrides = tuple(level.overrides)
+            job = Job(request.scene, overrides, str(folder), repeats, digest, request.trust_mesh)
             found = read_result(folder, digest)
             return job, found, found is None and (folder / RESULT_FILE).exists()
 
