@@ -56,7 +56,9 @@ def check_options() -> None:
             raise InputError(f"must be a finite number, not {value}", key=f"-{name}")
         if name.endswith("_type") and not value:
             raise InputError("needs a type after it", key=f"-{name}")
-        if name.endswith(("python_type", "monitor_python")):
+        if name.endswith("monitor_python") and not value:
+            raise InputError("needs a file after it, as monitor.py:function", key=f"-{name}")
+        if name.endswith("python_type"):
             _check_class(name, value or "")
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
