@@ -70,6 +70,11 @@ def check_options() -> None:
         raise InputError(
             "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
         )
+    if is_set("snes_convergence_test"):
+        raise InputError(
+            "is by solver.force_tolerance and solver.step_tolerance; leave it out",
+            key="-snes_convergence_test",
+        )
     for name in WITHOUT_GRID:
         if _is_on(name):
             raise InputError(

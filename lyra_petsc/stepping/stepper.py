@@ -292,6 +292,8 @@ class Stepper:
                 collective=together,
             ) from None
         self._linear_failed = False
+        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.judged:
+            self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
             self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)

@@ -36,6 +36,7 @@ REFUSED = [
     ["-snes_fd"],
     ["-snes_fd_color"],
     ["-fp_trap"],
+    ["-snes_convergence_test", "skip"],
     ["-snes_convergence_estimate"],
     ["-snes_grid_sequence", "1"],
     ["-snes_monitor_fields"],
