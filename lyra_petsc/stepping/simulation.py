@@ -166,7 +166,8 @@ class SteppedScene:
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
         time, every = self.scene.time, self.scene.output.every
-        largest = LARGEST_FRACTION * end if time.adaptive else step
+        # the end of the run is found within a fraction of Δt, which must not be the whole of it
+        largest = LARGEST_FRACTION * end if time.adaptive else min(step, end)
         largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
         smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
         smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))

@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
-from lyra_petsc.linear.petsc_options import Value, culprits, fill_gaps, is_set, refused
+from lyra_petsc.linear.petsc_options import FOREIGN, Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.parallel import all_here
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
@@ -292,6 +292,8 @@ class Stepper:
                 collective=together,
             ) from None
         self._linear_failed = False
+        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.judged:
+            self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
             self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)
@@ -342,7 +344,13 @@ class Stepper:
 
     def monitor(self) -> None:
         """Call the TS monitors that the user asked for; collective."""
-        self.ts.monitor(self.ts.getStepNumber(), self.ts.getTime(), self.velocity)
+        try:
+            self.ts.monitor(self.ts.getStepNumber(), self.ts.getTime(), self.velocity)
+        except PETSc.Error as error:
+            asked = [f"-{name}" for name in PETSc.Options().getAll() if name.startswith("ts_monitor")]
+            raise InputError(
+                f"PETSc cannot: {reasons.last_words(error)}", key=" or ".join(sorted(asked))
+            ) from None
 
     # -- callbacks ---------------------------------------------------------------------------------------
 
@@ -381,5 +389,5 @@ def _forget_python(ksp: PETSc.KSP) -> None:
 
 def _runs_foreign_python() -> bool:
     """Whether PETSc calls Python that is not this program's."""
-    types = {name: value for name, value in PETSc.Options().getAll().items() if name.endswith("python_type")}
-    return any(value != presets.PYTHON_TYPE for value in types.values())
+    options = PETSc.Options().getAll()
+    return any(value != presets.PYTHON_TYPE for name, value in options.items() if name.endswith(FOREIGN))
