@@ -159,7 +159,7 @@ class StageEquations:
         self.new_iterate(None)
         self._follow(self.x)
         after = self.integrator.stage_after(self.dt)
-        changed = self.prescribed.begin_step(t0, t1)
+        changed = self.prescribed.begin_step(t0, t1, self.x)
         self._freeze(t0 + after)
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
@@ -309,7 +309,9 @@ class StageEquations:
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
-        self.frozen = self.frozen | self._frozen_at(self.t1, self.x)
+        step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)
+        targets = (*self._moving, *self._constraints)
+        self.frozen = self.frozen | {term: term.freeze(step) for term in targets}
         self.prescribed.hold_vertices(self.x[:n])
         self.prescribed.solve(self._xh[:n], self.dt)
 
@@ -424,8 +426,8 @@ class StageEquations:
         self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
-        """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
-        parts = (np.where(self.prescribed.free, part, 0.0) for part in self._last_parts.values())
+        """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
+        parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
 
     def new_iterate(self, v: Array | None) -> None:
