@@ -158,6 +158,8 @@ class Simulation:
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
+        if self.problem.points.n_edges_global and not self.stepper.settle_edges(floor):
+            self.notes.append("the moments on the edges of the start shape do not balance")
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)

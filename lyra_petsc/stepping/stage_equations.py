@@ -288,6 +288,12 @@ class StageEquations:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
 
+    def begin_at_rest(self) -> float:
+        """Let handles hold what they do at the start; norm [N] of the moments on free edges; collective."""
+        self.prescribed.begin_step(self.t0, self.t0, self.x)
+        moments = np.where(self.prescribed.free, self._internal(self.x), 0.0)[self.points.n_vertices :]
+        return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
+
     # -- unknowns of edges at the end of a step ----------------------------------------------------
 
     @property
@@ -299,13 +305,14 @@ class StageEquations:
         """Seek the edges' unknowns at the end of the step just accepted, from x_before (n_owned, 3);
         collective.
 
-        A stage of backward Euler in which the vertices go where they are now.
+        A stage of backward Euler in which the vertices go where they are now. Before the first step it begins
+        there, too, after `begin_at_rest`.
         """
-        n = self.points.n_owned
+        n, dt = self.points.n_owned, self.dt or 1.0
         self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.frozen
         self.new_iterate(None)
         self.objective.forget()
-        self.stage = Stage(1.0 / self.dt, self.dt, self.dt)
+        self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
@@ -313,7 +320,7 @@ class StageEquations:
         targets = (*self._moving, *self._constraints)
         self.frozen = self.frozen | {term: term.freeze(step) for term in targets}
         self.prescribed.hold_vertices(self.x[:n])
-        self.prescribed.solve(self._xh[:n], self.dt)
+        self.prescribed.solve(self._xh[:n], dt)
 
     def end_edges(self, v: Array | None) -> None:
         """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""

@@ -170,9 +170,7 @@ class MidEdge(Elastic):
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
         data, shape = self.elements.data, self._shape(x, frozen)
         numbers = self.stencil, self.of_edges.of_triangles, self.edges
-        midedge_energy.add_gradient(
-            x, *numbers, data["sign"], shape, *self._constants, data["length"], out
-        )
+        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *self._constants, data["length"], out)
 
     def hessians(self, x: Array, frozen: Frames, lo: int, hi: int, blend: float, out: Array) -> None:
         data, shape = self.elements.data, self._shape(x, frozen)

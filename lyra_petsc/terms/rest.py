@@ -68,7 +68,10 @@ class RestShape:
 
     def _check_models(self) -> None:
         """Refuse neighbours that bend by different models."""
-        if len({shell.model for shell in self.shells if max(shell.bending) > 0.0 or shell.plate[0] > 0.0}) < 2:
+        if (
+            len({shell.model for shell in self.shells if max(shell.bending) > 0.0 or shell.plate[0] > 0.0})
+            < 2
+        ):
             return
         models = self.bends_by("midedge").astype(int) - self.bends_by("hinge")
         triangles = self.hinges.triangles

@@ -253,7 +253,9 @@ def of_isotropic(sheet: IsotropicSheet) -> ShellMaterial:
     bend = stretch * sheet.thickness * sheet.thickness / 12
     nu = sheet.poisson
     plate = (bend, nu * bend, bend, 0.5 * (1 - nu) * bend)
-    return ShellMaterial(sheet.density, stretch, nu * stretch, stretch, shear, (bend, bend, bend), plate=plate)
+    return ShellMaterial(
+        sheet.density, stretch, nu * stretch, stretch, shear, (bend, bend, bend), plate=plate
+    )
 
 
 def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[str]]:
