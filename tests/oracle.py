@@ -100,7 +100,7 @@ def directors_along_normals(term: MidEdge, x: Array) -> Array:
     edges = term.of_edges
     tangent = unit(x[edges.ends[:, 1]] - x[edges.ends[:, 0]])
     across = carried(term.frames, tangent)
-    mean = mean_directors(x, term.stencil.astype(np.int64), edges.of_triangles, len(edges.length))
+    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length))
     sine = np.sum(np.cross(tangent, across) * mean, axis=1)
     return np.asarray(edges.length * np.arctan2(sine, np.sum(across * mean, axis=1)))
 

@@ -293,9 +293,9 @@ class Material(Block):
         Cylindrical stiffness B; three values hold at 0°, 45°, 90° to the warp (of a hinge's edge). Or four
         numbers of an orthotropic plate.
     bending_model : str or None
-        ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh; ``midedge``:
-        one unknown more on every edge, converges on any mesh. By default ``midedge`` for young, poisson and
-        thickness, also of the library, and for an orthotropic plate, else ``hinge``.
+        ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
+        ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
+        poisson and thickness, also of the library, and for an orthotropic plate, else ``hinge``.
     young : float [Pa] or None
         Young's modulus of an isotropic shell.
     poisson : float or None
@@ -625,6 +625,7 @@ FIELD_UNITS = {
     "membrane_energy": "J/m²",
     "bending_energy": "J/m²",
     "curvature": "1/m",
+    "curvature_tensor": "1/m",
     "rank": "1",
 }
 FIELDS = tuple(FIELD_UNITS)

@@ -98,7 +98,7 @@ class Prescribed:
         return changed
 
     def hold_vertices(self, x: Array) -> None:
-        """Prescribe also the positions in x (n_owned, 3) [m] of all vertices, until `release_vertices`; collective."""
+        """Prescribe all vertices where x (n_owned, 3) has them, too, until `release_vertices`; collective."""
         layout = self._discretisation.layout
         self._kept = ~self.free, self.goal, self.velocity
         own = ~self.free
@@ -136,7 +136,7 @@ class Prescribed:
             self.put(velocity, self._rates(start + 1e-3 * (end - start)))
 
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
-        """Write the positions [m] that handles prescribe at time ``at`` over those in ``out`` (n_owned, 3)."""
+        """Write what handles prescribe at time ``at`` [s] over present positions in ``out`` (n_owned, 3)."""
         self.held.targets(t0, t1, at, self._reference.at, out)
 
     def _positions(self, at: float) -> Array:

@@ -268,7 +268,7 @@ class Stepper:
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
 
     def settle_edges(self, floor: float) -> bool:
-        """Let moments on the edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
+        """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
         equations, n = self._equations, self._shape[0]
         before = np.inf
         while floor < (moments := equations.begin_at_rest()) < before:

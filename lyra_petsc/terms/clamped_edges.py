@@ -1,8 +1,8 @@
-"""Directors that handles with ``clamp`` hold: they turn as the plane does that the sheet had where it was held.
+"""Directors that handles with ``clamp`` hold: they turn as the plane does that the sheet had at the start.
 
 That plane is the mean of those of the triangles on the edge, when the handle starts to act; it moves as the
-handle does. Where only springs hold the ends of an edge its director keeps its angle in the frame that follows
-the edge.
+handle does. Where only springs hold the ends of an edge the director keeps its angle in the frame that
+follows the edge.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class ClampedEdges:
         return np.empty(0, dtype=np.int64) if each is None else each.places
 
     def targets(self, number: int, at: float, reference: Callable[[float, Ints], Array], out: Array) -> None:
-        """Write a handle's unknowns at time ``at`` [s] over those in ``out`` (n,), as many turns as they say."""
+        """Write a handle's unknowns at time ``at`` [s] over the present ones in ``out`` (n,)."""
         each = self._handles.get(number)
         if each is None:
             return

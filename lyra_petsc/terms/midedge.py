@@ -1,15 +1,16 @@
 """Bending with one unknown on every edge: directors, whose angles with the triangles make a curvature.
 
-An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per triangle
-of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
+An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per
+triangle of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
 
     κ = −Σ_i (tan α_i − tan ᾱ_i) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
     energy = ½ A (κ − κ̄)ᵀ D (κ − κ̄)
 
-κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is the
-material's rest curvature and D its stiffness [N·m]. As κ is linear in the three tangents the energy is a
+κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is
+the material's rest curvature and D its stiffness [N·m]. As κ is linear in the three tangents the energy is a
 quadratic form of theirs. The director's angle has no mass: it is where moments balance, which makes edges of
-one, two or more triangles alike. A triangle's stencil is its own corners and edges. tan keeps folds below 180°.
+one, two or more triangles alike. A triangle's stencil is its own corners and edges. tan keeps folds below
+180°.
 
 Sources: constant curvatures from rotations of the edges are Morley's plate (Aeronautical Quarterly 19 (1968)
 149-169); on curved sheets Grinspun, Gingold, Reisman & Zorin, Computing discrete shape operators on general
@@ -44,6 +45,7 @@ from lyra_petsc.terms.term import Elastic, Step
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
 STEEPEST = np.radians(89.0)
 """Angle of a director at rest or at the start from which on a scene is refused."""
@@ -88,7 +90,8 @@ class MidEdge(Elastic):
         ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) 1 where the triangle runs along an edge, else
         −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of edges and
         directors before the start, ``curvature`` (E, 3, 3) [1/m] κ of each tangent, ``area`` (E,) [m²],
-        ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
+        ``triangle`` (E,) numbers in the mesh, ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴],
+        ``damping`` (E,) [s].
     """
 
     def __init__(self, elements: Elements) -> None:
@@ -211,13 +214,13 @@ class MidEdge(Elastic):
         return curvature
 
 
-def normals_of(x: Array, triangles: Ints) -> Array:
+def normals_of(x: Array, triangles: AnyInts) -> Array:
     """Unit normals (n, 3) of triangles (n, 3)."""
     a, b, c = (x[triangles[:, k]] for k in range(3))
     return unit(np.cross(b - a, c - a))
 
 
-def mean_directors(x: Array, triangles: Ints, number: Ints, n_edges: int) -> Array:
+def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) -> Array:
     """Means (n_edges, 3) of the unit normals of the triangles that have an edge, ``number`` (F, 3) of it."""
     normals = np.repeat(normals_of(x, triangles), 3, axis=0)
     total = np.stack([np.bincount(number.ravel(), normals[:, i], n_edges) for i in range(3)], axis=1)
@@ -225,7 +228,7 @@ def mean_directors(x: Array, triangles: Ints, number: Ints, n_edges: int) -> Arr
 
 
 def edge_numbers(rest: RestShape, triangles: Ints) -> tuple[Ints, Array]:
-    """Of triangles (F, 3) the edge opposite each corner, and 1 where they run from its lesser vertex, else −1."""
+    """Of triangles (F, 3) the edges opposite corners; 1 where they run from the lesser vertex, else −1."""
     tail, head = triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]
     n = rest.mesh.n_vertices
     keys = rest.edges[:, 0] * n + rest.edges[:, 1]
@@ -269,7 +272,7 @@ def elements(rest: RestShape) -> Elements:
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
     director = mean_directors(mesh.positions, triangles, number, n_edges)[number]
     _check(_tangents_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
-    ends = mesh.positions[edges[number]]
+    ends: Array = mesh.positions[edges[number]]
     data = {
         "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
         "rest": at_rest,
@@ -279,6 +282,7 @@ def elements(rest: RestShape) -> Elements:
         "director": director,
         "curvature": curvature,
         "area": area,
+        "triangle": chosen.astype(np.float64),
         "height": 2.0 * area / size.max(axis=1),
         "limit": fading_limit(area),
         "damping": rest.per_triangle("damping")[chosen],

@@ -5,8 +5,8 @@ Per triangle, with the tangents of ``midedge_shape`` and constants K (3 × 3) an
     energy = ½ w fᵀ K f,   f_i = tan α_i − f̄_i
 
 w is 1 but for triangles that have lost nine tenths of their area, with which it vanishes as in
-``hinge_energy``: they have hardly a normal. Of director angles φ, normal n, area A and barycentric coordinates
-b_c the derivatives of α_i are
+``hinge_energy``: they have hardly a normal. Of director angles φ, normal n, area A and barycentric
+coordinates b_c the derivatives of α_i are
 
     ∂α_i/∂x_c = ω n ± γ_i,   ω = −e_i · e_c / (2A |e_i|),     ∂α_i/∂φ_i = s_i
 

@@ -68,12 +68,9 @@ class RestShape:
 
     def _check_models(self) -> None:
         """Refuse neighbours that bend by different models."""
-        if (
-            len({shell.model for shell in self.shells if max(shell.bending) > 0.0 or shell.plate[0] > 0.0})
-            < 2
-        ):
+        if len({shell.model for shell in self.shells if shell.bends_by(shell.model)}) < 2:
             return
-        models = self.bends_by("midedge").astype(int) - self.bends_by("hinge")
+        models = np.where(self.bends_by("midedge"), 1, 0) - np.where(self.bends_by("hinge"), 1, 0)
         triangles = self.hinges.triangles
         mixed = np.flatnonzero(models[triangles[:, 0]] * models[triangles[:, 1]] < 0)
         if len(mixed):
