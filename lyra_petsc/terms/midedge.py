@@ -223,7 +223,7 @@ def normals_of(x: Array, triangles: AnyInts) -> Array:
 def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) -> Array:
     """Means (n_edges, 3) of the unit normals of the triangles that have an edge, ``number`` (F, 3) of it."""
     normals = np.repeat(normals_of(x, triangles), 3, axis=0)
-    total = np.stack([np.bincount(number.ravel(), normals[:, i], n_edges) for i in range(3)], axis=1)
+    total: Array = np.stack([np.bincount(number.ravel(), normals[:, i], n_edges) for i in range(3)], axis=1)
     return unit(total)
 
 

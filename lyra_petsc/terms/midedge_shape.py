@@ -73,7 +73,8 @@ def some_perpendicular(tangent: Array) -> Array:
 def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-untyped-def]
     """Of edges (n, 2): director d, γ [1/m] and ρ [1/m], into out (n, 9).
 
-    γ changes with the edge by −γ ρᵀ and an antisymmetric part. d is 0 where an edge is too far from its frame.
+    γ changes with the edge by −γ ρᵀ and an antisymmetric part. d is 0 where an edge is too far from its
+    frame.
     """
     for k in range(ends.shape[0]):
         e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))

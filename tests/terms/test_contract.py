@@ -11,6 +11,7 @@ import pytest
 from examples import FRAGMENTS, example
 from numpy.typing import NDArray
 from oracle import (
+    blocks_of,
     differences,
     directors_along_normals,
     element_hessians,
@@ -18,6 +19,7 @@ from oracle import (
     gradient,
     hessian,
     plain_hessian,
+    summed,
 )
 from physics import Simulation, rotation
 

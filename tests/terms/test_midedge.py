@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +208,7 @@ def test_order_with_a_turning_clamp(scheme: str) -> None:
         outcome(MPI.COMM_SELF, smoothly | {"time": {"end": 0.04, "step": step, "integrator": scheme}})
         for step in (0.004, 0.002, 0.001)
     ]
-    moved = [np.abs(a[0] - b[0]).max() for a, b in zip(ends, ends[1:], strict=False)]
+    moved = [np.abs(a[0] - b[0]).max() for a, b in pairwise(ends)]
     assert np.log2(moved[0] / moved[1]) > 1.8
 
 
@@ -218,7 +219,7 @@ def test_order_with_damping(scheme: str) -> None:
         outcome(MPI.COMM_SELF, {"time": {"end": 0.04, "step": step, "integrator": scheme}})
         for step in (0.004, 0.002, 0.001)
     ]
-    moved = [np.abs(a[0] - b[0]).max() for a, b in zip(ends, ends[1:], strict=False)]
+    moved = [np.abs(a[0] - b[0]).max() for a, b in pairwise(ends)]
     assert np.log2(moved[0] / moved[1]) > 1.8
 
 
