@@ -6,6 +6,7 @@ import math
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -496,7 +497,10 @@ class Simulation:
         term.restore_edges(state, self.problem.system.x)
 
     def resume(
-        self, memory: Mapping[str, Any], arrays: Mapping[str, Array], edges: Mapping[str, Array]
+        self,
+        memory: Mapping[str, Any],
+        arrays: Mapping[str, Array],
+        edges: Mapping[str, Array] = MappingProxyType({}),
     ) -> None:
         """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
         system = self.problem.system
