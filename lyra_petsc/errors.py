@@ -11,6 +11,14 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+LONGEST_WORD = 250
+"""Characters that messages quote of what has no spaces: more than paths and keys have."""
+
+
+def with_short_words(text: str) -> str:
+    """``text`` with the beginnings of words that are longer than any that is meant."""
+    return re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: word[0][:57] + "...", text)
+
 
 class LyraError(Exception):
     """Base of everything a user may see as one line."""
@@ -47,7 +55,7 @@ class InputError(LyraError):
 
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.key) if part)
-        return f"{where}: {self.message}" if where else self.message
+        return with_short_words(f"{where}: {self.message}" if where else self.message)
 
     def __reduce__(self) -> tuple[object, ...]:
         # broadcast from rank 0 to all: pickle must keep the keywords

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import time
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from contextlib import suppress
 from functools import cache
 from typing import TYPE_CHECKING, TypeVar
 
-from lyra_petsc.errors import LyraError
+from lyra_petsc.errors import InputError, LyraError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -87,6 +88,10 @@ def on_root(comm: MPI.Comm, work: Callable[[], Result], *, share: bool = True) -
             result = work()
         except LyraError as error:
             problem = error
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            problem = InputError("file name too long", file=error.filename)  # as any name comes from outside
     problem, shared = comm.bcast((problem, result if share else None), root=0)
     if problem is not None:
         raise problem

@@ -101,7 +101,7 @@ def make(elements: Elements, scene: Scene, mass: Array) -> EdgeAngle:
 
 
 EDGE_ANGLE = Registration(
-    "edge-angle", lambda scene, shells: True, Role.ELASTIC, "bending_energy", home=__name__
+    "edge-angle", lambda scene, shells: True, Role.ELASTIC, "angle_energy", bends=True, home=__name__
 )
 
 IN_PLACE_OF_HINGES = [entry for entry in REGISTRY if entry.name != "bending"] + [EDGE_ANGLE]

@@ -12,9 +12,9 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.arguments import help_asked, petsc_cannot_start, split
+from lyra_petsc.cli.arguments import help_asked, petsc_cannot_start, split, start_petsc
 from lyra_petsc.cli.verbs import verbs
-from lyra_petsc.errors import InputError, LyraError, SolverError
+from lyra_petsc.errors import InputError, LyraError, SolverError, with_short_words
 from lyra_petsc.parallel import take_back_signals
 
 PROGRAM = "lyra-petsc"
@@ -40,11 +40,9 @@ def run_command_line(argv: Sequence[str]) -> int:
     # without a launcher Open MPI starts a daemon, which only a process that spawns others would need
     os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
     try:
-        import petsc4py
-
         why = petsc_cannot_start(petsc)
         if not why:
-            petsc4py.init([argv[0], *petsc])
+            why = start_petsc([argv[0], *petsc])
             take_back_signals()
         import numpy as np
         from mpi4py import MPI
@@ -59,7 +57,12 @@ def run_command_line(argv: Sequence[str]) -> int:
     comm = MPI.COMM_WORLD
     if why:
         _say(comm, why)
+        MPI.Finalize()  # which a PETSc that has not started leaves to others
         return InputError.exit_code
+    from petsc4py import PETSc
+
+    from lyra_petsc.linear.petsc_options import quoted, refused
+
     reserve = [bytes(RESERVE)]
     # numba would put colour codes on the standard output where it finds colorama
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
@@ -78,6 +81,11 @@ def run_command_line(argv: Sequence[str]) -> int:
         return _leave_together(comm, InputError.exit_code, line)
     except (Exception, KeyboardInterrupt) as error:
         reserve.clear()  # Open MPI without memory leaves with a code of its own
+        if isinstance(error, PETSc.Error) and quoted(error):
+            line = str(refused(error))
+            _clear_frames(error)
+            _say(comm, line)
+            return _leave_together(comm, InputError.exit_code, line)
         code = _report_unexpected(comm, error)
         _clear_frames(error)
         if comm.size > 1:
@@ -133,5 +141,6 @@ def _report_unexpected(comm: Any, error: BaseException) -> int:
 
 def _in_one_line(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption):
-        return f"{error.option_name}: no such option; see --help (PETSc options have one dash)"
-    return error.format_message()
+        name = with_short_words(error.option_name)
+        return f"{name}: no such option; see --help (PETSc options have one dash)"
+    return with_short_words(error.format_message())

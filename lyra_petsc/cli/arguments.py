@@ -6,10 +6,12 @@ value, as in every PETSc program. A scene that follows a PETSc flag is still the
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 _PETSC = re.compile(r"-[A-Za-z_]")
 _SCENE = re.compile(r".*\.(ya?ml|json)$", re.IGNORECASE)
@@ -61,9 +63,14 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
 
 
 def petsc_cannot_start(words: Sequence[str]) -> str:
-    """Why PETSc would fail or crash while it reads these options and PETSC_OPTIONS; or nothing."""
+    """Why PETSc would fail or crash while it reads these options, PETSC_OPTIONS and its files; or nothing."""
     every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
+    if "-skip_petscrc" not in every:
+        places = [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
+        every += [word for place in places if os.path.isfile(place) for word in ("-options_file", place)]
     for option, value in itertools.pairwise([*every, ""]):
+        if not option.startswith("-"):
+            continue
         name = option.lstrip("-").lower()
         if name in ("options_file", "options_file_yaml"):
             try:
@@ -73,11 +80,49 @@ def petsc_cannot_start(words: Sequence[str]) -> str:
                 why = getattr(error, "strerror", None) or "it is no text"
                 return f"-{name}: cannot read '{value}': {why}"
             if name == "options_file":
-                wrong = _wrong_line(text)
+                given = re.sub(r"(?m)#.*$", "", text).split()
+                wrong = _wrong_line(text) or _trapping(given)
                 if wrong:
                     return f"-{name}: {value}: {wrong}"
-        if name == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
+        if name == "python":
+            return "-python: starts a program of Python's own; leave it out"
+        if name == "history":
+            folder = Path(value).parent if value and not value.startswith("-") else Path.home()
+            if not os.access(folder, os.W_OK):
+                return f"-history: cannot write into '{folder}'"
+    return _trapping(every)
+
+
+def _trapping(words: Sequence[str]) -> str:
+    """Why no run survives ``-fp_trap``, if that is among the options."""
+    for option, value in itertools.pairwise([*words, ""]):
+        if option.lstrip("-").lower() == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
             return "-fp_trap: ends Python at numbers that overflow, which here make a step fail; leave it out"
+    return ""
+
+
+def start_petsc(words: Sequence[str]) -> str:
+    """Start PETSc with its options; why it does not, or nothing.
+
+    PETSc would say why in some twenty lines; without them, ``PetscErrorMessage`` tells.
+    """
+    import petsc4py
+    import petsc4py.lib
+
+    library = ctypes.CDLL(petsc4py.lib.ImportPETSc().__file__)
+    printing = ctypes.c_void_p.in_dll(library, "PetscErrorPrintf")
+    usual, silent = printing.value, ctypes.cast(library.PetscErrorPrintfNone, ctypes.c_void_p).value
+    printing.value = silent
+    try:
+        petsc4py.init(words)
+    except RuntimeError as error:  # of a class that petsc4py has only once it has started
+        told = ctypes.c_char_p(), ctypes.c_char_p()
+        library.PetscErrorMessage(error.args[0], *map(ctypes.byref, told))
+        reason = "; ".join(text.value.decode("utf-8", "replace") for text in told if text.value)
+        return f"PETSc does not start with its options: {reason}"
+    finally:
+        if printing.value == silent:  # else an option has chosen
+            printing.value = usual
     return ""
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped
+from lyra_petsc.cli.options import SETTINGS, example, helped, trust_mesh
 from lyra_petsc.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,12 +26,13 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="A .geo, .msh or .obj of yours; its groups are listed.",
 )
+@trust_mesh
 @click.pass_obj
-def new(comm: Any, name: str, mesh: Path | None) -> None:
+def new(comm: Any, name: str, mesh: Path | None, trust_mesh: bool) -> None:
     """Write the starter scene NAME.yaml."""
     from lyra_petsc.parallel import on_root
 
-    path = on_root(comm, lambda: write_starter(name, mesh))
+    path = on_root(comm, lambda: write_starter(name, mesh, trust_mesh=trust_mesh))
     if comm.rank == 0:
         word, (one, several) = shlex.quote(str(path)), ways_to_start()
         click.echo(f"{path} written; next: {one} check {word}, then: {several} run {word}")
@@ -46,7 +47,7 @@ def ways_to_start() -> tuple[str, str]:
     return "lyra-petsc", "mpirun -n 2 lyra-petsc"
 
 
-def write_starter(name: str, mesh: Path | None) -> Path:
+def write_starter(name: str, mesh: Path | None, *, trust_mesh: bool = False) -> Path:
     """Write it; the file's path.
 
     Raises
@@ -62,7 +63,7 @@ def write_starter(name: str, mesh: Path | None) -> Path:
     path = given if given.suffix.lower() in (".yaml", ".yml") else given.with_name(f"{given.name}.yaml")
     if os.path.lexists(path):  # before the mesh, which may take long
         raise InputError("exists and is left as it is; choose another name", file=path)
-    text = starter(path, ways_to_start(), None if mesh is None else _own_mesh(mesh))
+    text = starter(path, ways_to_start(), None if mesh is None else _own_mesh(mesh, trust_mesh))
     try:
         # two at the same time: only one makes the file
         with open(path, "x", encoding="utf-8") as file:
@@ -72,7 +73,7 @@ def write_starter(name: str, mesh: Path | None) -> Path:
     return path
 
 
-def _own_mesh(file: Path) -> OwnMesh:
+def _own_mesh(file: Path, trust_mesh: bool) -> OwnMesh:
     from pydantic import ValidationError
 
     from lyra_petsc.mesh.build import build_mesh
@@ -86,7 +87,7 @@ def _own_mesh(file: Path) -> OwnMesh:
         raise InputError(error.errors()[0]["msg"], key="--mesh") from None
     if not file.is_file():
         raise InputError(f"no such file: {file}", key="--mesh")
-    built = build_mesh([source])
+    built = build_mesh([source], trust_scripts=trust_mesh)
     groups = {
         group: (DIMENSION_NAMES[found.dimension], len(found.vertices))
         for group, found in built.groups.items()

@@ -39,7 +39,7 @@ settings = click.option(
 trust_mesh = click.option(
     "--trust-mesh",
     is_flag=True,
-    help="Give gmsh the scripts (.geo) of SCENE whatever they say; only what you trust.",
+    help="Give gmsh mesh scripts (.geo) whatever they say; only what you trust.",
 )
 results = click.argument("run", type=click.Path(path_type=Path))
 out = click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the results.")

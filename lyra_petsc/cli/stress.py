@@ -14,7 +14,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.launch import Launcher
 from lyra_petsc.experiments.results import Results
 from lyra_petsc.experiments.stress.base import setting_of
-from lyra_petsc.experiments.stress.case import Case, Level
+from lyra_petsc.experiments.stress.case import Case, Level, Setting
 from lyra_petsc.experiments.stress.launch import launched, save
 from lyra_petsc.experiments.stress.registry import FAMILIES, selected
 from lyra_petsc.experiments.stress.runner import BaseClock, Outcome, run_case
@@ -41,6 +41,7 @@ class Asked:
     force: bool = False
     ranks: int | None = None
     job: Path | None = None
+    trust_mesh: bool = False
 
     @property
     def level(self) -> Level:
@@ -66,6 +67,7 @@ class Asked:
         words = [str(self.scene)] if self.scene is not None else []
         for text in self.settings:
             words += ["--set", text]
+        words += ["--trust-mesh"] if self.trust_mesh else []
         return words + ([f"--{self.level.name.lower()}"] if self.level != Level.USUAL else [])
 
     @property
@@ -86,7 +88,7 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
         A signal; what had been done is in the folder.
     """
     cases = selected(asked.names, asked.level)
-    setting = on_root(comm, lambda: setting_of(asked.scene, asked.settings, asked.level))
+    setting = on_root(comm, lambda: _setting(asked))
     assert setting is not None
     launcher = None
     if asked.ranks is not None:
@@ -123,6 +125,10 @@ def stress(comm: MPI.Comm, asked: Asked) -> int:
     note = results.run(cases, run, show)
     show.families(folder, note)
     return 0 if all(outcome.passed for outcome in outcomes) else FAILED
+
+
+def _setting(asked: Asked) -> Setting:
+    return setting_of(asked.scene, asked.settings, asked.level, trust_mesh=asked.trust_mesh)
 
 
 def list_cases(comm: MPI.Comm, asked: Asked) -> None:

@@ -45,6 +45,7 @@ class Asked:
     out: Path | None = None
     resume: bool = False
     force: bool = False
+    trust_mesh: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,6 +124,7 @@ def _request(asked: Asked, stored: Request | None) -> Request:
         "quantities": asked.quantities,
         "repeats": asked.repeats,
         "ranks": asked.ranks,
+        "trust_mesh": asked.trust_mesh,  # is not taken from a folder, which may be another's
     }
     return dataclasses.replace(base, **{key: value for key, value in said.items() if value is not None})
 
@@ -140,6 +142,7 @@ def _command(comm: MPI.Comm, plan: Plan) -> str:
     words += ["--quantities", request.quantities] if request.quantities else []
     words += ["--repeats", str(request.repeats)]
     words += ["--ranks", str(request.ranks)] if request.ranks is not None else []
+    words += ["--trust-mesh"] if request.trust_mesh else []
     return shlex.join(command(comm, "study", words))
 
 

@@ -148,6 +148,7 @@ def verify(
 @helped
 @scene
 @settings
+@trust_mesh
 @click.option(
     "--vary",
     multiple=True,
@@ -185,6 +186,7 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
 @helped
 @scene
 @settings
+@trust_mesh
 @click.option("--only", multiple=True, metavar="NAME,NAME,…", help="Only these cases or families.")
 @click.option("--quick", is_flag=True, help="Fewer cases, on a coarser sheet: less than a minute.")
 @click.option("--full", is_flag=True, help="All values, and their products.")

@@ -160,6 +160,8 @@ class Bench:
         Called before every step on all ranks; may raise to end the work.
     exact : bool
         Fill a direct solver and tight tolerances in; without, scenes run as a user's do.
+    trust_mesh : bool
+        Give gmsh the scenes' scripts whatever they say.
 
     Attributes
     ----------
@@ -170,10 +172,15 @@ class Bench:
     """
 
     def __init__(
-        self, comm: MPI.Comm, watch: Callable[[], None] | None = None, *, exact: bool = True
+        self,
+        comm: MPI.Comm,
+        watch: Callable[[], None] | None = None,
+        *,
+        exact: bool = True,
+        trust_mesh: bool = False,
     ) -> None:
         self.comm = comm
-        self._exact = exact
+        self._exact, self._trust_mesh = exact, trust_mesh
         self.watch = watch or (lambda: None)
         self.steps = 0
         self.latest = (0, 0.0)
@@ -225,6 +232,8 @@ class Bench:
             scene = Scene.model_validate(filled)
         except ValidationError as error:
             raise input_error(error, filled, file="scene of the case") from None
+        if self._trust_mesh:
+            scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps
         with simulated(self.comm, scene) as simulation:
             yield Trial(self, simulation)

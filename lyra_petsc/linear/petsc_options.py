@@ -63,12 +63,27 @@ def refused(error: Exception) -> InputError:
     return InputError(f"PETSc refuses it: {last_words(error)}", key=culprits(error))
 
 
+def quoted(error: Exception) -> list[str]:
+    """The options that an error of PETSc names, or whose value it quotes."""
+    told = re.split(r"[\s;:,]+", last_words(error))
+    options = {f"-{name}": (value or "").strip() for name, value in PETSc.Options().getAll().items()}
+    named = [name for name in options if name in told]
+    named = named or [name for name, value in options.items() if value and value in told]
+    numbers = set(map(_number, told)) - {None}  # PETSc quotes -1 as -1. and 1e30 as 1e+30
+    return named or [name for name, value in options.items() if _number(value) in numbers]
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
 def culprits(error: Exception) -> str:
     """The options that an error is about: those whose value it quotes, as it does not tell their names."""
-    told = re.split(r"[\s;:,]+", last_words(error))
     options = PETSc.Options().getAll()
-    names = [f"-{name}" for name, value in options.items() if value and value.strip() in told]
-    names = names or [f"-{name}" for name in options if name.endswith("python_type")]
+    names = quoted(error) or [f"-{name}" for name in options if name.endswith("python_type")]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
     return " or ".join(sorted(names)) or "PETSc options"
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+from pathlib import Path
 
 from petsc4py import PETSc
 
@@ -19,12 +21,22 @@ SNES_TYPES = ("newtonls", "ksponly")
 JACOBIANS = ("snes_mf", "snes_mf_operator", "snes_fd", "snes_fd_color")
 """Options that replace the assembled Jacobian."""
 
+WITHOUT_GRID = (
+    *("snes_grid_sequence", "snes_convergence_estimate", "snes_monitor_fields", "snes_fd_function"),
+    *("ts_convergence_estimate", "ksp_view_diagonal_scale"),
+)
+"""Options by which PETSc reads what belongs to grids of its own (DM), and crashes."""
+
 NEEDS = {"kaczmarz": "pc_kaczmarz_symmetric", "redistribute": "mat_type"}
 """Preconditioners that without an option take for ever (sweeps that are not symmetric), or crash (an operator
 without entries)."""
 
 MOST_DENSE = 3000
 """Unknowns up to which work on dense matrices of that size is done."""
+
+FLAGS_AT_END = ("options_view", "mpidump", "get_total_flops")
+FILES_AT_END = ("log", "log_view", "malloc_view", "citations")
+"""What PETSc reads only when a run is over."""
 
 DENSE = ("pc_type svd", "snes_test_jacobian")
 """What is done with dense matrices."""
@@ -42,26 +54,30 @@ def check_options() -> None:
     for name, value in options.getAll().items():
         if not all(map(_finite, (value or "").split(","))):
             raise InputError(f"must be a finite number, not {value}", key=f"-{name}")
-        if name.endswith("python_type"):
-            _check_class(name, value)
+        if name.endswith("_type") and not value:
+            raise InputError("needs a type after it", key=f"-{name}")
+        if name.endswith(("python_type", "monitor_python")):
+            _check_class(name, value or "")
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
             # -pc_type python alone is the program's multigrid
             if name not in ("pc_type", "mat_type") and not is_set(f"{stem}python_type"):
                 raise InputError(f"python needs -{stem}python_type package.module.Class", key=f"-{name}")
+    _check_end()
     if is_set("ts_init_time"):
         raise InputError(
             "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
         )
+    for name in WITHOUT_GRID:
+        if _is_on(name):
+            raise InputError(
+                "PETSc crashes by it where it has no grid of its own; leave it out", key=f"-{name}"
+            )
     for name in JACOBIANS:
         if _is_on(name):
             raise InputError(
                 "regularisation needs the entries of the exact Jacobian; leave it out", key=f"-{name}"
             )
-    if _is_on("fp_trap"):
-        raise InputError(
-            "ends Python at numbers that overflow, which here make a step fail; leave it out", key="-fp_trap"
-        )
     kind = options.getString("snes_type", "")
     if is_set("snes_type") and kind not in SNES_TYPES:
         allowed = " and ".join(SNES_TYPES)
@@ -95,6 +111,29 @@ def check_size(unknowns: int) -> None:
 def _is_on(name: str) -> bool:
     """Whether an option is set, and not to false."""
     return is_set(name) and PETSc.Options().getString(name, "").lower() not in ("0", "false", "no", "off")
+
+
+def _check_end() -> None:
+    """Refuse what PETSc would stumble over at its end, which must not see it either."""
+    options = PETSc.Options()
+    for name in (*FLAGS_AT_END, *FILES_AT_END):
+        value = options.getString(name, "")
+        if why := _wrong_at_end(name, value):
+            options.delValue(name)
+            raise InputError(why, key=f"-{name}")
+
+
+def _wrong_at_end(name: str, value: str) -> str:
+    if name in FLAGS_AT_END:
+        known = value.lower() in ("", "1", "0", "true", "false", "yes", "no", "on", "off")
+        return "" if known else f"is true or false, not '{value}'"
+    if name == "log_view":
+        kind, _, value = value.partition(":")
+        if kind not in ("", "ascii"):
+            return f"is written as ascii, not as '{kind}'"
+        value = value.partition(":")[0]
+    folder = Path(value).parent
+    return f"cannot write into '{folder}'" if value and not os.access(folder, os.W_OK) else ""
 
 
 def _finite(text: str) -> bool:

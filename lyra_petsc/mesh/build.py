@@ -16,7 +16,12 @@ from lyra_petsc.mesh.measures import lay_out
 from lyra_petsc.mesh.mesh import Mesh, Sheet, Source
 from lyra_petsc.mesh.orientation import orient
 from lyra_petsc.mesh.validate import check_shape, check_topology
-from lyra_petsc.scene.schema import MeshSource, Rotation
+from lyra_petsc.scene.schema import MeshSource, Rotation, Scene
+
+
+def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
+    """`build_mesh` of a scene's sources, whose scripts are trusted if the scene's are."""
+    return build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=tell)
 
 
 def build_mesh(

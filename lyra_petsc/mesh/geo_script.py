@@ -31,8 +31,15 @@ from lyra_petsc.mesh.geo_words import (
 from lyra_petsc.mesh.readers import read_bytes
 from lyra_petsc.scene.values import one_line
 
-LONGEST_STRING = 1000
-"""Characters of a text in quotes: from 1023 on gmsh takes the rest for commands."""
+LONGEST_STRING = 900
+"""Characters of a text in quotes: from 1023 on gmsh takes the rest for commands, and its messages that quote
+one are of 1024."""
+
+LONGEST_WORD = 200
+"""Characters of a name, which messages of gmsh may quote several times."""
+
+LONGEST_FORMAT = 120
+"""Characters of a text with places for numbers: gmsh writes each part of it into 256."""
 
 LONGEST_LINE = 4000
 """Characters of a line in a script that jumps: gmsh returns to the middle of those above 8192."""
@@ -54,6 +61,9 @@ _CLOSING = {"(": ")", "[": "]", "{": "}"}
 _UNPRINTED = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
 _JUMP_IN_TEXT = re.compile(rf"\b(?:{'|'.join(sorted(JUMPS))})\b", re.ASCII)
 _JUMP_IN_WORD = re.compile(r"(?<![A-Za-z_])(?:EndIf|EndFor|ElseIf|Else|Return)(?![A-Za-z_])")
+_FORMATTING = frozenset(("Printf", "Sprintf", "Error", "Warning", "SetFactory"))
+"""What gmsh takes for a format of the C library (of SetFactory it quotes it), whatever stands in it."""
+_NUMBER_FORMAT = re.compile(r"%[-+ 0]?\d?\d?(?:\.\d\d?)?[efgEFG]")
 _BEFORE_STATEMENT = frozenset((";", "}", "Else", "EndIf", "EndFor", "Return"))
 
 _DATA_MARKS: dict[tuple[str, ...], re.Pattern[bytes]] = {
@@ -260,6 +270,10 @@ def _code(text: str, path: Path) -> Iterator[_Token]:
             continue
         if kind == "sign" and found not in _SIGNS:
             raise InputError(f"line {line}: {found!r} has no meaning in a mesh script", file=path)
+        if kind == "word" and len(found) > LONGEST_WORD:
+            raise InputError(
+                f"line {line}: a name of {len(found)} characters; at most {LONGEST_WORD} are read", file=path
+            )
         if kind == "text":
             if len(found) < 2 or found[-1] != found[0]:
                 raise InputError(f"line {line}: a text in quotes does not end", file=path)
@@ -384,6 +398,8 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
         raise refuse()
     if word == "Printf":
         _check_printf(script, number)
+    if word in _FORMATTING:
+        _check_format(script, number)
     if word in ("Macro", "Function") and not (after and after.kind == "word" and after.text in names):
         raise refuse("must be followed by a name")
     known = word in STATEMENTS or word in OPERANDS
@@ -447,6 +463,30 @@ def _check_printf(script: _Script, number: int) -> None:
         or any(t.text in JUMPS for t in inside if t.kind == "word")
     ):
         raise InputError(f"line {line}: 'Printf' writes files; {REMEDY}", file=script.path)
+
+
+def _check_format(script: _Script, number: int) -> None:
+    """Refuse formats by which gmsh would read or write memory that is not its own: all but numbers' own."""
+    token, following = script.tokens[number], script.tokens[number + 1 : number + 4]
+    kinds = [(t.kind, t.text) for t in following]
+    if len(kinds) < 3 or kinds[0][1] != "(" or kinds[1][0] != "text" or kinds[2][1] not in (",", ")"):
+        raise InputError(
+            f"line {token.line}: '{token.text}' must be followed by (\"text\"…)", file=script.path
+        )
+    text = following[1].text
+    if "%" not in text:
+        return
+    if "%" in _NUMBER_FORMAT.sub("", text):
+        raise InputError(
+            f"line {token.line}: a '%' in a text of '{token.text}' must begin the format of a number, "
+            "such as %g or %12.3f",
+            file=script.path,
+        )
+    if len(text) > LONGEST_FORMAT:
+        raise InputError(
+            f"line {token.line}: a format of {len(text)} characters; at most {LONGEST_FORMAT} are read",
+            file=script.path,
+        )
 
 
 def _name(script: _Script, number: int) -> str:

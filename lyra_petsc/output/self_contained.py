@@ -19,9 +19,6 @@ from lyra_petsc.output.h5py_loader import import_h5py
 ENDINGS = (".h5", ".xdmf", ".vtkhdf", ".csv", ".yaml", ".json", ".txt", ".part")
 """Of what a run writes and its readers read."""
 
-DEEPEST = 8
-"""Groups within groups: our files have three."""
-
 _REMEDY = "a run's folder must hold all of its results"
 
 
@@ -108,18 +105,22 @@ def _check_content(file: Any, path: Path) -> None:
     if _known.get(path) == stamp:
         return
     h5py = import_h5py()
-    groups = [("", h5py.h5g.open(file, b"/"), 0)]
+    root = h5py.h5g.open(file, b"/")
+    groups, seen = [("", root)], {h5py.h5o.get_info(root).addr}
     while groups:
-        above, group, depth = groups.pop()
+        above, group = groups.pop()
         for name in group:
             where = f"{above}/{name.decode(errors='replace')}"[-80:]
             if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
                 raise LeadsOutError(f"{where!r} is a link to elsewhere; {_REMEDY}", file=path)
             member = h5py.h5o.open(group, name)
             if isinstance(member, h5py.h5g.GroupID):
-                if depth == DEEPEST:
-                    raise InputError(f"{where!r}: groups within groups; is no file of a run", file=path)
-                groups.append((where, member, depth + 1))
+                # hard links may make circles, and few groups look like very many
+                address = h5py.h5o.get_info(member).addr
+                if address in seen:
+                    raise InputError(f"{where!r}: a group in several places; is no file of a run", file=path)
+                seen.add(address)
+                groups.append((where, member))
             elif isinstance(member, h5py.h5d.DatasetID):
                 plan = member.get_create_plist()
                 if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count() > 0:

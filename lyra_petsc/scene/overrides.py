@@ -10,7 +10,7 @@ from typing import Any
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.messages import dotted
 from lyra_petsc.scene.text import parse_yaml
-from lyra_petsc.scene.values import one_line
+from lyra_petsc.scene.values import cut, one_line
 
 # keys under which a single block may stand for a list of one
 ONE_OR_MANY = ("mesh", "material")
@@ -40,7 +40,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> list[str]
 def apply_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
     """Change ``data`` in place as `apply_overrides` does, by values of Python; None removes a key."""
     for path, value in changes.items():
-        _set(data, str(path), plain(value), one_line(str(path)))
+        _set(data, str(path), plain(value), one_line(cut(str(path))))
 
 
 def plain(value: Any) -> Any:
@@ -59,7 +59,7 @@ def plain(value: Any) -> Any:
 
 def _apply(data: dict[str, Any], text: str) -> str:
     path_text, equals, value_text = text.partition("=")
-    option = one_line(f"--set {text if len(text) <= 60 else text[:57] + '...'}")
+    option = one_line(f"--set {cut(text)}")
     if not equals:
         raise InputError("must read key.path=value", key=option)
     return _set(data, path_text.strip(), parse_yaml(value_text, file=None, key=option), option)
@@ -112,7 +112,7 @@ def _step(
         # Python converts no number of thousands of digits
         if not part.isdecimal() or len(part) > 9 or int(part) > len(target):
             many = f"[0] to [{len(target)}]" if target else "[0]"
-            raise InputError(f"{dotted(walked)} is a list; give an index, {many}", key=option)
+            raise InputError(f"{cut(dotted(walked))} is a list; give an index, {many}", key=option)
         index = int(part)
         if index == len(target):
             target.append(None)
@@ -123,7 +123,7 @@ def _step(
             target[index] = [] if rest[0].isdecimal() else {}
         return target[index]
     if not isinstance(target, dict):
-        raise InputError(f"{dotted(walked)} holds a single value, no keys", key=option)
+        raise InputError(f"{cut(dotted(walked))} holds a single value, no keys", key=option)
     walked.append(part)
     if not rest:
         target[part] = value

@@ -47,7 +47,12 @@ def shown(value: object) -> str:
         text = _SHORT.repr(value)
     except ValueError:  # more digits than Python is willing to write
         return f"a very long {type(value).__name__}"
-    return text if len(text) <= 60 else text[:57] + "..."
+    return cut(text)
+
+
+def cut(text: str, most: int = 60) -> str:
+    """``text``, or its beginning where it is too long to be quoted."""
+    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def one_line(text: str) -> str:

@@ -158,23 +158,26 @@ class EnergyGuard:
             x0, v0 = fitted(x0, n, layout.n_local), fitted(v0, n, layout.n_local)
             for values in (x0, v0):
                 layout.update_ghosts(values)
-        x1, v1, free = system.x, system.v, system.prescribed.free
-        moved, mass = x1[:n] - x0[:n], system.mass[:, None]
-        slower, faster = (0.5 * float(np.sum(mass * v[:n] ** 2, where=free)) for v in (v0, v1))
-        change = 0.5 * float(np.sum(mass * (v1[:n] - v0[:n]) ** 2))
-        work = float(np.vdot(self._outer_force(x0, v0, x1, v1), np.where(free, moved, 0.0)))
+        x1, v1, at = system.x, system.v, system.prescribed.at
+        moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
+        change = 0.5 * float(np.einsum("i,ij,ij", system.mass, gained, gained))
+        # what the ledger's kinetic energies hold beyond the free coordinates
+        driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
+        work = self._outer_work(x0, v0, x1, v1, moved)
         work += self._handle_work(x0, x1, moved, works)
         pulled = self._of_targets(x0, x1)
-        reach = max(float(np.abs(x).max(initial=0.0)) for x in (x0, x1))
-        local = (slower, faster, change, work, *pulled, works.moving, self._stiff * reach**2)
+        reach = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
+        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2)
         sums = [float(value) for value in layout.summed(*local)]
         slower, faster, change, work, rise, from_targets, *springs, moving, stiff = sums
+        slower, faster = before.kinetic - slower, after.kinetic - faster
         work += from_targets
         plain = after.elastic - before.elastic - moving
         heat, fall = works.heat, after.potential - before.potential
         gain = faster - slower + plain + rise + fall + heat - work
         energy, energy_before = faster + after.elastic + springs[1], slower + before.elastic + springs[0]
-        sizes = energy + energy_before + abs(work) + abs(heat) + abs(before.potential) + abs(after.potential)
+        sizes = energy + energy_before + before.kinetic + after.kinetic
+        sizes += abs(work) + abs(heat) + abs(before.potential) + abs(after.potential)
         noise = ROUND_OFF * (sizes + math.sqrt(2.0 * abs(energy) * stiff) + ROUND_OFF * stiff)
         unexplained = after.total - before.total + heat - works.external
         return Balance(
@@ -210,9 +213,12 @@ class EnergyGuard:
                 springs = [springs[0] + at[0][0], springs[1] + at[1][1]]
         return rise, work, springs[0], springs[1]
 
-    def _outer_force(self, x0: Array, v0: Array, x1: Array, v1: Array) -> Array:
-        """Mean over both ends of loads without a potential and of wind (n_owned, 3) [N]."""
+    def _outer_work(self, x0: Array, v0: Array, x1: Array, v1: Array, moved: Array) -> float:
+        """Work [J] of loads without a potential and of wind on this rank's free coordinates, by the mean of
+        their forces over both ends of the step."""
         system = self._system
+        if not (self._forces or system.viscous):
+            return 0.0
         t0, t1 = system.t0, system.t1
         force = np.zeros_like(x1)
         for x, v in ((x0, v0), (x1, v1)):
@@ -225,8 +231,8 @@ class EnergyGuard:
             for term in system.viscous:
                 term.add_gradient(v, term.freeze(Step(t0, t1, t0, x, system.reference.at)), wind)
             force -= wind
-        force *= 0.5
-        return force[: system.points.n_owned]
+        free = np.where(system.prescribed.free, moved, 0.0)
+        return 0.5 * float(np.vdot(force[: len(free)], free))
 
     def _handle_work(self, x0: Array, x1: Array, moved: Array, works: Works) -> float:
         """Work [J] of exact handles on this rank, by the mean over both ends of what the sheet and its weight

@@ -18,7 +18,7 @@ from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.linear.hierarchy import Surface
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.linear.petsc_options import petsc_number
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.distribute import Part, Whole, distribute
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import mean_edge_length
@@ -132,7 +132,7 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=phases.tell)
+        mesh = mesh_of(scene, phases.tell)
         outline, whole = _whole(scene, mesh)
         return outline
 

@@ -111,7 +111,7 @@ class Examination:
         system = self._system
         bent = np.zeros(system.points.n_local, dtype=bool)
         for term in system.elastic:
-            if term.registration.energy == "bending_energy":
+            if term.registration.bends:
                 bent[term.stencil] = True
         n = system.points.n_vertices
         square = (mode[:n] ** 2).sum(axis=1)

@@ -47,6 +47,8 @@ class Registration:
         ``sum``, ``min`` or ``max``.
     damped : bool
         Stiffness-proportional damping acts through it.
+    bends : bool
+        It resists bending: without such a term sheets wrinkle as finely as their mesh.
     moving : bool
         Its energy depends on where moving handles stand, which thereby do work on the sheet.
     neighbours : bool
@@ -65,6 +67,7 @@ class Registration:
     energy: str = ""
     columns: Mapping[str, str] = field(default_factory=dict)
     damped: bool = False
+    bends: bool = False
     moving: bool = False
     neighbours: bool = False
     limits_step: bool = False
@@ -87,17 +90,18 @@ def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
 
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
-    Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True),
+    Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True, bends=True),
     Registration(
         "midedge",
         _bends_by("midedge"),
         Role.ELASTIC,
         "bending_energy",
         damped=True,
+        bends=True,
         limits_step=True,
         edge_state=("frame",),
     ),
-    Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, moving=True),
+    Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(
         "spring",
         lambda scene, shells: any(h.stiffness is not None or h.fade > 0 for h in scene.handles),

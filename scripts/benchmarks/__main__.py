@@ -61,6 +61,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--growth", type=numbers, nargs="*", metavar="N", help=f"further sizes to fit growth ({GROWTH})")
     add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
+    add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
     asked = parser.parse_args(list(words))
     chosen = QUICK if asked.quick else DEFAULT
@@ -120,13 +121,20 @@ class Bench:
             self.save()
 
     def _row(
-        self, vertices: int, method: str, ranks: int, petsc: Sequence[str] = (), **changes: float
+        self,
+        vertices: int,
+        method: str,
+        ranks: int,
+        petsc: Sequence[str] = (),
+        *,
+        plain: str = "",
+        **changes: float,
     ) -> Any:
-        what = f"{vertices} vertices, {method}, {ranks} rank(s)"
+        what = f"{vertices} vertices, {method}, {ranks} rank(s)" + (", plain numba" if plain else "")
         what += "".join(f", {name} {value:g}" for name, value in changes.items())
-        words = [*self._petsc, *petsc]
+        words, limits = [*self._petsc, *petsc], self._asked.limits
         return self._attempt(
-            what, lambda: measures.row(vertices, method, ranks, words, self._asked.limits, **changes)
+            what, lambda: measures.row(vertices, method, ranks, words, limits, plain, **changes)
         )
 
     def save(self) -> None:
@@ -141,6 +149,8 @@ class Bench:
             for method in measures.METHODS:
                 for ranks in asked.ranks:
                     self._add("rows", self._row(vertices, method, ranks))
+                    if asked.plain:
+                        self._add("rows", self._row(vertices, method, ranks, plain=self._plain))
             for name, command in asked.peers:
                 self._peer(vertices, name, command)
         self._growth()
@@ -161,13 +171,20 @@ class Bench:
             self.results["versions"] |= found.get("versions", {})
             self.save()
 
+    @property
+    def _plain(self) -> str:
+        """A folder for the kernels in plain numba."""
+        return str((self._folder / "plain").resolve())
+
     def _warm_up(self) -> None:
         """Fill numba's cache, that no row pays for compiling."""
-        for method in measures.METHODS:
-            self._attempt(
-                f"compiling, {method}",
-                lambda method=method: measures.row(36, method, 1, self._petsc, Limits(1, 1.0, 600.0)),
-            )
+        few = Limits(1, 1.0, 600.0)
+        for plain in ("", self._plain) if self._asked.plain else ("",):
+            for method in measures.METHODS:
+                self._attempt(
+                    f"compiling, {method}",
+                    lambda method=method, plain=plain: measures.row(1024, method, 1, self._petsc, few, plain),
+                )
 
     def _peer(self, vertices: int, name: str, command: str) -> None:
         self._add(

@@ -51,11 +51,21 @@ def machine() -> Result:
 
 
 def row(
-    vertices: int, method: str, ranks: int, petsc: Sequence[str], limits: Limits, **changes: float
+    vertices: int,
+    method: str,
+    ranks: int,
+    petsc: Sequence[str],
+    limits: Limits,
+    plain: str = "",
+    **changes: float,
 ) -> Result:
-    """Set-up, steps and memory of the hanging square; ``changes`` as `hanging_square` takes them."""
+    """Set-up, steps and memory of the hanging square; ``changes`` as `hanging_square` takes them.
+
+    With a folder ``plain``, kernels are plain numba, see ``worker.py``.
+    """
     scene = hanging_square(vertices, method, **changes)
-    return _steps("steps", scene, ranks, petsc, limits) | {"who": method}
+    found = _steps("steps", scene, ranks, petsc, limits, **({"plain": plain} if plain else {}))
+    return found | {"who": f"{method}, plain numba" if plain else method}
 
 
 def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
@@ -64,9 +74,11 @@ def apart(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Re
     return found | {"whole_vertices": square_number(vertices)}
 
 
-def _steps(kind: str, scene: dict[str, Any], ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
+def _steps(
+    kind: str, scene: dict[str, Any], ranks: int, petsc: Sequence[str], limits: Limits, **more: str
+) -> Result:
     few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": limits.seconds}
-    return measure(kind, ranks, petsc, limits.process, scene=scene, **few)
+    return measure(kind, ranks, petsc, limits.process, scene=scene, **few, **more)
 
 
 def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits) -> Result:

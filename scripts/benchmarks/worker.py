@@ -3,11 +3,13 @@
     mpirun -n P python worker.py JOB.json RESULT.json [-petsc options]
 
 ``JOB.json`` holds ``kind`` (a name in `KINDS`), ``scene`` and what else the kind takes; all times are in
-seconds of wall time, between barriers.
+seconds of wall time, between barriers. With ``plain``, a folder for numba's cache, kernels call the functions
+of ``tests/kernels/plain_vectors.py`` instead of those written in LLVM's language.
 """
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -20,6 +22,12 @@ from typing import Any
 import petsc4py
 
 petsc4py.init([sys.argv[0], *sys.argv[3:]])
+
+if plain := json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")).get("plain"):
+    # before anything imports what they replace; kernels in the usual cache contain the others
+    os.environ["NUMBA_CACHE_DIR"] = plain
+    sys.path.append(str(Path(__file__).parents[2] / "tests" / "kernels"))
+    sys.modules["lyra_petsc.kernels.vectors"] = importlib.import_module("plain_vectors")
 
 import numpy as np  # noqa: E402
 from mpi4py import MPI  # noqa: E402

@@ -10,6 +10,7 @@ import pytest
 from launch import SCENE, Left, done, lyra, write_scene
 
 GRID = "{grid: {width: 1.0, height: 1.0, nx: 4, ny: 4}}"
+LONG = 3000 * "x"
 EMPTY = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 
 # name: (change of the scene (old, new) or None, arguments after `run scene.yaml`, words in the line)
@@ -56,13 +57,18 @@ WORDS: list[tuple[list[str], str]] = [
     (["check", "noise.msh"], "noise.msh"),
     (["check", "scene.yaml", "--out", "x"], "--out: no such option"),
     (["run", "--resume", "--out", "used"], "used"),
+    (["check", "scene.yaml", "--set", f"{LONG}=1"], "unknown key"),
+    (["check", "scene.yaml", "--set", f"handles=[{{group: {LONG}}}]"], "handles[0].group"),
+    (["check", "scene.yaml", "--set", f"mesh.file=/{LONG}/x.obj"], "file name too long"),
+    (["report", LONG], "file name too long"),
+    (["check", "scene.yaml", f"--{LONG}"], "no such option"),
 ]
 
 # name: (scene, arguments, words in the line)
 MISTAKES = {
     name: (SCENE.replace(*change) if change else SCENE, ["run", "scene.yaml", *arguments], words)
     for name, (change, arguments, words) in CASES.items()
-} | {" ".join(arguments): (SCENE, arguments, words) for arguments, words in WORDS}
+} | {" ".join(arguments)[:60]: (SCENE, arguments, words) for arguments, words in WORDS}
 
 OF_PETSC = [
     name for name, (_, words, _) in MISTAKES.items() if any(re.match("-[a-z]", word) for word in words)
@@ -121,6 +127,7 @@ def refused(left: Left, words: str) -> None:
     """Exit code 2 and one line of ours with these words."""
     assert left.code == 2, left.err
     assert len(left.ours) == 1, left.err
+    assert len(left.ours[0]) < 800
     assert words in left.ours[0]
     assert "Traceback" not in left.err
     assert left.out == ""

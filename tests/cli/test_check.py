@@ -61,6 +61,23 @@ def test_a_mesh_script_of_others_is_read_by_a_list_of_statements_unless_trusted(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.geo", "scene.yaml", "x.msh"]
 
 
+def test_other_verbs_trust_mesh_scripts_where_asked_to_and_only_then(tmp_path: Path) -> None:
+    mesh = MEMBRANE.replace("{grid: {width: 1.0, height: 1.0, nx: 10, ny: 10}}", "{file: m.geo}")
+    (tmp_path / "scene.yaml").write_text(mesh)
+    (tmp_path / "m.geo").write_text(SQUARE + 'a = GetEnv("HOME");\n')
+    study = ["study", "scene.yaml", "--vary", "dt=0.01", "--set", "time.end=0.02", "--repeats", "1"]
+    stress = ["stress", "scene.yaml", "--quick", "--only", "gravity"]
+    for words in (["new", "starter", "--mesh", "m.geo"], stress, study):
+        refused = lyra(words, tmp_path)
+        assert refused.code == 2, refused.err
+        assert "GetEnv" in refused.err
+        trusted = lyra([*words, "--trust-mesh"], tmp_path)
+        assert trusted.code == 0, trusted.err
+    resumed = lyra(["study", "--out", "studies/scene", "--resume"], tmp_path)
+    assert resumed.code == 2, resumed.err  # what a folder says of itself is not enough
+    assert "GetEnv" in resumed.err
+
+
 def test_titles_are_text_and_any_number_of_steps_is_told(tmp_path: Path) -> None:
     (tmp_path / "plain.yaml").write_text(
         'title: "[/red] :smile: \\e[31m"\n' + MEMBRANE.replace("0.01", "1e-7")

@@ -173,3 +173,10 @@ def test_the_command_line_wins_over_the_environment_and_that_over_the_scene(tmp_
         3,
         pytest.approx(0.002),
     )
+
+
+def test_options_in_files_are_refused_like_those_of_the_command_line(tmp_path: Path) -> None:
+    (tmp_path / ".petscrc").write_text("-ksp_rtol 1e-6  # and then\n-fp_trap\n")
+    refused = lyra(["info"], tmp_path)
+    assert refused.code == 2, refused.err
+    assert ".petscrc: -fp_trap: ends Python" in refused.err

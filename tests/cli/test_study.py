@@ -98,6 +98,7 @@ def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
     ) in text
     for word in ("Recommendation", "Observed orders", "Reference", "numpy", "Pareto"):
         assert word in text
+    assert text.count("★") == 2  # in the table and below it
 
 
 def test_exact_answers_on_two_ranks(tmp_path: Path) -> None:
@@ -155,6 +156,7 @@ def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
     assert "all 1 combinations failed" in left.ours[0]
     assert table(tmp_path / "out")[0]["status"] == "failed"
     assert (tmp_path / "out" / "report.html").exists()
+    assert "★" not in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
 
 
 LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.001", "--repeats", "1", "--out", "out"]

@@ -36,6 +36,21 @@ REFUSED = [
     ["-snes_fd"],
     ["-snes_fd_color"],
     ["-fp_trap"],
+    ["-snes_convergence_estimate"],
+    ["-snes_grid_sequence", "1"],
+    ["-snes_monitor_fields"],
+    ["-snes_fd_function"],
+    ["-ksp_view_diagonal_scale"],
+    ["-ksp_monitor_python", "nosuch"],
+    ["-mat_seqaij_type"],
+    ["-pc_python_type"],
+    ["-ts_adapt_clip", "1e30"],
+    ["-ts_adapt_safety", "-1"],
+    ["-log_view", "draw"],
+    ["-log_view", ":/nonexistent/log"],
+    ["-citations", "/nonexistent/refs"],
+    ["-malloc_view", "/nonexistent/log"],
+    ["-options_view", "x"],
     ["--set", "output.every=1e-12"],
     ["--set", "time.step=auto", "--set", "time.tolerance=1e-30"],
     ["--set", "time.step=auto", "-ts_adapt_dt_max", "1e-12"],
@@ -139,17 +154,32 @@ def test_what_petsc_solves_is_solved(walk: Walk) -> None:
         assert end == (0, []), (words, end)
 
 
-def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path) -> None:
-    """At its end PETSc frees what calls Python; the runs above leave before."""
-    for words in (["-pc_type", "mg", "-ksp_type", "nosuch"], ["-options_file", "nosuch.txt"], ["-fp_trap"]):
-        left = subprocess.run(
-            [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out", *words],
-            cwd=tmp_path,
-            env=environment(),
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-        assert left.returncode == 2, left.stderr
-        assert len(left.stderr.splitlines()) == 1, left.stderr
-        assert words[-1] in left.stderr
+AT_THE_START_OR_END = [
+    ["-pc_type", "mg", "-ksp_type", "nosuch"],
+    ["-options_file", "nosuch.txt"],
+    ["-fp_trap"],
+    ["-prefix_pop"],
+    ["-python"],
+    ["-history", "/nonexistent/log"],
+    ["-log_trace", "/nonexistent/log"],
+    ["-log_view", ":/nonexistent/log"],
+    ["-is_view", "nosuch"],
+]
+
+
+@pytest.mark.parametrize("words", AT_THE_START_OR_END, ids=" ".join)
+def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: list[str]) -> None:
+    """PETSc reads some options only as it starts, and at its end frees what calls Python."""
+    left = subprocess.run(
+        [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out", *words],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert left.returncode == 2, left.stderr
+    assert len(left.stderr.splitlines()) == 1, left.stderr
+    assert "Traceback" not in left.stdout + left.stderr
+    told = {"-prefix_pop": "prefixes popped"}.get(words[-1], words[-1].removeprefix(":").removesuffix("/log"))
+    assert told in left.stderr

@@ -100,6 +100,16 @@ def meshed(folder: Path, text: str, **options: object) -> str:
         (f"For i In {{0:1}}\n{'a = 1; ' * 800}\nEndFor", "line 6: 5600 characters"),
         (f'a = "{"a" * 1100}"; //', "a text of 1102 characters"),
         ("// \0 hidden", "no text file"),
+        # formats, by which gmsh would write over its own memory
+        ('Printf("%n%n%n");', "line 5: a '%' in a text of 'Printf' must begin the format of a number"),
+        ('Error("%s%s%s%n");', "a '%' in a text of 'Error'"),
+        ('Printf("%999999999g", 1);', "a '%' in a text of 'Printf'"),
+        ('Printf("%*g", 1, 2);', "a '%' in a text of 'Printf'"),
+        ('a = Sprintf("%%n", 1);', "a '%' in a text of 'Sprintf'"),
+        ('a = "%n"; Printf(a);', "line 5: 'Printf' must be followed by"),
+        ('Warning(StrCat("%", "n"));', "'Warning' must be followed by"),
+        (f'a = Sprintf("%g{"A" * 400}", 1);', "a format of 404 characters"),
+        (f"{'a' * 1500} = 1;", "line 5: a name of 1500 characters"),
     ],
 )
 def test_refused_with_line_and_command(tmp_path: Path, text: str, words: str) -> None:
@@ -145,6 +155,7 @@ def test_links_do_not_lead_out_of_the_folder(tmp_path: Path) -> None:
         'Macro f /*\nSystemCall "touch mark";\n*/\na = 1;\nReturn\nCall f;\n',
         "If (0) a = 1; // EndIf SystemCall\nEndIf\n",
         'Savings = 1; Printer = Savings; Printf("%g", Printer);\n',
+        'a = Sprintf("layer%02.0f of %g", 3, 4); Printf("100 cotton %-12.3e", 2);\n',
     ],
 )
 def test_words_that_only_look_like_commands_are_allowed(tmp_path: Path, text: str) -> None:

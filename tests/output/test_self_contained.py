@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -165,7 +166,17 @@ def test_groups_that_hold_themselves_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["a/b"] = 1.0
         file["a/c"] = file["a"]
-    with pytest.raises(InputError, match="groups within groups"), open_own(tmp_path / "x.h5"):
+    with pytest.raises(InputError, match="a group in several places"), open_own(tmp_path / "x.h5"):
+        pass
+
+
+def test_few_groups_that_look_like_very_many_are_refused_at_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        groups = [file.create_group(f"g{number}") for number in range(7)]
+        for above, below in pairwise(groups):
+            for number in range(60):  # 60⁶ paths
+                above[f"{number}"] = below
+    with pytest.raises(InputError, match="a group in several places"), open_own(tmp_path / "x.h5"):
         pass
 
 

@@ -87,8 +87,8 @@ def test_sail_passes_wind_and_weight_on_to_its_handles() -> None:
 
 
 def test_plate_bends_like_a_beam_under_a_small_weight() -> None:
-    # w L⁴ / 8 D for a hundredth of its weight; a beam has (1 − ν²) D, but at the clamp it cannot curve across:
-    # 1.0816 on elements of 0.0125 m
+    # w L⁴ / 8 D for a hundredth of its weight; a beam has (1 − ν²) D, but at the clamp it cannot curve
+    # across: 1.0816 on elements of 0.0125 m
     settings = (
         "gravity=[0, 0, -0.0981]",
         "time.step=0.25",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import grid, scene_of
+from physics import gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.simulation import Simulation
@@ -86,6 +86,30 @@ def test_what_it_remembers_goes_into_checkpoints() -> None:
     assert other.guard.gains.scale == pytest.approx(one.guard.gains.scale, rel=1e-12)
     for each in (one, other):
         each.destroy()
+
+
+@pytest.mark.parallel
+def test_a_linear_solve_that_is_not_enough_is_repeated_alike_on_all_ranks(comm: MPI.Comm) -> None:
+    """A stiff hung sheet under long steps, which are far from linear: round-off must not grow with them."""
+    stiff = {key: 1e3 * c for key, c in MEMBRANE.items()}
+    content = {
+        "mesh": grid(1.0, 1.0, 12, 12, "alternating"),
+        "material": {"density": 0.15, "membrane": stiff, "bending": 1e-5, "damping": 0.005},
+        "gravity": [0.0, 0.0, -9.8],
+        "handles": [{"nodes": [0, 12]}],
+    }
+    ends = []
+    for on in (comm, MPI.COMM_SELF):
+        one = simulation(on, "semi-implicit", content, 0.2, 0.04)
+        rejected = one.step().rejected
+        run(one)
+        notes = [note for note in one.notes if "out of nothing" in note]
+        ends.append(gathered(one.problem.points, one.problem.system.x))
+        one.destroy()
+        assert rejected >= 1
+        assert len(notes) == 1
+        assert "time.integrator: beuler" in notes[0]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
 
 
 STIFF = FREE | {

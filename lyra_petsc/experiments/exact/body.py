@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import active
@@ -36,7 +36,7 @@ class Body:
 
     def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
         self.scene = scene
-        self.mesh = build_mesh(scene.mesh, file=scene.source) if mesh is None else mesh
+        self.mesh = mesh_of(scene) if mesh is None else mesh
         self.rest = RestShape(scene, self.mesh)
 
     @cached_property

@@ -48,7 +48,9 @@ def sheet(cells: int) -> Content:
     }
 
 
-def setting_of(scene: Path | None, settings: Sequence[str], level: Level) -> Setting:
+def setting_of(
+    scene: Path | None, settings: Sequence[str], level: Level, *, trust_mesh: bool = False
+) -> Setting:
     """What the cases start from. On one rank.
 
     Raises
@@ -77,4 +79,4 @@ def setting_of(scene: Path | None, settings: Sequence[str], level: Level) -> Set
         content["time"].pop("tolerance")
     for key in ("output", "probes"):
         content.pop(key, None)
-    return Setting(content, scene is not None, level)
+    return Setting(content, scene is not None, level, trust_mesh=trust_mesh)

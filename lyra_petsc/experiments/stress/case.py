@@ -10,6 +10,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments import case as experiments
@@ -47,16 +48,23 @@ class Setting:
     level : Level
     size : float
         Diagonal of the rest shape's bounding box [m].
+    trust_mesh : bool
+        Give gmsh the scene's scripts whatever they say.
     """
 
     base: Content
     given: bool
     level: Level
     size: float = math.sqrt(2.0)
+    trust_mesh: bool = False
 
     def content(self) -> Content:
         """A copy of the base scene, to be changed."""
         return copy.deepcopy(self.base)
+
+    def bench(self, comm: MPI.Comm, watch: Callable[[], None] | None) -> Bench:
+        """Where its scenes run as a user's do."""
+        return Bench(comm, watch, exact=False, trust_mesh=self.trust_mesh)
 
     @property
     def step(self) -> float:

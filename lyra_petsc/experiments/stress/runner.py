@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments import case as experiments
-from lyra_petsc.experiments.bench import Bench, Trial, problem_of
+from lyra_petsc.experiments.bench import Trial, problem_of
 from lyra_petsc.experiments.launch import Watch
 from lyra_petsc.experiments.stress.balance import Accountant
 from lyra_petsc.experiments.stress.case import Case, Level, NotHere, Setting
@@ -89,7 +89,7 @@ class BaseClock:
         content = self._setting.content()
         content["time"] = {**content["time"], "end": BASE_STEPS * self._setting.step}
         seconds: list[tuple[float, float]] = []
-        with Bench(self._comm, self._watch, exact=False) as bench, bench.simulation(content) as trial:
+        with self._setting.bench(self._comm, self._watch) as bench, bench.simulation(content) as trial:
             self.size = trial.simulation.problem.outline.size
             while not trial.simulation.finished:
                 began = time.process_time()
@@ -126,7 +126,7 @@ def run_case(
     began = time.perf_counter()
     before = clock.latest if clock is not None else None
     outcome = Outcome(case, record=Record(case.steps))
-    with Bench(comm, watch, exact=False) as bench:
+    with setting.bench(comm, watch) as bench:
         try:
             content = case.content(setting, bench)
         except NotHere as why:

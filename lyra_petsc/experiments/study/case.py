@@ -34,6 +34,8 @@ class Job:
         How often it is timed; the first repeat writes the states.
     fingerprint : str
         Of everything the result depends on.
+    trust_mesh : bool
+        Give gmsh the scene's scripts whatever they say.
     """
 
     scene: str
@@ -41,6 +43,7 @@ class Job:
     folder: str
     repeats: int
     fingerprint: str
+    trust_mesh: bool = False
 
 
 @dataclass
@@ -117,10 +120,10 @@ class Result:
         """Mean Δt [s]; 0 without steps."""
         return self.end / self.steps if self.steps else 0.0
 
-    def describe(self, outline: Outline, sheets: Sequence[int]) -> None:
-        """Note the mesh; ``sheets`` are the vertices of its sources, if it has several."""
+    def describe(self, outline: Outline) -> None:
+        """Note the mesh."""
         self.vertices, self.triangles = outline.n_vertices, outline.n_triangles
-        self.spacing, self.sheets = outline.spacing, list(sheets) or [outline.n_vertices]
+        self.spacing, self.sheets = outline.spacing, [each.n_vertices for each in outline.sources]
 
     def count(self, reports: Sequence[StepReport]) -> None:
         """Note the steps of a run."""

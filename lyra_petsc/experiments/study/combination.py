@@ -158,7 +158,7 @@ def _text(value: Value) -> str:
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
-def scene_of(path: Path, given: Sequence[str], further: Sequence[str]) -> Scene:
+def scene_of(path: Path, given: Sequence[str], further: Sequence[str], *, trust_mesh: bool = False) -> Scene:
     """The scene with ``--set`` and a combination's overrides, without what a study need not write.
 
     Raises
@@ -167,10 +167,11 @@ def scene_of(path: Path, given: Sequence[str], further: Sequence[str]) -> Scene:
         As ``load_scene`` does; what comes from the combination says so.
     """
     try:
-        return load_scene(path, [*given, *LEAN, *further])
+        scene = load_scene(path, [*given, *LEAN, *further])
     except InputError as error:
         option, key = "--vary", error.key
         if key is not None and key.startswith("--set "):
             key = option + key.removeprefix("--set")
         message = error.message.replace("(from --set)", "(from --set or --vary)")
         raise InputError(message, file=error.file, key=key) from None
+    return scene.trusting_meshes() if trust_mesh else scene

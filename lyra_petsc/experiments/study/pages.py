@@ -132,7 +132,8 @@ def _tables(report: Report, plan: Plan, rows: Sequence[Row]) -> None:
     report.table(
         head,
         body,
-        caption=f"Bold: on the Pareto front. ★: recommended for {percent(DEFAULT_TARGET)}.",
+        caption="Bold: on the Pareto front."
+        + (f" ★: recommended for {percent(DEFAULT_TARGET)}." if any(row.recommended for row in done) else ""),
         marked=front,
     )
     if any(row.unresolved for row in rows):

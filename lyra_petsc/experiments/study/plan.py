@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.study.axes import Axis, Value, parse_axes
@@ -14,12 +13,11 @@ from lyra_petsc.experiments.study.combination import (
     combinations,
     mesh_overrides,
     overrides,
-    scene_of,
 )
 from lyra_petsc.experiments.study.quantities import Quantity, chosen
 from lyra_petsc.experiments.study.request import Request
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.measures import mean_edge_length
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.numbers import seconds
@@ -91,7 +89,7 @@ class Plan:
         InputError
             If its settings do not go together.
         """
-        return scene_of(Path(self.request.scene), self.request.settings, self.overrides(combination))
+        return self.request.with_changes(self.overrides(combination))
 
 
 def is_static(scene: Scene) -> bool:
@@ -107,11 +105,10 @@ def make_plan(request: Request) -> Plan:
     InputError
         Whatever in the request, the scene or its meshes cannot be used.
     """
-    path = Path(request.scene)
     if request.repeats < 1:
         raise InputError(f"must be at least 1, not {request.repeats}", key="--repeats")
     axes = parse_axes(request.vary)
-    base = scene_of(path, request.settings, [])
+    base = request.with_changes([])
     quantities = chosen(request.quantities, base.probes)
     notes: list[str] = []
     if not axes:
@@ -131,7 +128,7 @@ def make_plan(request: Request) -> Plan:
 def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
     """Without ``--vary``: integrators and halved steps (or tolerances); for an equilibrium, meshes."""
     if is_static(base):
-        size = mean_edge_length(build_mesh(base.mesh, file=base.source))
+        size = mean_edge_length(mesh_of(base))
         h = float(f"{_given_size(base) or size:.3g}")
         mesh_overrides(base, h)
         notes.append(f"no --vary: element sizes {2 * h:g}, {h:g} and {h / 2:g} m")
@@ -218,7 +215,7 @@ def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
     for value in axis.values:
         found = overrides(base, [axis], [value])
         try:
-            scene_of(Path(request.scene), request.settings, found)
+            request.with_changes(found)
         except InputError as error:
             if not _needs_company(request, axis):
                 raise

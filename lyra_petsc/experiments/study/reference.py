@@ -13,10 +13,10 @@ from lyra_petsc.experiments.exact.body import Body
 from lyra_petsc.experiments.exact.motion import Motion
 from lyra_petsc.experiments.exact.registry import SOLUTIONS, exact_motion, matching
 from lyra_petsc.experiments.study.axes import Value
-from lyra_petsc.experiments.study.combination import Combination, overrides, scene_of
+from lyra_petsc.experiments.study.combination import Combination, overrides
 from lyra_petsc.experiments.study.plan import Plan
 from lyra_petsc.experiments.study.samples import Surface, read_here, read_surface
-from lyra_petsc.mesh.build import build_mesh
+from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
 
@@ -91,7 +91,7 @@ def choose_references(plan: Plan) -> dict[Physics, Chosen]:
 
 
 def _scene(plan: Plan, physics: Physics) -> Scene:
-    return scene_of(Path(plan.request.scene), plan.request.settings, physical_overrides(plan, physics))
+    return plan.request.with_changes(physical_overrides(plan, physics))
 
 
 def _exact_words(name: str) -> str:
@@ -119,8 +119,8 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
     axis = plan.axis("mesh")
     for value in axis.values if axis is not None else [None]:
         further = overrides(plan.base, [axis], [value]) if axis is not None and value is not None else []
-        scene = scene_of(Path(plan.request.scene), plan.request.settings, further)
-        mesh = build_mesh(scene.mesh, file=scene.source)
+        scene = plan.request.with_changes(further)
+        mesh = mesh_of(scene)
         built = Surface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
         if not built.same_as(stored):
             raise InputError(

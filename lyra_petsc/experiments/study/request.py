@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments import records
+from lyra_petsc.experiments.study.combination import scene_of
 from lyra_petsc.output.agreement import reason
+from lyra_petsc.scene.schema import Scene
 
 REQUEST_FILE = "request.json"
 
@@ -32,6 +35,8 @@ class Request:
         How often each combination is timed.
     ranks : int or None
         ``--ranks``: one mpirun per case; None: the communicator the study was started with.
+    trust_mesh : bool
+        ``--trust-mesh``.
     """
 
     scene: str
@@ -41,6 +46,17 @@ class Request:
     quantities: str = ""
     repeats: int = 3
     ranks: int | None = None
+    trust_mesh: bool = False
+
+    def with_changes(self, overrides: Sequence[str]) -> Scene:
+        """The scene with its settings and further overrides.
+
+        Raises
+        ------
+        InputError
+            If they do not go together.
+        """
+        return scene_of(Path(self.scene), self.settings, overrides, trust_mesh=self.trust_mesh)
 
 
 def read_request(folder: Path) -> Request:

@@ -14,7 +14,6 @@ from lyra_petsc.experiments.bench import problem_of, simulated
 from lyra_petsc.experiments.study.case import Job, Result, Timing
 from lyra_petsc.experiments.study.combination import scene_of
 from lyra_petsc.experiments.study.folder import empty_case
-from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import checkpoint_files
 from lyra_petsc.parallel import on_root
@@ -53,7 +52,7 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     on_root(comm, lambda: empty_case(folder))
     result = Result(job.fingerprint, ranks=comm.size)
     try:
-        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides))
+        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides, trust_mesh=job.trust_mesh))
         assert scene is not None
         result.integrator = str(scene.time.scheme)
         if warm:
@@ -84,7 +83,7 @@ def _repeat(
         set_up = time.perf_counter() - began
         recorder = None
         if repeat == 0:
-            result.describe(simulation.problem.outline, _sheets(comm, scene))
+            result.describe(simulation.problem.outline)
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)
@@ -118,14 +117,6 @@ def _repeat(
         # phases are entered together, so that all ranks have the same
         by_phase = {name: slowest(seconds) for name, seconds in phases.seconds().items()}
         result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
-
-
-def _sheets(comm: MPI.Comm, scene: Scene) -> list[int]:
-    """Vertices of each mesh source, where there are several."""
-    if len(scene.mesh) == 1:
-        return []
-    work = lambda: [build_mesh([source], file=scene.source).n_vertices for source in scene.mesh]  # noqa: E731
-    return on_root(comm, work) or []
 
 
 def _forget_checkpoints(folder: Path) -> None:

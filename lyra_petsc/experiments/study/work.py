@@ -158,7 +158,9 @@ class Work:
 
         def look() -> tuple[Job, Result | None, bool]:
             digest = self._fingerprint(level.overrides, repeats)
-            job = Job(self.plan.request.scene, tuple(level.overrides), str(folder), repeats, digest)
+            request = self.plan.request
+            overrides = tuple(level.overrides)
+            job = Job(request.scene, overrides, str(folder), repeats, digest, request.trust_mesh)
             found = read_result(folder, digest)
             return job, found, found is None and (folder / RESULT_FILE).exists()
 
