@@ -267,6 +267,20 @@ class Stepper:
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
 
+    def settle_edges(self, floor: float) -> bool:
+        """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
+        equations, n = self._equations, self._shape[0]
+        before = np.inf
+        while floor < (moments := equations.begin_at_rest()) < before:
+            before = moments if not self._iterates else 0.0
+            equations.begin_edges(equations.x[:n].copy())
+            rates, _ = self._solve(equations.t0)
+            equations.end_edges(rates)
+            self.start(equations.t0, 0)
+            if rates is None:
+                return False
+        return True
+
     def _solve(self, t0: float) -> tuple[Array | None, str]:
         """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective."""
         equations, stage = self._equations, self._equations.stage
