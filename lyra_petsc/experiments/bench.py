@@ -93,10 +93,10 @@ class Trial:
         return self
 
     def gather(self, owned: Array) -> Array:
-        """Rows of the owned vertices (n_owned, …) in mesh order (V, …), on every rank; collective."""
+        """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
         points = self.simulation.problem.points
-        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_owned])))
-        out = np.empty((points.n_global, *owned.shape[1:]))
+        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_vertices])))
+        out = np.empty((points.n_vertices_global, *owned.shape[1:]))
         for original, rows in pieces:
             out[original] = rows
         return out
@@ -121,7 +121,7 @@ class Trial:
         problem = self.simulation.problem
         for target, values in ((problem.system.x, x), (problem.system.v, v)):
             if values is not None:
-                target[: problem.points.n_owned] = values[problem.points.original]
+                target[: problem.points.n_vertices] = values[problem.points.original]
                 problem.points.update_ghosts(target)
 
     def total(self, owned: Array) -> float:
@@ -201,10 +201,6 @@ class Bench:
         """
 
         def write() -> str:
-            if self._folder is None:
-                self._folder = TemporaryDirectory(prefix="lyra-cases-")
-            self._files += 1
-            path = Path(self._folder.name) / f"{self._files}.obj"
             lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
             corners = (triangles + 1).tolist()
             if rest is None:
@@ -212,10 +208,22 @@ class Bench:
             else:
                 lines += [f"vt {u!r} {v!r}" for u, v in rest.tolist()]
                 lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in corners]
-            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-            return str(path)
+            return self._written(".obj", "\n".join(lines) + "\n")
 
         return {"file": on_root(self.comm, write)}
+
+    def script(self, text: str) -> dict[str, Any]:
+        """The mesh block of a scene whose mesh gmsh makes from a script; collective."""
+        return {"file": on_root(self.comm, lambda: self._written(".geo", text))}
+
+    def _written(self, suffix: str, text: str) -> str:
+        """Path of a new file with this text, on rank 0."""
+        if self._folder is None:
+            self._folder = TemporaryDirectory(prefix="lyra-cases-")
+        self._files += 1
+        path = Path(self._folder.name) / f"{self._files}{suffix}"
+        path.write_text(text, encoding="utf-8")
+        return str(path)
 
     @contextmanager
     def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:

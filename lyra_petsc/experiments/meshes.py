@@ -34,6 +34,17 @@ def irregular_rectangle(n: int, width: float, height: float, seed: int = 1) -> t
     return vertices, _halved(n, column, row, random.integers(0, 2, n * n) == 1)
 
 
+def square_script(size: float) -> str:
+    """For gmsh: the unit square in the xy plane with edges of about ``size`` [m] and one in the middle."""
+    corners = ((0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0.5))
+    points = [f"Point({k}) = {{{x}, {y}, 0, {size:.9g}}};" for k, (x, y) in enumerate(corners, 1)]
+    lines = [f"Line({k}) = {{{k}, {k % 4 + 1}}};" for k in range(1, 5)]
+    face = ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};", "Point{5} In Surface{1};"]
+    return "\n".join(
+        ['SetFactory("Built-in");', *points, *lines, *face, 'Physical Surface("sheet") = {1};', ""]
+    )
+
+
 def _halved(nx: int, column: Ints, row: Ints, flipped: NDArray[np.bool_]) -> Ints:
     """Two triangles of every cell, cut from its low left to its high right corner or the other way."""
     a = row * (nx + 1) + column

@@ -27,6 +27,7 @@ CASES: Registry[VerificationCase] = Registry(
         "wide-strip": "hinges",
         "hinge-sheet": "hinges",
         "hinge-plate": "hinges",
+        "plate": "plates",
         "tip-load": "cantilevers",
         "roll-up": "cantilevers",
         "heavy-cantilever": "cantilevers",
