@@ -13,6 +13,8 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.midedge import MidEdge, mean_directors
+from lyra_petsc.terms.midedge_shape import carried, unit
 from lyra_petsc.terms.term import Elastic, Step, Viscous
 from lyra_petsc.terms.wind import Wind
 
@@ -93,6 +95,16 @@ def summed(stencil: Ints, blocks: Array, n: int) -> Array:
     return out
 
 
+def directors_along_normals(term: MidEdge, x: Array) -> Array:
+    """Unknowns (n,) of edges that let directors be the means of the normals of their triangles."""
+    edges = term.of_edges
+    tangent = unit(x[edges.ends[:, 1]] - x[edges.ends[:, 0]])
+    across = carried(term.frames, tangent)
+    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length))
+    sine = np.sum(np.cross(tangent, across) * mean, axis=1)
+    return np.asarray(edges.length * np.arctan2(sine, np.sum(across * mean, axis=1)))
+
+
 # -- formulas ------------------------------------------------------------------------------------------
 
 
@@ -166,3 +178,16 @@ def blocks_of(
     out = np.full((term.n_elements, k, k, 3, 3), np.nan)
     term.hessians(at, frozen, 0, term.n_elements, blend, out)
     return out
+
+
+def plain_hessian(term: Elastic, at: Array, frozen: Any, blend: float) -> Array:
+    """The Hessian of an elastic term (n, 3, n, 3), element by element from ``blocks_of``."""
+    if term.edges is None:
+        return summed(term.stencil, blocks_of(term, at, frozen, blend), len(at))
+    points, unknowns = 3 * term.stencil[:, :, None] + np.arange(3), term.edges
+    index = np.concatenate([points.reshape(len(points), -1), unknowns], axis=1)
+    out, blocks = np.zeros((at.size, at.size)), np.empty((len(index), index.shape[1], index.shape[1]))
+    term.hessians(at, frozen, 0, term.n_elements, blend, blocks)
+    for rows, block in zip(index, blocks, strict=True):
+        out[np.ix_(rows, rows)] += block
+    return out.reshape(*at.shape, *at.shape)

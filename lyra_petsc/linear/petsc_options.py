@@ -21,6 +21,9 @@ Value = str | int | float | bool | None
 READ_AT_THE_END = frozenset({"options_left", "options_view", "citations", "mpidump", "get_total_flops"})
 """What PETSc asks for only while it leaves."""
 
+FOREIGN = ("python_type", "monitor_python")
+"""How the names of options end that have PETSc call Python."""
+
 CHOICES = ("ksp_type", "pc_type", "mat_type", "snes_linesearch_type")
 """What most errors are about that quote no option's value."""
 
@@ -65,7 +68,7 @@ def refused(error: Exception) -> InputError:
 
 def quoted(error: Exception) -> list[str]:
     """The options that an error of PETSc names, or whose value it quotes."""
-    told = re.split(r"[\s;:,]+", last_words(error))
+    told = re.split(r"[\s;:,']+", last_words(error))
     options = {f"-{name}": (value or "").strip() for name, value in PETSc.Options().getAll().items()}
     named = [name for name in options if name in told]
     named = named or [name for name, value in options.items() if value and value in told]
@@ -83,7 +86,7 @@ def _number(text: str) -> float | None:
 def culprits(error: Exception) -> str:
     """The options that an error is about: those whose value it quotes, as it does not tell their names."""
     options = PETSc.Options().getAll()
-    names = quoted(error) or [f"-{name}" for name in options if name.endswith("python_type")]
+    names = quoted(error) or [f"-{name}" for name in options if name.endswith(FOREIGN)]
     names = names or [f"-{name} {value}" for name, value in options.items() if name in CHOICES]
     return " or ".join(sorted(names)) or "PETSc options"
 

@@ -56,7 +56,9 @@ def check_options() -> None:
             raise InputError(f"must be a finite number, not {value}", key=f"-{name}")
         if name.endswith("_type") and not value:
             raise InputError("needs a type after it", key=f"-{name}")
-        if name.endswith(("python_type", "monitor_python")):
+        if name.endswith("monitor_python") and not value:
+            raise InputError("needs a file after it, as monitor.py:function", key=f"-{name}")
+        if name.endswith("python_type"):
             _check_class(name, value or "")
         elif name.endswith("_type") and value == "python":
             stem = name.removesuffix("type")
@@ -67,6 +69,11 @@ def check_options() -> None:
     if is_set("ts_init_time"):
         raise InputError(
             "a run begins at 0, or with --resume where it stopped; leave it out", key="-ts_init_time"
+        )
+    if is_set("snes_convergence_test"):
+        raise InputError(
+            "is by solver.force_tolerance and solver.step_tolerance; leave it out",
+            key="-snes_convergence_test",
         )
     for name in WITHOUT_GRID:
         if _is_on(name):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,14 @@ from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending import Bending
+    from lyra_petsc.terms.midedge import MidEdge
+    from lyra_petsc.terms.midedge_shape import Frames
+
+    OnHinges = Callable[[Bending, "Array"], "Array"]
+    OnTriangles = Callable[[MidEdge, "Array", Frames], "Array"]
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int32]
 
 
 def _velocity(problem: Problem) -> Array:
@@ -45,35 +51,58 @@ def _membrane_energy(problem: Problem) -> Array:
     return density
 
 
-def _to_vertices(problem: Problem, bending: Bending, on_hinges: Array) -> Array:
-    """Halves of what hinges carry, summed on their edges' ends and divided by the vertices' rest area."""
+def _per_area(problem: Problem, rows: Ints, shares: Array) -> Array:
+    """What shares (n,) of local rows (n,) make on the owned vertices, over the vertices' rest area."""
     n_local, n_owned = problem.points.n_local, problem.points.n_vertices
-    ends = bending.stencil[:, :2].ravel()
-    carried = np.bincount(ends, np.repeat(0.5 * on_hinges, 2), n_local)
     membrane = problem.membrane
     thirds = np.repeat(membrane.elements.data["area"] / 3.0, 3)
     area = np.bincount(membrane.stencil.ravel(), thirds, n_local)
-    density: Array = carried[:n_owned] / area[:n_owned]
+    density: Array = np.bincount(rows, shares, n_local)[:n_owned] / area[:n_owned]
     return density
 
 
+def _on_vertices(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangles) -> Array:
+    """Per rest area: halves of what hinges carry on their edges' ends, thirds of what triangles do."""
+    x, out = problem.system.x, np.zeros(problem.points.n_vertices)
+    if "bending" in problem.terms:
+        hinges = cast("Bending", problem.terms["bending"])
+        halves = np.repeat(0.5 * of_hinges(hinges, x), 2)
+        out += _per_area(problem, hinges.stencil[:, :2].ravel(), halves)
+    if "midedge" in problem.terms:
+        midedge = cast("MidEdge", problem.terms["midedge"])
+        thirds = np.repeat(of_triangles(midedge, x, problem.system.frozen[midedge]) / 3.0, 3)
+        out += _per_area(problem, midedge.stencil.ravel(), thirds)
+    return out
+
+
 def _bending_energy(problem: Problem) -> Array:
-    bending = _bending(problem)
-    return _to_vertices(problem, bending, bending.all_energies(problem.system.x, bending.n_elements))
+    return _on_vertices(
+        problem,
+        lambda hinges, x: hinges.all_energies(x, hinges.n_elements),
+        lambda midedge, x, frames: midedge.all_energies(x, frames, midedge.n_elements),
+    )
 
 
 def _curvature(problem: Problem) -> Array:
-    bending, x = _bending(problem), problem.system.x
-    # the angle of a collapsed triangle is undefined
-    angles = bending.weights(x) * bending.angles(x)
-    return _to_vertices(problem, bending, -bending.elements.data["length"] * angles)
+    return _on_vertices(
+        problem,
+        # the angle of a collapsed triangle is undefined
+        lambda hinges, x: -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x),
+        lambda midedge, x, frames: (
+            midedge.elements.data["area"] * np.nan_to_num(midedge.curvatures(x, frames)[:, :2].sum(axis=1))
+        ),
+    )
 
 
-def _bending(problem: Problem) -> Bending:
-    """The term of the hinges, which `check_field` has seen."""
-    from lyra_petsc.terms.bending import Bending
-
-    return next(term for term in problem.terms.values() if isinstance(term, Bending))
+def _curvature_tensor(problem: Problem) -> Array:
+    midedge = cast("MidEdge", problem.terms["midedge"])
+    found = midedge.curvatures(problem.system.x, problem.system.frozen[midedge])[: midedge.n_owned]
+    out = np.zeros((problem.membrane.n_owned, 3))  # of triangles that do not bend
+    numbers = problem.membrane.elements.index[: len(out)]
+    order = np.argsort(numbers)
+    own = midedge.elements.data["triangle"][: midedge.n_owned]
+    out[order[np.searchsorted(numbers, own, sorter=order)]] = found
+    return six_components(out)
 
 
 def _rank(problem: Problem) -> Array:
@@ -88,7 +117,10 @@ class Field:
     on: Literal["vertex", "triangle"]
     meaning: str
     compute: Callable[[Problem], Array]
-    term: str = "membrane"
+    terms: tuple[str, ...] = ("membrane",)
+
+
+_BENDING = ("bending", "midedge")
 
 
 FIELDS = {
@@ -102,11 +134,18 @@ FIELDS = {
         Field(
             "bending_energy",
             "vertex",
-            "J per m² of rest area, hinges averaged, (V,)",
+            "J per m² of rest area, averaged, (V,)",
             _bending_energy,
-            "bending",
+            _BENDING,
         ),
-        Field("curvature", "vertex", "κ1 + κ2, 1/m, hinge angles averaged, (V,)", _curvature, "bending"),
+        Field("curvature", "vertex", "κ1 + κ2, 1/m, averaged, (V,)", _curvature, _BENDING),
+        Field(
+            "curvature_tensor",
+            "triangle",
+            "in material axes, 1/m, of bending_model: midedge, (F, 6): see `tensors`",
+            _curvature_tensor,
+            ("midedge",),
+        ),
         Field("rank", "vertex", "owning rank, (V,)", _rank),
     )
 }
@@ -139,9 +178,10 @@ def check_field(field: Field, problem: Problem) -> None:
             file=problem.scene.source,
             key="output.fields",
         )
-    if field.term not in problem.terms:
+    if not any(term in problem.terms for term in field.terms):
+        needed = " or ".join(f"'{term}'" for term in field.terms)
         raise InputError(
-            f"'{field.name}' needs the term '{field.term}', which this scene does not have (bending: 0?)",
+            f"'{field.name}' needs the term {needed}, which this scene does not have (bending: 0?)",
             file=problem.scene.source,
             key="output.fields",
         )

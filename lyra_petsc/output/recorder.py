@@ -156,7 +156,7 @@ class Recorder:
         for number, start in enumerate(memory["late_starts"]):
             system.reference.resume(float(start), arrays[f"start_{number}"])
         system.state.set(arrays["position"], arrays["velocity"])
-        simulation.resume(memory, arrays)
+        simulation.resume(memory, arrays, checkpoint.edges)
         int(memory["last_state"])
 
     def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
@@ -339,6 +339,7 @@ class Recorder:
             rows[f"start_{number}"] = system.reference.late[start]
         arrays = {name: layout.split(values)[0] for name, values in rows.items()} | simulation.term_states()
         edges = {name: layout.split(values)[1] for name, values in rows.items()} if self._edges else {}
+        edges |= simulation.edge_states()
         scalars = simulation.memory() | {
             "last_state": last_state,
             "scheme": simulation.scene.time.scheme,

@@ -1,4 +1,4 @@
-"""Symmetric tensors of the membrane in files: six components, in the order of XDMF or in that of VTK.
+"""Symmetric tensors of triangles in files: six components, in the order of XDMF or in that of VTK.
 
 They are plane tensors in material axes: u along the warp, v across it in the sheet, w normal to it. Files of
 states and arrays in Python have XDMF's order uu, uv, uw, vv, vw, ww (its ``Tensor6``), VTK
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-TENSORS = frozenset({"green_strain", "stress"})
+TENSORS = frozenset({"green_strain", "stress", "curvature_tensor"})
 """Fields that are symmetric tensors."""
 
 COMPONENTS = {6: ("uu", "uv", "uw", "vv", "vw", "ww"), 3: ("uu", "vv", "uv")}

@@ -21,6 +21,10 @@ __all__ = ["dump_scene", "load_scene"]
 # A JSON file with one of these is a scene of ours, not one of the original program.
 _OUR_KEYS = {"mesh", "material", "time"}
 
+STORED, BESIDE_STORED = "scene.yaml", "mesh.h5"
+"""Of a run's folder: the scene, whose materials have no bending_model if there were hinges only, and what
+shows that it is one."""
+
 
 def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed: bool = True) -> Scene:
     """Read and check a scene: YAML, or the original program's conf.json.
@@ -50,6 +54,9 @@ def load_scene(path: Path | str, overrides: Sequence[str] = (), *, meshes_needed
         raise InputError(f"must be a block of keys (mesh, material, time, …), not {shown(data)}", file=path)
     try:
         data = plain(data)
+        if path.name == STORED and (path.parent / BESIDE_STORED).exists():
+            for block in _without_model(data):
+                block["bending_model"] = "hinge"
         overridden = apply_overrides(data, overrides)
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=path) from None
@@ -72,6 +79,32 @@ def scene_of(data: Mapping[str, Any], changes: Mapping[str, Any] | None = None) 
         On anything that cannot be used, naming the key.
     """
     return _changed(data, changes or {}, None, Path.cwd())
+
+
+def _without_model(data: Any) -> list[dict[str, Any]]:
+    """The material blocks of a scene as plain values that name no bending model."""
+    return [block for block in _materials(data) if block.get("bending_model") is None]
+
+
+def _materials(data: Any) -> list[dict[str, Any]]:
+    blocks = data.get("material") if isinstance(data, dict) else None
+    return [block for block in (blocks if isinstance(blocks, list) else [blocks]) if isinstance(block, dict)]
+
+
+def bent_as_stored(scene: Scene, stored: Path) -> Scene:
+    """A scene that a run goes on with: where neither it nor the ``stored`` one names a bending model, hinges.
+
+    As it is where the stored one cannot be read.
+    """
+    try:
+        before = parse_yaml(read_text(stored), file=stored)
+    except InputError:
+        return scene
+    if not _without_model(before) or scene._given is None:
+        return scene
+    blocks = _materials(scene._given)
+    chosen = [number for number, block in enumerate(blocks) if block.get("bending_model") is None]
+    return change_scene(scene, {f"material[{number}].bending_model": "hinge" for number in chosen})
 
 
 def change_scene(scene: Scene, changes: Mapping[str, Any]) -> Scene:

@@ -47,7 +47,9 @@ def input_error(
     findings = error.errors(include_url=False)
     first = findings[0]
     context: dict[str, Any] = first.get("ctx", {})
-    path = [part for part in first["loc"] if part != "[key]"] + list(context.get("at", ()))
+    # parts in brackets are pydantic's: of a name of a mapping, of the kind of a value
+    parts = [part for part in first["loc"] if not str(part).startswith("[")]
+    path = parts + list(context.get("at", ()))
     key = one_line(dotted(path, data))
     message = one_line(_words(first["type"], first["msg"], first.get("input"), context))
     if any(key == given or key.startswith((f"{given}.", f"{given}[")) for given in overridden):

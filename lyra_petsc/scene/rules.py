@@ -56,7 +56,9 @@ def _obeys(value: Any, word: str, said: Any, condition: Condition) -> bool:
     match word:
         case "type":
             kinds = said if isinstance(said, list) else [said]
-            return any(k == "object" or isinstance(value, _TYPES[k]) for k in kinds)
+            return any(
+                hasattr(value, "get") if k == "object" else isinstance(value, _TYPES[k]) for k in kinds
+            )
         case "const":
             return bool(value == said)
         case "enum":

@@ -14,12 +14,21 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    PrivateAttr,
+    Tag,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from typing_extensions import Self
 
 from lyra_petsc.errors import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.materials.library import names
+from lyra_petsc.scene.materials.library import is_isotropic, names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, some, when
 from lyra_petsc.scene.values import (
@@ -196,6 +205,52 @@ class MembraneStiffness(Block):
         return self
 
 
+class PlateStiffness(Block):
+    """Orthotropic bending stiffness [N·m]: moments per width of curvatures; axis 1 is the warp.
+
+    Attributes
+    ----------
+    d11, d22 : float [N·m]
+        Along warp and weft.
+    d12 : float [N·m]
+        Coupling of the two; d12² < d11 d22.
+    d33 : float [N·m]
+        Of twist, on 2 κ12; D (1 − ν)/2 of an isotropic plate.
+    """
+
+    d11: Positive
+    d22: Positive
+    d12: Number = 0.0
+    d33: Positive
+
+    @model_validator(mode="after")
+    def _positive_definite(self) -> Self:
+        if abs(self.d12) >= (self.d11**0.5) * (self.d22**0.5):
+            raise problem(
+                f"is not positive definite: |d12| = {abs(self.d12):g} must be below"
+                f" sqrt(d11 d22) = {(self.d11**0.5) * (self.d22**0.5):g} N·m",
+                "d12",
+            )
+        return self
+
+
+def _one_word_of(words: Any) -> BeforeValidator:
+    known = get_args(words)
+
+    def check(value: Any) -> Any:
+        if value is not None and value not in known:
+            raise problem(f"must be one of {', '.join(known)}, not {shown(value)}")
+        return value
+
+    return BeforeValidator(check)
+
+
+BendingModel = Literal["hinge", "midedge"]
+_AnyBending = Annotated[
+    Annotated[Bending, Tag("[number]")] | Annotated[PlateStiffness, Tag("[plate]")],
+    Discriminator(lambda value: "[plate]" if isinstance(value, (dict, PlateStiffness)) else "[number]"),
+]
+
 # the ways to give a material's numbers: the keys of each, and those it needs
 _MATERIAL_WAYS = (
     (("cloth",), ()),
@@ -234,8 +289,13 @@ class Material(Block):
         Areal density.
     membrane : MembraneStiffness or None
         Stretching stiffness.
-    bending : float or (3,) [N·m] or None
-        Cylindrical stiffness B; three values hold for hinge edges at 0°, 45°, 90° to the warp.
+    bending : float or (3,) [N·m], PlateStiffness or None
+        Cylindrical stiffness B; three values hold at 0°, 45°, 90° to the warp (of a hinge's edge). Or four
+        numbers of an orthotropic plate.
+    bending_model : str or None
+        ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
+        ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
+        poisson and thickness, also of the library, and for an orthotropic plate, else ``hinge``.
     young : float [Pa] or None
         Young's modulus of an isotropic shell.
     poisson : float or None
@@ -258,13 +318,20 @@ class Material(Block):
         Rule({"oneOf": [some(*way) for way, _ in _MATERIAL_WAYS]}, _several_ways),
         Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
         *(_needed(way, key) for way, needed in _MATERIAL_WAYS for key in needed),
+        Rule(
+            when(given(bending={"type": "object"}), given(bending_model={"const": "midedge"})),
+            "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three",
+            "bending",
+        ),
     )
+    sometimes_filled = frozenset({"bending_model"})
 
     group: Name | None = None
     cloth: Annotated[Name, JsonSchema({"enum": names()})] | None = None
     density: Positive | None = None
     membrane: MembraneStiffness | None = None
-    bending: Bending | None = None
+    bending: _AnyBending | None = None
+    bending_model: Annotated[BendingModel | None, _one_word_of(BendingModel)] = None
     young: Positive | None = None
     poisson: Poisson | None = None
     thickness: Positive | None = None
@@ -279,7 +346,11 @@ class Material(Block):
     @classmethod
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Numbers without ``bending`` mean a membrane: the zero is written out."""
-        return {**data, "bending": 0.0} if "membrane" in data and "bending" not in data else data
+        if "membrane" in data:
+            data = {"bending": 0.0, **data}
+        isotropic = "young" in data or is_isotropic(data.get("cloth"))
+        plate = isinstance(data.get("bending"), (dict, PlateStiffness))
+        return {"bending_model": "midedge" if isotropic or plate else "hinge", **data}
 
     @field_validator("cloth")
     @classmethod
@@ -554,6 +625,7 @@ FIELD_UNITS = {
     "membrane_energy": "J/m²",
     "bending_energy": "J/m²",
     "curvature": "1/m",
+    "curvature_tensor": "1/m",
     "rank": "1",
 }
 FIELDS = tuple(FIELD_UNITS)
@@ -564,17 +636,6 @@ _FIELDS = {"type": "array", "items": {"enum": list(FIELDS)}}
 
 _STATIC = given(analysis={"const": "static"})
 _MEANINGLESS = "has no meaning in a static analysis; leave it out"
-
-
-def _one_word_of(words: Any) -> BeforeValidator:
-    known = get_args(words)
-
-    def check(value: Any) -> Any:
-        if value is not None and value not in known:
-            raise problem(f"must be one of {', '.join(known)}, not {shown(value)}")
-        return value
-
-    return BeforeValidator(check)
 
 
 class Time(Block):

@@ -78,10 +78,23 @@ class Convergence:
         self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
-        self._balanced = False
+        self._balanced = self._ended = False
+
+    @property
+    def judged(self) -> bool:
+        """Whether the solve ended by this test, or where it is good enough.
+
+        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual.
+        """
+        return self._ended or self.norm <= max(self._floor, self._force_tolerance())
 
     def test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
         """SNES's reason to stop after so many linear iterations ``spent``, or None."""
+        reason = self._test(snes, iteration, residual, spent)
+        self._ended = reason is not None
+        return reason
+
+    def _test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
         before, self.norm = self.norm, residual
         self.fell = residual < FELL * before
         if not np.isfinite(residual):
@@ -106,7 +119,7 @@ class Convergence:
         if residual > atol and iteration == 0:
             self._first_norm = residual
             return None
-        balanced = residual <= self._tolerances.force_tolerance * self._equations.largest_force()
+        balanced = residual <= self._force_tolerance()
         if residual <= atol:
             self.stopped_by = "" if balanced else "-snes_atol"
             return int(Reason.CONVERGED_FNORM_ABS if balanced else Reason.DIVERGED_INNER)
@@ -121,6 +134,10 @@ class Convergence:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
+
+    def _force_tolerance(self) -> float:
+        """Residual norm [N] that the scene asks for."""
+        return float(self._tolerances.force_tolerance * self._equations.largest_force())
 
     def _moved_by(self, increment: float) -> None:
         """Expect increments to go on falling as they fell last, where the residual shows that they may.

@@ -24,6 +24,8 @@ class Prescribed:
         Prescribed unknowns.
     free : (n_owned, 3) bool
         The others.
+    counted : (n_owned, 3) bool
+        Those whose forces a residual is measured by: the same, also while vertices are held.
     at : (m,) int
         Which of all owned unknowns, row by row, are prescribed.
     goal : (m,)
@@ -40,6 +42,7 @@ class Prescribed:
         own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
         own.ravel()[discretisation.layout.padding] = True
         self._set(own)
+        self.counted = self.free
         self.goal = self.velocity = np.zeros(len(self.at))
 
     def _set(self, own: Mask) -> None:
@@ -75,10 +78,11 @@ class Prescribed:
             self._beside = rows, *found
         return self._beside[1:]
 
-    def begin_step(self, t0: float, t1: float) -> bool:
-        """Take the handles of the step t0..t1 [s]; whether they changed; collective."""
+    def begin_step(self, t0: float, t1: float, x: Array) -> bool:
+        """Take the handles of the step t0..t1 [s] from x (n_owned, 3); whether they changed; collective."""
         if not self.held:
             return False
+        self._x = x
         layout = self._discretisation.layout
         self._span = t0, t1
         active = self.held.active(t0, t1)
@@ -89,16 +93,16 @@ class Prescribed:
             own = self.held.mask(t0, t1, layout.n_owned)
             own.ravel()[layout.padding] = True
             self._set(own)
+            self.counted = self.free
         self.goal = self._positions(t1)
         return changed
 
     def hold_vertices(self, x: Array) -> None:
-        """Prescribe positions x (n_owned, 3) [m] of all vertices, until `release_vertices`; collective."""
+        """Prescribe all vertices where x (n_owned, 3) has them, too, until `release_vertices`; collective."""
         layout = self._discretisation.layout
         self._kept = ~self.free, self.goal, self.velocity
-        own = np.zeros((layout.n_owned, 3), dtype=bool)
+        own = ~self.free
         own[: layout.n_vertices] = True
-        own.ravel()[layout.padding] = True
         self._set(own)
         self.goal = x.take(self.at)
 
@@ -132,11 +136,11 @@ class Prescribed:
             self.put(velocity, self._rates(start + 1e-3 * (end - start)))
 
     def targets(self, t0: float, t1: float, at: float, out: Array) -> None:
-        """Write the positions [m] that handles prescribe at time ``at`` into ``out`` (n_owned, 3)."""
+        """Write what handles prescribe at time ``at`` [s] over present positions in ``out`` (n_owned, 3)."""
         self.held.targets(t0, t1, at, self._reference.at, out)
 
     def _positions(self, at: float) -> Array:
-        out = np.zeros((self._discretisation.layout.n_owned, 3))
+        out = self._x[: self._discretisation.layout.n_owned].copy()
         self.targets(*self._span, at, out)
         return out.take(self.at)
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -35,6 +37,9 @@ from lyra_petsc.terms.prescribed_handles import Held, disagreements, is_exact, s
 from lyra_petsc.terms.registry import Role, active, registered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Term
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.clamped_edges import ClampedEdges
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -188,6 +193,11 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     held = select_held(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
+    if "midedge" in names and any(handle.clamp for handle in scene.handles):
+        from lyra_petsc.terms import clamped_edges  # of use for nothing else
+
+        clamps = clamped_edges.elements(rest)
+        elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
     for name, selector in scene.probes.items():
         vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
         elements[f"probe {name}"] = Elements(vertices[:, None])
@@ -227,6 +237,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     held = Held(
         scene,
         {n: _own(part, f"held {n}") for n, handle in enumerate(scene.handles) if is_exact(handle)},
+        _clamped_edges(scene, part, terms),
     )
     mass = np.zeros(layout.n_owned)
     mass[: layout.n_vertices] = part.vertex_data["mass"]
@@ -248,6 +259,8 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
+    for term in system.elastic:
+        term.begin(system.x)
     system.rest_at(0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Problem(
@@ -262,6 +275,24 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         part.partitioner,
         data.get("tag"),
         system.x[rows].copy() if "displacement" in scene.output.fields else None,
+    )
+
+
+def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:
+    """The edges that handles clamp, where they have unknowns."""
+    numbers = [n for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements]
+    if not numbers:
+        return None
+    from lyra_petsc.terms.clamped_edges import ClampedEdges
+    from lyra_petsc.terms.midedge import MidEdge
+
+    term, layout = terms["midedge"], part.layout
+    assert isinstance(term, MidEdge)
+    return ClampedEdges(
+        term,
+        {n: part.elements[f"clamp {n}"] for n in numbers},
+        {n: (motion_of(scene, n), Window.of(scene.handles[n])) for n in numbers},
+        layout.edge_places,
     )
 
 

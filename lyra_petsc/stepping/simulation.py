@@ -6,6 +6,7 @@ import math
 import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.stepping.ts_options import with_ts_options
+from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
 
@@ -157,6 +159,8 @@ class SteppedScene:
         self.failure: Failure | None = None
         self._tried: list[Tried] = []
         self.stepper.start(0.0, 0)
+        if self.problem.points.n_edges_global and not self.stepper.settle_edges(floor):
+            self.notes.append("the moments on the edges of the start shape do not balance")
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
@@ -166,7 +170,8 @@ class SteppedScene:
     def _control(self, step: float, end: float) -> StepControl:
         """Plan of the steps: fixed, by a tolerance, or of a load factor."""
         time, every = self.scene.time, self.scene.output.every
-        largest = LARGEST_FRACTION * end if time.adaptive else step
+        # the end of the run is found within a fraction of Δt, which must not be the whole of it
+        largest = LARGEST_FRACTION * end if time.adaptive else min(step, end)
         largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
         smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
         smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
@@ -277,7 +282,7 @@ class SteppedScene:
                 f"method at a residual of {attempt.residual:.2g} N, short of solver.force_tolerance"
             )
         for term in system.elastic:
-            if term.registration.state:
+            if term.registration.state or term.registration.edge_state:
                 term.accept(system.x, system.frozen[term])
         system.begin(self.time)
         self.stepper.monitor()
@@ -472,10 +477,38 @@ class SteppedScene:
             for name, values in term.state().items()
         }
 
-    def resume(self, memory: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    def edge_states(self) -> dict[str, Array]:
+        """The same of edges with an unknown, (n_edges,)."""
+        layout, found = self.problem.points, {}
+        for term in self.problem.system.elastic:
+            for name, values in term.edge_state().items():
+                rows = np.zeros(3 * layout.n_local)
+                rows[term.edge_places] = values
+                found[f"{term.name}.{name}"] = rows[layout.edge_places]
+        return found
+
+    def _restore_edges(self, term: Elastic, edges: Mapping[str, Array]) -> None:
+        """Let a term go on with what a checkpoint holds of edges, those of ghosts too; collective."""
+        layout, state = self.problem.points, {}
+        for name in term.registration.edge_state:
+            rows = np.zeros((layout.n_local, 3))
+            rows.ravel()[layout.edge_places] = edges[f"{term.name}.{name}"]
+            layout.update_ghosts(rows)
+            state[name] = rows.ravel()[term.edge_places]
+        term.restore_edges(state, self.problem.system.x)
+
+    def resume(
+        self,
+        memory: Mapping[str, Any],
+        arrays: Mapping[str, Array],
+        edges: Mapping[str, Array] = MappingProxyType({}),
+    ) -> None:
         """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
         system = self.problem.system
         system.state.update_ghosts()
+        for term in system.elastic:
+            if term.registration.edge_state:
+                self._restore_edges(term, edges)
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
         # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)

@@ -159,7 +159,7 @@ class StageEquations:
         self.new_iterate(None)
         self._follow(self.x)
         after = self.integrator.stage_after(self.dt)
-        changed = self.prescribed.begin_step(t0, t1)
+        changed = self.prescribed.begin_step(t0, t1, self.x)
         self._freeze(t0 + after)
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
@@ -288,6 +288,12 @@ class StageEquations:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
 
+    def begin_at_rest(self) -> float:
+        """Let handles hold what they do at the start; norm [N] of the moments on free edges; collective."""
+        self.prescribed.begin_step(self.t0, self.t0, self.x)
+        moments = np.where(self.prescribed.free, self._internal(self.x), 0.0)[self.points.n_vertices :]
+        return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
+
     # -- unknowns of edges at the end of a step ----------------------------------------------------
 
     @property
@@ -299,19 +305,22 @@ class StageEquations:
         """Seek the edges' unknowns at the end of the step just accepted, from x_before (n_owned, 3);
         collective.
 
-        A stage of backward Euler in which the vertices go where they are now.
+        A stage of backward Euler in which the vertices go where they are now. Before the first step it begins
+        there, too, after `begin_at_rest`.
         """
-        n = self.points.n_owned
+        n, dt = self.points.n_owned, self.dt or 1.0
         self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.frozen
         self.new_iterate(None)
         self.objective.forget()
-        self.stage = Stage(1.0 / self.dt, self.dt, self.dt)
+        self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
-        self.frozen = self.frozen | self._frozen_at(self.t1, self.x)
+        step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)
+        targets = (*self._moving, *self._constraints)
+        self.frozen = self.frozen | {term: term.freeze(step) for term in targets}
         self.prescribed.hold_vertices(self.x[:n])
-        self.prescribed.solve(self._xh[:n], self.dt)
+        self.prescribed.solve(self._xh[:n], dt)
 
     def end_edges(self, v: Array | None) -> None:
         """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""
@@ -424,8 +433,8 @@ class StageEquations:
         self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
-        """Norm [N] of the largest part of F last evaluated, over the free unknowns; collective."""
-        parts = (np.where(self.prescribed.free, part, 0.0) for part in self._last_parts.values())
+        """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
+        parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
 
     def new_iterate(self, v: Array | None) -> None:

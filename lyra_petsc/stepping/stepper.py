@@ -15,7 +15,7 @@ from petsc4py import PETSc
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
-from lyra_petsc.linear.petsc_options import Value, culprits, fill_gaps, is_set, refused
+from lyra_petsc.linear.petsc_options import FOREIGN, Value, culprits, fill_gaps, is_set, refused
 from lyra_petsc.parallel import all_here
 from lyra_petsc.phases import FROZEN, RESIDUAL, logged
 from lyra_petsc.scene.schema import Scene
@@ -267,6 +267,20 @@ class Stepper:
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
 
+    def settle_edges(self, floor: float) -> bool:
+        """Let moments on edges balance at the start shape, to ``floor`` [N]; whether they do; collective."""
+        equations, n = self._equations, self._shape[0]
+        before = np.inf
+        while floor < (moments := equations.begin_at_rest()) < before:
+            before = moments if not self._iterates else 0.0
+            equations.begin_edges(equations.x[:n].copy())
+            rates, _ = self._solve(equations.t0)
+            equations.end_edges(rates)
+            self.start(equations.t0, 0)
+            if rates is None:
+                return False
+        return True
+
     def _solve(self, t0: float) -> tuple[Array | None, str]:
         """Velocities (n_owned, 3) [m/s] that solve the present stage, or None and why; collective."""
         equations, stage = self._equations, self._equations.stage
@@ -292,6 +306,8 @@ class Stepper:
                 collective=together,
             ) from None
         self._linear_failed = False
+        if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.judged:
+            self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
             slow = self._newton.convergence.too_slow
             self._linear_failed = slow or reasons.preconditioner_failed(self.ksp)
@@ -342,7 +358,13 @@ class Stepper:
 
     def monitor(self) -> None:
         """Call the TS monitors that the user asked for; collective."""
-        self.ts.monitor(self.ts.getStepNumber(), self.ts.getTime(), self.velocity)
+        try:
+            self.ts.monitor(self.ts.getStepNumber(), self.ts.getTime(), self.velocity)
+        except PETSc.Error as error:
+            asked = [f"-{name}" for name in PETSc.Options().getAll() if name.startswith("ts_monitor")]
+            raise InputError(
+                f"PETSc cannot: {reasons.last_words(error)}", key=" or ".join(sorted(asked))
+            ) from None
 
     # -- callbacks ---------------------------------------------------------------------------------------
 
@@ -381,5 +403,5 @@ def _forget_python(ksp: PETSc.KSP) -> None:
 
 def _runs_foreign_python() -> bool:
     """Whether PETSc calls Python that is not this program's."""
-    types = {name: value for name, value in PETSc.Options().getAll().items() if name.endswith("python_type")}
-    return any(value != presets.PYTHON_TYPE for value in types.values())
+    options = PETSc.Options().getAll()
+    return any(value != presets.PYTHON_TYPE for name, value in options.items() if name.endswith(FOREIGN))

@@ -164,7 +164,7 @@ def edge_in_material(
     edge : (n, 2) float64
         Its material vector [m], warp axis first.
     stiffness : (n,) float64
-        B [N·m] of the triangle's material for that direction.
+        B [N·m] of the triangle's hinges for that direction.
     """
     corners, uv = rest.mesh.triangles[triangle], rest.mesh.triangle_uv[triangle]
     row = np.arange(len(triangle))
@@ -178,6 +178,8 @@ def edge_in_material(
     stiffness = np.zeros(len(triangle))
     for number, shell in enumerate(rest.shells):
         mine = rest.shell_of[triangle] == number
+        if not shell.bends_by("hinge"):
+            continue
         stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)
     return edge, stiffness
 

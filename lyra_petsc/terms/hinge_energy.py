@@ -31,7 +31,7 @@ def fading_limit(area: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @kernel()
-def _fade(square, limit):  # type: ignore[no-untyped-def]
+def fade(square, limit):  # type: ignore[no-untyped-def]
     """w of one triangle, and its first two derivatives with respect to |n|² [1/m⁴, 1/m⁸].
 
     Without a limit (0) a triangle counts in full as long as it has an area.
@@ -50,7 +50,7 @@ def _fade(square, limit):  # type: ignore[no-untyped-def]
 @kernel()
 def hinge_weight(square1, square2, limit1, limit2):  # type: ignore[no-untyped-def]
     """w(a1) w(a2): 1 unless a triangle has lost nearly all its area."""
-    return _fade(square1, limit1)[0] * _fade(square2, limit2)[0]
+    return fade(square1, limit1)[0] * fade(square2, limit2)[0]
 
 
 @kernel(inline="always")
@@ -132,8 +132,8 @@ def _fade_gradient(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, change, g
 ):
     """Turn ∇θ in g (4, 3) into W ∇θ + ½ (θ − θ̄) ∇W, W = w(a1) w(a2); what θ − θ̄ counts as then."""
-    w1, d1, _ = _fade(square1, limit1)
-    w2, d2, _ = _fade(square2, limit2)
+    w1, d1, _ = fade(square1, limit1)
+    w2, d2, _ = fade(square2, limit2)
     if w1 * w2 == 0.0:  # where θ itself may be no number
         g[:] = 0.0
         return 0.0
@@ -147,7 +147,7 @@ def _fade_gradient(  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
+def add_square_hessian(y, n, at, scale, out):  # type: ignore[no-untyped-def]
     """Add scale ∂²|n|²/∂y² of a triangle's corners y, points ``at`` of the hinge, to out (4, 4, 3, 3).
 
     Of corners c and d with opposite edges ε: 2 ((ε_c·ε_d) I − ε_d ε_cᵀ − σ [n]×), σ = 1 if d follows c,
@@ -172,8 +172,8 @@ def _fade_hessian(  # type: ignore[no-untyped-def]
     x0, x1, x2, x3, square1, square2, limit1, limit2, k, change, blend, g, out
 ):
     """Turn the Hessian of f = k (θ − θ̄)² in out (4, 4, 3, 3) into that of f W, W = w(a1) w(a2)."""
-    w1, d1, dd1 = _fade(square1, limit1)
-    w2, d2, dd2 = _fade(square2, limit2)
+    w1, d1, dd1 = fade(square1, limit1)
+    w2, d2, dd2 = fade(square2, limit2)
     if w1 * w2 == 0.0:
         out[:] = 0.0
         return
@@ -183,8 +183,8 @@ def _fade_hessian(  # type: ignore[no-untyped-def]
     n1, n2 = _normals(x0, x1, x2, x3)
     slopes, bent = np.empty((2, 4, 3)), np.zeros((4, 4, 3, 3))
     _slopes(x0, x1, x2, x3, slopes)
-    _add_square_hessian((x0, x1, x2), n1, (0, 1, 2), d1 * w2, bent)
-    _add_square_hessian((x1, x0, x3), n2, (1, 0, 3), w1 * d2, bent)
+    add_square_hessian((x0, x1, x2), n1, (0, 1, 2), d1 * w2, bent)
+    add_square_hessian((x1, x0, x3), n2, (1, 0, 3), w1 * d2, bent)
     for a in range(4):
         for b in range(4):
             for i in range(3):

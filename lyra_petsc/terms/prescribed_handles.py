@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations, pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Handle, Scene
 from lyra_petsc.terms.motion import Motion, Window, motion_of
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.clamped_edges import ClampedEdges
 
 Array = NDArray[np.float64]
 Selection = dict[int, NDArray[np.int64]]
@@ -92,34 +96,47 @@ class Held:
     scene : Scene
     owned : mapping of handle number → (n,) int
         Owned vertices of each exact handle, local numbering.
+    edges : ClampedEdges or None
+        Whose unknowns are prescribed, too.
     """
 
-    def __init__(self, scene: Scene, owned: Selection) -> None:
-        self._vertices = owned
+    def __init__(self, scene: Scene, owned: Selection, edges: ClampedEdges | None = None) -> None:
+        self._vertices, self._edges = owned, edges
         self._axes = {
             number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
         }
         self._places = {number: np.ix_(vertices, self._axes[number]) for number, vertices in owned.items()}
         self._motions: dict[int, Motion] = {number: motion_of(scene, number) for number in owned}
         self._windows = {number: Window.of(scene.handles[number]) for number in owned}
+        self._windows |= edges.windows if edges is not None else {}
 
     def __bool__(self) -> bool:
-        return bool(self._vertices)
+        return bool(self._windows)
 
     def active(self, t0: float, t1: float) -> tuple[int, ...]:
         """Numbers of the handles that hold through the step from t0 to t1 [s]."""
         return tuple(number for number, window in self._windows.items() if window.holds(t0, t1))
 
     def mask(self, t0: float, t1: float, n_owned: int) -> NDArray[np.bool_]:
-        """Prescribed coordinates (n_owned, 3) of the step from t0 to t1 [s]."""
+        """Prescribed unknowns (n_owned, 3) of the step from t0 to t1 [s]."""
         mask = np.zeros((n_owned, 3), dtype=bool)
         for number in self.active(t0, t1):
-            mask[self._places[number]] = True
+            if number in self._places:
+                mask[self._places[number]] = True
+            if self._edges is not None:
+                mask.ravel()[self._edges.places(number)] = True
         return mask
 
     def targets(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
-        """Write the positions [m] prescribed at time ``at`` of the step t0..t1 into ``out`` (n_owned, 3)."""
+        """Write the positions [m] prescribed at time ``at`` of the step t0..t1 over ``out`` (n_owned, 3).
+
+        The latter are the present ones, and say how often directors have turned.
+        """
         for number in self.active(t0, t1):
+            if self._edges is not None:
+                self._edges.targets(number, at, reference, out.ravel())
+            if number not in self._places:
+                continue
             start = self._windows[number].start
             goal = self._motions[number].carried(reference(start, self._vertices[number]), start, at)
             out[self._places[number]] = goal[:, self._axes[number]]
@@ -127,6 +144,10 @@ class Held:
     def velocities(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
         """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
+            if self._edges is not None:
+                self._edges.rates(number, at, reference, out.ravel())
+            if number not in self._places:
+                continue
             start = self._windows[number].start
             rate = self._motions[number].velocity(reference(start, self._vertices[number]), start, at)
             out[self._places[number]] = rate[:, self._axes[number]]
@@ -134,7 +155,8 @@ class Held:
     @property
     def reference_rows(self) -> NDArray[np.int64]:
         """Local rows (n,) whose reference positions are asked for."""
-        return np.concatenate([np.empty(0, dtype=np.int64), *self._vertices.values()])
+        edges = [self._edges.reference_rows] if self._edges is not None else []
+        return np.concatenate([np.empty(0, dtype=np.int64), *self._vertices.values(), *edges])
 
     @property
     def numbers(self) -> list[int]:
@@ -143,4 +165,4 @@ class Held:
 
     def vertices(self, number: int) -> NDArray[np.int64]:
         """Owned vertices of a handle, local numbering."""
-        return self._vertices[number]
+        return self._vertices.get(number, np.empty(0, dtype=np.int64))

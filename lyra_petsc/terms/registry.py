@@ -55,8 +55,8 @@ class Registration:
         Its stencils change as points come near to each other.
     limits_step : bool
         It limits how far a Newton iteration may go.
-    state : tuple of str
-        Names of the vertex arrays that a checkpoint must hold for it.
+    state, edge_state : tuple of str
+        Names of the arrays that a checkpoint must hold for it, of vertices and of edges with an unknown.
     home : str
         Full name of its module, where that is elsewhere.
     """
@@ -72,6 +72,7 @@ class Registration:
     neighbours: bool = False
     limits_step: bool = False
     state: tuple[str, ...] = ()
+    edge_state: tuple[str, ...] = ()
     home: str = ""
 
     def module(self) -> ModuleType:
@@ -79,17 +80,27 @@ class Registration:
         return import_module(self.home or f"lyra_petsc.terms.{self.name}")
 
 
-def _bends(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    return any(max(shell.bending) > 0.0 for shell in shells)
+def _bends_by(model: str) -> Need:
+    return lambda scene, shells: any(shell.bends_by(model) for shell in shells)
 
 
 def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
-    return _bends(scene, shells) and any(handle.clamp for handle in scene.handles)
+    return any(shell.bends_by("hinge") for shell in shells) and any(handle.clamp for handle in scene.handles)
 
 
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
-    Registration("bending", _bends, Role.ELASTIC, "bending_energy", damped=True, bends=True),
+    Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True, bends=True),
+    Registration(
+        "midedge",
+        _bends_by("midedge"),
+        Role.ELASTIC,
+        "bending_energy",
+        damped=True,
+        bends=True,
+        limits_step=True,
+        edge_state=("frame",),
+    ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(
         "spring",

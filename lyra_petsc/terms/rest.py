@@ -63,13 +63,36 @@ class RestShape:
                 file=scene.source,
                 key="material",
             )
+        self._check_models()
         self.inverse, self.area = rest_matrices(mesh, self.per_triangle("warp_degrees"))
+
+    def _check_models(self) -> None:
+        """Refuse neighbours that bend by different models."""
+        if len({shell.model for shell in self.shells if shell.bends_by(shell.model)}) < 2:
+            return
+        models = np.where(self.bends_by("midedge"), 1, 0) - np.where(self.bends_by("hinge"), 1, 0)
+        triangles = self.hinges.triangles
+        mixed = np.flatnonzero(models[triangles[:, 0]] * models[triangles[:, 1]] < 0)
+        if len(mixed):
+            one, two = triangles[mixed[0]]
+            numbers = sorted({int(self.shell_of[one]), int(self.shell_of[two])})
+            raise InputError(
+                f"triangles {one} and {two} are neighbours with different bending models; give one "
+                "bending_model to all materials of a sheet",
+                file=self.scene.source,
+                key=f"material[{numbers[1]}].bending_model",
+            )
 
     def per_triangle(self, attribute: str) -> NDArray[np.float64]:
         """A scalar attribute of ShellMaterial on each triangle, (F,)."""
         values = np.array([getattr(shell, attribute) for shell in self.shells], dtype=np.float64)
         on_triangles: NDArray[np.float64] = values[self.shell_of]
         return on_triangles
+
+    def bends_by(self, model: str) -> NDArray[np.bool_]:
+        """Which triangles resist bending by this model, (F,)."""
+        bends: NDArray[np.bool_] = np.array([shell.bends_by(model) for shell in self.shells])[self.shell_of]
+        return bends
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:

@@ -206,6 +206,9 @@ class Elastic(Term):
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
 
+    def begin(self, x: Array) -> None:
+        """The run begins at positions x (n_local, 3); for terms that have a state."""
+
     # -- state and history -------------------------------------------------------------------------
 
     def accept(self, x: Array, frozen: Any) -> None:
@@ -217,6 +220,18 @@ class Elastic(Term):
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go on with a state."""
+
+    @property
+    def edge_places(self) -> Ints:
+        """Places (n,) of the edges that ``edge_state`` is of, in the flat form of arrays over local rows."""
+        return np.empty(0, dtype=np.int64)
+
+    def edge_state(self) -> dict[str, Array]:
+        """What a checkpoint must hold, by the registration's names: a number for each edge, (n,)."""
+        return {}
+
+    def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
+        """Go on with a state of edges at positions x (n_local, 3)."""
 
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
         """This rank's part of each further column of history.csv that the registration names."""

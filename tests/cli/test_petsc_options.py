@@ -137,6 +137,19 @@ def test_a_loose_relative_tolerance_is_noted(tmp_path: Path) -> None:
     assert "note: step 1 (t = 0.01 s): -snes_rtol stopped Newton's method at a residual of" in left.err
 
 
+def test_a_line_search_that_fails_ends_no_step(tmp_path: Path) -> None:
+    """PETSc takes a short direction for convergence then, here one that Richardson's iteration gave up."""
+    scene = SCENE.replace("nx: 4, ny: 4", "nx: 8, ny: 8").replace("800", "100").replace("160", "0")
+    ran(tmp_path, "-ksp_type", "richardson", scene=scene.replace("2.0e-5, damping: 0.005", "1.0e-4"))
+    assert max(float(row["residual"]) for row in history(tmp_path / "out")) < 1e-5  # [N]; it weighs 1.5 N
+
+
+@pytest.mark.parametrize("step", ["1e30", "1e3"])
+def test_a_step_longer_than_the_run_is_the_whole_run(tmp_path: Path, step: str) -> None:
+    ran(tmp_path, "-ts_dt", step, scene=SCENE.replace("every: 0.02", "every: 0.05"))
+    assert [float(row["time"]) for row in history(tmp_path / "out")] == [0.0, 0.05]
+
+
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_views_show_what_solves(tmp_path: Path, ranks: int) -> None:
     scene = SCENE.replace("nx: 4, ny: 4", "nx: 12, ny: 12").replace("end: 0.05", "end: 0.01")

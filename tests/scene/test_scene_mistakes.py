@@ -22,6 +22,8 @@ def scene_text(part: str) -> str:
     return "\n".join([text for key, text in BASE.items() if key != first] + [part]) + "\n"
 
 
+SHEET = "density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, "
+
 # (block, key in the message, words in the message)
 CASES = [
     # unknown keys, at every depth, with the nearest
@@ -140,6 +142,19 @@ CASES = [
      "material.bending", "three numbers"),
     ("material: {density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, bending: -1}",
      "material.bending", ">= 0"),
+    (
+        "material: {" + SHEET + "bending: {d11: 1, d22: 1, d33: 1}, bending_model: hinge}",
+        "material.bending",
+        "are for bending_model: midedge",
+    ),
+    (
+        "material: {" + SHEET + "bending: {d11: 1, d22: 4, d12: 2, d33: 1}}",
+        "material.bending.d12",
+        "below sqrt(d11 d22) = 2 N·m",
+    ),
+    ("material: {" + SHEET + "bending: {d11: 1, d22: 1}}", "material.bending.d33", "missing"),
+    ("material: {" + SHEET + "bending: {d11: 1, d22: 1, d33: 1, d44: 1}}", "material.bending.d44", "d11"),
+    ("material: {" + SHEET + "bending_model: midege}", "material.bending_model", "one of hinge, midedge"),
     ("material: {young: 1, poisson: 0.6, thickness: 1, density: 1}", "material.poisson", "(-1, 0.5]"),
     ("material: {young: 1, poisson: -1, thickness: 1, density: 1}", "material.poisson", "(-1, 0.5]"),
     ("material: {young: 1, poisson: 0.3, density: 1}", "material.thickness", "missing"),

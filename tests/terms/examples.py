@@ -17,6 +17,7 @@ BENDING = CLOTH | {"bending": [2.0e-3, 1.0e-3, 3.0e-3], "damping": 0.02, "warp_d
 FRAGMENTS: dict[str, dict[str, Any]] = {
     "membrane": {},
     "bending": {},
+    "midedge": {"material": BENDING | {"bending_model": "midedge"}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},
     "gravity": {"gravity": [0.3, -1.0, -9.0]},

@@ -6,7 +6,9 @@ Conventions, in one place:
   whose hinge energy k_e l² (θ − θ̄)² / (8 (A0 + A1)) bends a structured mesh with k_e/4:
   C11, C12, C22 = 2 × table, C33 (engineering shear) = table, B = k_e/4;
 - an isotropic sheet is in plane stress: c11 = c22 = E h/(1 − ν²), c12 = ν c11,
-  c33 = E h/(2 (1 + ν)), B = E h³/(12 (1 − ν²));
+  c33 = E h/(2 (1 + ν)), B = E h³/(12 (1 − ν²)), d11 = d22 = B, d12 = ν B, d33 = B (1 − ν)/2;
+- B at 0°, 45°, 90° makes d11 = B0, d22 = B90, d12 = 0, 2 d33 = 2 B45 − (B0 + B90)/2, which is raised to
+  0.2 √(d11 d22) where it is less;
 - explicit numbers are used as they stand;
 - then density × density_scale × thicken, membrane × stretching_scale × thicken,
   bending × bending_scale × thicken³.
@@ -34,6 +36,10 @@ ISOTROPIC_LIBRARIES = ("engineering.json",)
 PROJECTION_FLOOR = 0.01
 
 Triple = tuple[float, float, float]
+Plate = tuple[float, float, float, float]
+
+LEAST_TWIST = 0.2
+"""Least 2 d33 of a measured cloth over √(d11 d22)."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,11 @@ class ShellMaterial:
         κ11, κ22, κ12 [1/m] in the material axes.
     law : str
         Name of the membrane law.
+    model : str
+        Name of the bending model.
+    plate : tuple of four floats
+        d11, d12, d22, d33 [N·m] of ``midedge``; energy per rest area is
+        ½ (d11 κ11² + 2 d12 κ11 κ22 + d22 κ22² + d33 (2 κ12)²).
     """
 
     density: float
@@ -70,6 +81,18 @@ class ShellMaterial:
     warp_degrees: float = 0.0
     rest_curvature: Triple | None = None
     law: str = "stvk"
+    model: str = "hinge"
+    plate: Plate = (0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def plate_matrix(self) -> tuple[Triple, Triple, Triple]:
+        """``plate`` as a matrix on (κ11, κ22, 2 κ12)."""
+        d11, d12, d22, d33 = self.plate
+        return (d11, d12, 0.0), (d12, d22, 0.0), (0.0, 0.0, d33)
+
+    def bends_by(self, model: str) -> bool:
+        """Whether it resists bending, by this model."""
+        return self.model == model and max(*self.bending, self.plate[0]) > 0.0
 
 
 @dataclass(frozen=True)
@@ -141,6 +164,11 @@ def names() -> list[str]:
     return sorted(entries())
 
 
+def is_isotropic(name: object) -> bool:
+    """Whether an engineering material of the library has this name."""
+    return isinstance(name, str) and isinstance(entries().get(name), IsotropicSheet)
+
+
 def resolve(
     material: Material, *, file: object | None = None, key: str = "material"
 ) -> tuple[ShellMaterial, list[str]]:
@@ -164,24 +192,33 @@ def resolve(
         Numbers so large that they overflow, or so small that they vanish.
     """
     notes: list[str] = []
+    name = key
     if material.cloth is not None:
         entry = entries()[material.cloth]
         if isinstance(entry, ClothTable):
             shell, notes = of_table(entry, material.cloth)
         else:
             shell = of_isotropic(entry)
+        name = material.cloth
     else:
         assert material.density is not None
         if (c := material.membrane) is not None:
-            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33, _triple(material.bending))
+            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33)
+            if isinstance(d := material.bending, (float, tuple)):
+                shell = replace(shell, bending=_triple(d))
+            elif d is not None:
+                shell = replace(shell, plate=(d.d11, d.d12, d.d22, d.d33))
         else:
             assert material.young is not None
             assert material.poisson is not None
             assert material.thickness is not None
             sheet = IsotropicSheet(material.young, material.poisson, material.thickness, material.density)
             shell = of_isotropic(sheet)
+    if material.bending_model == "midedge":
+        shell, more = _with_plate(shell, name)
+        notes += more
     shell = _scaled(shell, material)
-    numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending)
+    numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending, *shell.plate)
     if not all(math.isfinite(value) for value in numbers):
         raise InputError("numbers too large: stiffness or density is not finite", file=file, key=key)
     if min(shell.density, shell.c11, shell.c22, shell.c33) <= 0.0:
@@ -214,7 +251,29 @@ def of_isotropic(sheet: IsotropicSheet) -> ShellMaterial:
     stretch = sheet.young * sheet.thickness / (1 - sheet.poisson**2)
     shear = sheet.young * sheet.thickness / (2 * (1 + sheet.poisson))
     bend = stretch * sheet.thickness * sheet.thickness / 12
-    return ShellMaterial(sheet.density, stretch, sheet.poisson * stretch, stretch, shear, (bend, bend, bend))
+    nu = sheet.poisson
+    plate = (bend, nu * bend, bend, 0.5 * (1 - nu) * bend)
+    return ShellMaterial(
+        sheet.density, stretch, nu * stretch, stretch, shear, (bend, bend, bend), plate=plate
+    )
+
+
+def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[str]]:
+    """A shell that bends by its plate stiffness, made of B where there is none yet; and notes."""
+    shell = replace(shell, model="midedge")
+    at_0, at_45, at_90 = shell.bending
+    if shell.plate[0] > 0.0 or max(shell.bending) <= 0.0:
+        return shell, []
+    twist = at_45 - 0.25 * (at_0 + at_90)
+    least = 0.5 * LEAST_TWIST * math.sqrt(at_0 * at_90)
+    notes = []
+    if twist < least:
+        notes.append(
+            f"{name}: B at 0°, 45°, 90° = {at_0:.4g}, {at_45:.4g}, {at_90:.4g} N·m make d33 = {twist:.4g} "
+            f"N·m; raised to {least:.4g} N·m"
+        )
+        twist = least
+    return replace(shell, plate=(at_0, 0.0, at_90, twist)), notes
 
 
 def _triple(bending: float | Triple | None) -> Triple:
@@ -241,6 +300,7 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
     # a product and not a power: too large a factor becomes inf here and is refused above
     bend = material.bending_scale * thicken * thicken * thicken
     at_0, at_45, at_90 = (b * bend for b in shell.bending)
+    d11, d12, d22, d33 = (d * bend for d in shell.plate)
     return replace(
         shell,
         density=shell.density * material.density_scale * thicken,
@@ -249,6 +309,7 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
         c22=shell.c22 * stretch,
         c33=shell.c33 * stretch,
         bending=(at_0, at_45, at_90),
+        plate=(d11, d12, d22, d33),
         damping=material.damping,
         warp_degrees=material.warp_degrees,
         rest_curvature=material.rest_curvature,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import logging
 import socket
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -12,6 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -105,7 +107,7 @@ class Access:
         if not hmac.compare_digest(given.encode("utf-8", "surrogateescape"), self._token):
             return "the address needs the token that was printed at the start"
         origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
+        if origin is not None and origin.partition("://")[2] != request.headers.get("Host"):
             return "a page from elsewhere may not ask"
         return ""
 
@@ -122,6 +124,16 @@ class Access:
             response.set_cookie(
                 self._cookie, self._token.decode(), httponly=True, samesite="Strict", path="/"
             )
+
+
+def keep_quiet_about_bad_requests() -> None:
+    """Let aiohttp answer what is no HTTP with 400, and not also print a traceback for each."""
+
+    def is_ours(record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        return not isinstance(error, HttpProcessingError)
+
+    logging.getLogger("aiohttp.server").addFilter(is_ours)
 
 
 def is_loopback(host: str) -> bool:

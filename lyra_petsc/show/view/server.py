@@ -18,7 +18,7 @@ from typing import Any
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.read_run import StoredRun, read_history
-from lyra_petsc.show.view.access import Access
+from lyra_petsc.show.view.access import Access, keep_quiet_about_bad_requests
 
 LOCAL = "127.0.0.1"
 
@@ -98,6 +98,7 @@ async def serve(
     asked.check(run)
     token = secrets.token_urlsafe(24)
     access = Access(token, host)
+    keep_quiet_about_bad_requests()
     page = Page(run, access, asked)
     server = page.server
     web: list[Any] = []

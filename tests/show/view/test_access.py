@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import socket
 
 import pytest
 from launch import PATIENCE, finish
@@ -63,6 +64,26 @@ def test_what_opens_no_web_socket_is_answered_and_the_end_is_clean(serve, tmp_pa
         for method in ("GET", "HEAD", "POST"):
             assert page.get(f"/ws?token={page.token}", method, **headers)[0] == 426
     assert page.get(f"/index.html?token={page.token}")[0] == 200
+    page.process.send_signal(signal.SIGINT)
+    left = finish(page.process)
+    assert left.code == 0
+    assert left.err == ""
+
+
+def test_what_is_no_request_is_answered_without_a_traceback(serve, tmp_path):
+    page = serve(written(tmp_path / "run"))
+    for origin in ("http://[", "null", "http://[::1", "://", "\x80"):
+        assert page.get(f"/index.html?token={page.token}", Origin=origin)[0] == 403, origin
+    for request in (
+        b"GET / HTTP/9.9",
+        b"\x16\x03\x01",
+        b"FOO",
+        b"GET /\xe9 HTTP/1.1",
+        b"GET / HTTP/1.1\r\nHost",
+    ):
+        with socket.create_connection(("127.0.0.1", page.port), PATIENCE) as connection:
+            connection.sendall(request + b"\r\n\r\n")
+            assert connection.recv(12).endswith(b" 400"), request
     page.process.send_signal(signal.SIGINT)
     left = finish(page.process)
     assert left.code == 0

@@ -1,0 +1,319 @@
+"""Bending with one unknown on every edge: directors, whose angles with the triangles make a curvature.
+
+An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per
+triangle of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
+
+    κ = −Σ_i (tan α_i − tan ᾱ_i) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
+    energy = ½ A (κ − κ̄)ᵀ D (κ − κ̄)
+
+κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is
+the material's rest curvature and D its stiffness [N·m]. As κ is linear in the three tangents the energy is a
+quadratic form of theirs. The director's angle has no mass: it is where moments balance, which makes edges of
+one, two or more triangles alike. A triangle's stencil is its own corners and edges. tan keeps folds below
+180°.
+
+Sources: constant curvatures from rotations of the edges are Morley's plate (Aeronautical Quarterly 19 (1968)
+149-169); on curved sheets Grinspun, Gingold, Reisman & Zorin, Computing discrete shape operators on general
+meshes, Eurographics 2006; as a Hellan-Herrmann-Johnson method with the moments eliminated Neunteufel &
+Schöberl, Computers & Structures 225 (2019) 106109.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms import midedge_energy
+from lyra_petsc.terms.hinge_energy import fading_limit
+from lyra_petsc.terms.midedge_shape import (
+    Frames,
+    carried,
+    directors,
+    some_perpendicular,
+    tangents,
+    unit,
+)
+from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, Step
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+AnyInts = NDArray[np.int32] | NDArray[np.int64]
+
+STEEPEST = np.radians(89.0)
+"""Angle of a director at rest or at the start from which on a scene is refused."""
+
+LARGEST_TURN = 0.5
+"""Angle [rad] by which a Newton iteration may turn a director."""
+
+CLOSER = 0.2
+"""Part of the smallest cos α that a Newton iteration must leave."""
+
+HALVINGS = 20
+
+
+class Edges(NamedTuple):
+    """The edges of this rank's triangles, each once.
+
+    Attributes
+    ----------
+    places : (n,)
+        Of their unknowns in the flat form of arrays over local rows.
+    ends : (n, 2) int32
+        Local rows of their vertices; directors turn about the way from the first to the second.
+    length : (n,)
+        At rest [m].
+    of_triangles : (E, 3) int32
+        The edge opposite each corner.
+    """
+
+    places: Ints
+    ends: NDArray[np.int32]
+    length: Array
+    of_triangles: NDArray[np.int32]
+
+
+class MidEdge(Elastic):
+    """The bending energy of all triangles.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 3), edges (E, 3) opposite the corners; data ``stiffness`` (E, 6) of the tangents [N·m],
+        ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) 1 where the triangle runs along an edge, else
+        −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of edges and
+        directors before the start, ``curvature`` (E, 3, 3) [1/m] κ of each tangent, ``area`` (E,) [m²],
+        ``triangle`` (E,) numbers in the mesh, ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴],
+        ``damping`` (E,) [s].
+    """
+
+    def __init__(self, elements: Elements) -> None:
+        data = elements.data
+        super().__init__(elements.without("tangent", "director"))
+        assert self.edges is not None
+        places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
+        triangle, side = np.divmod(first, 3)
+        ends = np.stack([self.stencil[triangle, (side + k) % 3] for k in (1, 2)], axis=1)
+        against = data["sign"].ravel()[first] < 0.0
+        ends[against] = ends[against, ::-1]
+        index = index.reshape(-1, 3).astype(np.int32)
+        self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
+        self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
+        self._constants = data["stiffness"], data["rest"], data["limit"]
+        self._shapes: Remembered[Array] | None = None
+        self._shapes_of: Frames | None = None
+
+    # -- frames ------------------------------------------------------------------------------------
+
+    def begin(self, x: Array) -> None:
+        self.frames = self._carried(self.frames, x)
+
+    def freeze(self, step: Step) -> Frames:
+        return self.frames
+
+    def accept(self, x: Array, frozen: Frames) -> None:
+        self.frames = self._carried(frozen, x)
+
+    def _carried(self, frames: Frames, x: Array) -> Frames:
+        tangent = self._tangents(x)
+        return Frames(tangent, carried(frames, tangent))
+
+    def _tangents(self, x: Array) -> Array:
+        tail, head = self.of_edges.ends.T
+        return unit(x[head] - x[tail])
+
+    def edge_state(self) -> dict[str, Array]:
+        tangent, across = self.frames
+        base = some_perpendicular(tangent)
+        side = np.sum(np.cross(tangent, base) * across, axis=1)
+        return {"frame": np.arctan2(side, np.sum(base * across, axis=1))}
+
+    def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
+        tangent = self._tangents(x)
+        base, angle = some_perpendicular(tangent), state["frame"][:, None]
+        self.frames = Frames(tangent, np.cos(angle) * base + np.sin(angle) * np.cross(tangent, base))
+
+    @property
+    def edge_places(self) -> Ints:
+        return self.of_edges.places
+
+    # -- energy ------------------------------------------------------------------------------------
+
+    def _shape(self, x: Array, frames: Frames) -> Array:
+        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 9)."""
+        if self._shapes is None or self._shapes_of is not frames:
+            self._shapes_of = frames
+            self._shapes = Remembered(lambda at: self._computed(at, frames))
+        return self._shapes(x)
+
+    def _computed(self, x: Array, frames: Frames) -> Array:
+        angle = x.ravel()[self.of_edges.places] / self.of_edges.length
+        out = np.empty((len(angle), 9))
+        # all at once: NumPy's are several at a time where the processor can
+        directors(x, self.of_edges.ends, *frames, np.cos(angle), np.sin(angle), out)
+        return out
+
+    def energies(self, x: Array, frozen: Frames) -> Array:
+        return self.all_energies(x, frozen, self.n_owned)
+
+    def all_energies(self, x: Array, frozen: Frames, n: int) -> Array:
+        """Energy [J] of the first n triangles of this rank, (n,)."""
+        out = np.empty(n)
+        edges, shape = self.of_edges.of_triangles, self._shape(x, frozen)
+        midedge_energy.energies(x, self.stencil, edges, shape, *self._constants, out)
+        return out
+
+    def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
+        data, shape = self.elements.data, self._shape(x, frozen)
+        numbers = self.stencil, self.of_edges.of_triangles, self.edges
+        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *self._constants, data["length"], out)
+
+    def hessians(self, x: Array, frozen: Frames, lo: int, hi: int, blend: float, out: Array) -> None:
+        data, shape = self.elements.data, self._shape(x, frozen)
+        numbers = self.of_edges.of_triangles, data["sign"], shape
+        midedge_energy.hessians(
+            x, self.stencil, lo, hi, blend, *numbers, *self._constants, data["length"], out
+        )
+
+    def force_scale(self, size: float) -> Array:
+        data = self.elements.data
+        trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
+        scale: Array = trace * size / data["height"] ** 2
+        return scale
+
+    def largest_step(self, x: Array, way: Array, frozen: Frames) -> float:
+        places, _, length, edges = self.of_edges
+        turn = np.abs(way.ravel()[places] / length).max(initial=0.0)
+        fraction = min(1.0, LARGEST_TURN / turn) if turn > 0.0 else 1.0
+        limit = self._constants[2]
+
+        def smallest(at: Array) -> float:
+            shape = self._computed(at, frozen)
+            return float(midedge_energy.smallest_cosine(at, self.stencil, edges, shape, limit))
+
+        least = CLOSER * smallest(x)
+        for _ in range(HALVINGS):
+            if smallest(x + fraction * way) >= least:
+                break
+            fraction *= 0.5
+        return fraction
+
+    def curvatures(self, x: Array, frozen: Frames) -> Array:
+        """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
+        found = np.empty((self.n_elements, 3))
+        tangents(x, self.stencil, self.of_edges.of_triangles, self._shape(x, frozen), found)
+        curvature: Array = np.einsum("eki,ei->ek", self.elements.data["curvature"], found)
+        curvature[:, 2] *= 0.5
+        return curvature
+
+
+def normals_of(x: Array, triangles: AnyInts) -> Array:
+    """Unit normals (n, 3) of triangles (n, 3)."""
+    a, b, c = (x[triangles[:, k]] for k in range(3))
+    return unit(np.cross(b - a, c - a))
+
+
+def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) -> Array:
+    """Means (n_edges, 3) of the unit normals of the triangles that have an edge, ``number`` (F, 3) of it."""
+    normals = np.repeat(normals_of(x, triangles), 3, axis=0)
+    total: Array = np.stack([np.bincount(number.ravel(), normals[:, i], n_edges) for i in range(3)], axis=1)
+    return unit(total)
+
+
+def edge_numbers(rest: RestShape, triangles: Ints) -> tuple[Ints, Array]:
+    """Of triangles (F, 3) the edges opposite corners; 1 where they run from the lesser vertex, else −1."""
+    tail, head = triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]
+    n = rest.mesh.n_vertices
+    keys = rest.edges[:, 0] * n + rest.edges[:, 1]
+    number = np.searchsorted(keys, np.minimum(tail, head) * n + np.maximum(tail, head))
+    return number, np.where(tail < head, 1.0, -1.0)
+
+
+def elements(rest: RestShape) -> Elements:
+    """All triangles that bend by this model, with their constants (rank 0).
+
+    Raises
+    ------
+    InputError
+        Where a triangle lies at 90° to a director, at rest or at the start.
+    """
+    chosen = np.flatnonzero(rest.bends_by("midedge"))
+    mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
+    number, sign = edge_numbers(rest, triangles)
+    edges, n_edges = rest.edges, len(rest.edges)
+    material = np.linalg.inv(rest.inverse[chosen]).transpose(0, 2, 1)  # x1 − x0, x2 − x0
+    one, two = material[:, 0], material[:, 1]
+    side = np.stack([two - one, -two, one], axis=1)
+    size, area = np.linalg.norm(side, axis=2), rest.area[chosen]
+    normal = np.stack([side[..., 1], -side[..., 0]], axis=2) / size[..., None]
+    x, y = normal[..., 0], normal[..., 1]
+    curvature = -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * (size / area[:, None])[:, None, :]
+    stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
+    form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
+    # the two faces of a seam may have edges of different lengths
+    count = np.bincount(number.ravel(), minlength=n_edges)
+    length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
+
+    surface = ~mesh.flat_rest[chosen]
+    at_rest = np.zeros_like(size)
+    if surface.any():
+        director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges)
+        at_rest[surface] = _tangents_of(mesh.rest, triangles[surface], director[number[surface]])
+        _check(at_rest, number, edges, rest, "rest shape")
+    curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
+    if curved.any():
+        at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
+    director = mean_directors(mesh.positions, triangles, number, n_edges)[number]
+    _check(_tangents_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
+    ends: Array = mesh.positions[edges[number]]
+    data = {
+        "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
+        "rest": at_rest,
+        "sign": sign,
+        "length": length[number],
+        "tangent": unit(ends[:, :, 1] - ends[:, :, 0]),
+        "director": director,
+        "curvature": curvature,
+        "area": area,
+        "triangle": chosen.astype(np.float64),
+        "height": 2.0 * area / size.max(axis=1),
+        "limit": fading_limit(area),
+        "damping": rest.per_triangle("damping")[chosen],
+    }
+    return Elements(triangles, data, edges=number)
+
+
+def _tangents_of(x: Array, triangles: Ints, director: Array) -> Array:
+    """tan α (n, 3) of directors (n, 3, 3) on the edges opposite the corners of triangles (n, 3)."""
+    normal = normals_of(x, triangles)[:, None, :]
+    along = unit(x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]])
+    outward = np.cross(along, np.broadcast_to(normal, along.shape))
+    height = np.sum(director * normal, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found: Array = np.where(height > 0.0, np.sum(director * outward, axis=2) / height, np.inf)
+    return found
+
+
+def _check(tangent: Array, number: Ints, edges: Ints, rest: RestShape, what: str) -> None:
+    """Refuse edges at which a shape is folded by nearly 180°."""
+    steep = np.flatnonzero(~(np.abs(tangent.ravel()) < np.tan(STEEPEST)))
+    if len(steep):
+        a, b = edges[number.ravel()[steep[0]]]
+        raise InputError(
+            f"the {what} is folded by 178° or more at the edge of vertices {a} and {b}, where bending_model: "
+            "midedge has no moment; open the fold, or take bending_model: hinge",
+            file=rest.scene.source,
+            key="mesh",
+        )
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> MidEdge:
+    """The term on one rank."""
+    return MidEdge(elements)

@@ -1,0 +1,239 @@
+"""The energy of bending by directors on edges, its gradient and Hessian: pure functions on arrays.
+
+Per triangle, with the tangents of ``midedge_shape`` and constants K (3 × 3) and f̄::
+
+    energy = ½ w fᵀ K f,   f_i = tan α_i − f̄_i
+
+w is 1 but for triangles that have lost nine tenths of their area, with which it vanishes as in
+``hinge_energy``: they have hardly a normal. Of director angles φ, normal n, area A and barycentric
+coordinates b_c the derivatives of α_i are
+
+    ∂α_i/∂x_c = ω n ± γ_i,   ω = −e_i · e_c / (2A |e_i|),     ∂α_i/∂φ_i = s_i
+
+with γ_i at both ends of the edge only, + at its head, and s_i = ±1 as the triangle runs along the edge or
+against it. The second derivatives are, as for the angle of a hinge (``hinge.triangle_turn``),
+
+    −ω_d n ∇b_cᵀ − ω_c ∇b_d nᵀ + σ_c σ_d (n τᵀ + τ nᵀ) − ½ σ_c σ_d s_i (γ ρᵀ + ρ γᵀ),   τ = −m_i / (2 |e_i|²)
+
+with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
+∇f K ∇fᵀ.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.hinge import cross, dot, point, scaled
+from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
+from lyra_petsc.terms.midedge_shape import edges_of, row, tangent_of
+
+
+@kernel(inline="always")
+def _moments(stiffness, e, f0, f1, f2):  # type: ignore[no-untyped-def]
+    """K f of triangle e."""
+    k00, k01, k02 = stiffness[e, 0], stiffness[e, 1], stiffness[e, 2]
+    k11, k12, k22 = stiffness[e, 3], stiffness[e, 4], stiffness[e, 5]
+    return (
+        k00 * f0 + k01 * f1 + k02 * f2,
+        k01 * f0 + k11 * f1 + k12 * f2,
+        k02 * f0 + k12 * f1 + k22 * f2,
+    )
+
+
+@kernel()
+def energies(x, stencil, edges, shape, stiffness, rest, limit, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of the first len(out) triangles; infinite where a director lies at 90° or beyond."""
+    for e in range(out.shape[0]):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+        if square <= GONE * limit[e]:
+            out[e] = 0.0
+            continue
+        t0, h0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        t1, h1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        t2, h2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        if not min(h0, h1, h2) > 0.0:
+            out[e] = np.inf
+            continue
+        f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+        g0, g1, g2 = _moments(stiffness, e, f0, f1, f2)
+        out[e] = 0.5 * (f0 * g0 + f1 * g1 + f2 * g2)
+        if square < limit[e]:
+            out[e] *= fade(square, limit[e])[0]
+
+
+@kernel()
+def smallest_cosine(x, stencil, edges, shape, limit):  # type: ignore[no-untyped-def]
+    """The smallest cos α of all directors in triangles that have not lost their area; 1 without any."""
+    found = 1.0
+    for e in range(stencil.shape[0]):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        _, _, _, normal, square = edges_of(x0, x1, x2)
+        if square > GONE * limit[e]:
+            inverse = 1.0 / math.sqrt(square)
+            for i in range(3):
+                found = min(found, inverse * dot(row(shape, edges[e, i], 0), normal))
+    return found
+
+
+@kernel()
+def add_gradient(  # type: ignore[no-untyped-def]
+    x, stencil, edges, places, sign, shape, stiffness, rest, limit, length, out
+):
+    """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (E, 3)."""
+    flat = out.reshape(-1)
+    for e in range(stencil.shape[0]):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+        if square <= GONE * limit[e]:
+            continue
+        t0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        t1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        t2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+        p0, p1, p2 = _moments(stiffness, e, f0, f1, f2)
+        if square < limit[e]:
+            weight, slope, _ = fade(square, limit[e])
+            energy = slope * (f0 * p0 + f1 * p1 + f2 * p2)  # 2 · ½
+            p0, p1, p2 = weight * p0, weight * p1, weight * p2
+            for c, edge in ((0, e0), (1, e1), (2, e2)):
+                turned = cross(normal, edge)
+                for i in range(3):
+                    out[stencil[e, c], i] += energy * turned[i]
+        p0, p1, p2 = p0 * (1.0 + t0 * t0), p1 * (1.0 + t1 * t1), p2 * (1.0 + t2 * t2)
+        q0, q1, q2 = p0 / math.sqrt(dot(e0, e0)), p1 / math.sqrt(dot(e1, e1)), p2 / math.sqrt(dot(e2, e2))
+        pull = (
+            q0 * e0[0] + q1 * e1[0] + q2 * e2[0],
+            q0 * e0[1] + q1 * e1[1] + q2 * e2[1],
+            q0 * e0[2] + q1 * e1[2] + q2 * e2[2],
+        )
+        n = scaled(1.0 / square, normal)  # over 2A
+        w0, w1, w2 = -dot(e0, pull), -dot(e1, pull), -dot(e2, pull)
+        a0, a1, a2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
+        for i in range(3):
+            s0, s1, s2 = p0 * a0[i], p1 * a1[i], p2 * a2[i]
+            out[stencil[e, 0], i] += w0 * n[i] + s1 - s2
+            out[stencil[e, 1], i] += w1 * n[i] + s2 - s0
+            out[stencil[e, 2], i] += w2 * n[i] + s0 - s1
+        flat[places[e, 0]] += sign[e, 0] * p0 / length[e, 0]
+        flat[places[e, 1]] += sign[e, 1] * p1 / length[e, 1]
+        flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
+
+
+@kernel(inline="always")
+def _outer(h, a, b, factor, left, right):  # type: ignore[no-untyped-def]
+    """Add factor left rightᵀ to the block (a, b) of h (12, 12)."""
+    for i in range(3):
+        for j in range(3):
+            h[3 * a + i, 3 * b + j] += factor * left[i] * right[j]
+
+
+@kernel()
+def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, h):  # type: ignore[no-untyped-def]
+    """The Hessian of triangle e into the upper blocks of h (12, 12); g (3, 12) becomes the ∇α_i."""
+    h[:] = 0.0
+    x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+    e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+    if square <= GONE * limit[e]:
+        return
+    side = (e0, e1, e2)
+    inverse = 1.0 / math.sqrt(square)  # 1 / 2A
+    n = scaled(inverse, normal)
+    t0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+    t1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+    t2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+    f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+    moment = _moments(stiffness, e, f0, f1, f2)
+    tangent = (t0, t1, t2)
+    steep = (1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2)
+    energy = 0.5 * (f0 * moment[0] + f1 * moment[1] + f2 * moment[2])
+    exact = 1.0 - blend
+    # ∇α_i
+    g[:] = 0.0
+    for i in range(3):
+        size = math.sqrt(dot(side[i], side[i]))
+        spin = row(shape, edges[e, i], 3)
+        tail, head = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            turn = -dot(side[i], side[c]) / size * inverse
+            for k in range(3):
+                g[i, 3 * c + k] = turn * n[k]
+        for k in range(3):
+            g[i, 3 * head + k] += spin[k]
+            g[i, 3 * tail + k] -= spin[k]
+        g[i, 9 + i] = sign[e, i] / length[e, i]
+    # ∇f K ∇fᵀ, and what tan adds as it bends
+    number = 0
+    for i in range(3):
+        for j in range(i, 3):
+            factor = steep[i] * stiffness[e, number] * steep[j]
+            number += 1
+            if i == j:
+                factor += exact * 2.0 * tangent[i] * steep[i] * moment[i]
+            for a in range(12):
+                left, right = factor * g[i, a], factor * g[j, a]
+                for b in range(a, 12):
+                    h[a, b] += left * g[j, b]
+                    if i != j:
+                        h[a, b] += right * g[i, b]
+    if exact > 0.0:
+        for i in range(3):
+            p = exact * moment[i] * steep[i]
+            size = math.sqrt(dot(side[i], side[i]))
+            tail, head = (i + 1) % 3, (i + 2) % 3
+            spin, about = row(shape, edges[e, i], 3), row(shape, edges[e, i], 6)
+            across = scaled(-0.5 / size**3, cross(side[i], n))
+            for c in range(3):
+                turn_c = -dot(side[i], side[c]) / size * inverse
+                for d in range(c, 3):
+                    turn_d = -dot(side[i], side[d]) / size * inverse
+                    _outer(h, c, d, -p * turn_d * inverse, n, cross(n, side[c]))
+                    _outer(h, c, d, -p * turn_c * inverse, cross(n, side[d]), n)
+                    if c != i and d != i:
+                        ends = p if c == d else -p
+                        _outer(h, c, d, ends, n, across)
+                        _outer(h, c, d, ends, across, n)
+                        _outer(h, c, d, -0.5 * ends * sign[e, i], spin, about)
+                        _outer(h, c, d, -0.5 * ends * sign[e, i], about, spin)
+    if square < limit[e]:
+        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, moment, steep, g, h)
+
+
+@kernel()
+def _fade_hessian(corners, normal, square, limit, energy, exact, moment, steep, g, h):  # type: ignore[no-untyped-def]
+    """Turn the Hessian of f in h (12, 12) into that of f w; of the rest, the regularised one has nothing."""
+    weight, first, second = fade(square, limit)
+    h *= weight
+    slopes, force, bent = np.zeros(12), np.zeros(12), np.zeros((4, 4, 3, 3))
+    for c in range(3):
+        b, d = corners[(c + 1) % 3], corners[(c + 2) % 3]
+        turned = cross(normal, (d[0] - b[0], d[1] - b[1], d[2] - b[2]))
+        for i in range(3):
+            slopes[3 * c + i] = 2.0 * turned[i]
+    for i in range(3):
+        for a in range(12):
+            force[a] += moment[i] * steep[i] * g[i, a]
+    add_square_hessian(corners, normal, (0, 1, 2), first, bent)
+    for a in range(12):
+        for b in range(a, 12):
+            h[a, b] += exact * first * (force[a] * slopes[b] + slopes[a] * force[b])
+            h[a, b] += exact * energy * second * slopes[a] * slopes[b]
+            if b < 9:
+                h[a, b] += exact * energy * bent[a // 3, b // 3, a % 3, b % 3]
+
+
+@kernel()
+def hessians(  # type: ignore[no-untyped-def]
+    x, stencil, lo, hi, blend, edges, sign, shape, stiffness, rest, limit, length, out
+):
+    """Hessians [N/m] of triangles lo..hi into out (hi − lo, 12, 12)."""
+    g = np.empty((3, 12))
+    for e in range(lo, hi):
+        h = out[e - lo]
+        _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, h)
+        for a in range(12):
+            for b in range(a):
+                h[a, b] = h[b, a]

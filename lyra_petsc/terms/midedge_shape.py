@@ -1,0 +1,137 @@
+"""Directors of edges, and the tangents of the angles that they have with the normals of their triangles.
+
+A director d is a unit vector perpendicular to its edge, at the angle φ in a frame that follows the edge: the
+direction a₀ that it had on an edge of direction t₀, carried by the smallest rotation to the present direction
+t (Bergou, Audoly, Vouga, Wardetzky & Grinspun, Discrete viscous threads, SIGGRAPH 2010)::
+
+    d = cos φ a + sin φ t × a,   a = P(t₀ → t) a₀
+
+As the edge e = |e| t turns, d spins about it at the rate φ̇ + γ · ė with γ = −t₀ × t / (|e| (1 + t₀ · t)).
+
+In a triangle with unit normal n, counter-clockwise edges e_i = |e_i| t_i opposite its corners x_i and outward
+normals m_i = t_i × n in its plane, α_i is the angle about t_i from n to the director of the edge::
+
+    tan α_i = (d_i · m_i) / (d_i · n)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FARTHEST = -0.8
+"""Cosine of the angle by which an edge may turn from its frame: at −1 there is no smallest rotation."""
+
+
+class Frames(NamedTuple):
+    """What directors of n edges are measured in.
+
+    Attributes
+    ----------
+    tangent, across : (n, 3)
+        t₀ and a₀, unit vectors.
+    """
+
+    tangent: Array
+    across: Array
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors (n, 3) made 1 long; NaN where they have no direction."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        made: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return made
+
+
+def carried(frames: Frames, tangent: Array) -> Array:
+    """a (n, 3): a₀ as the smallest rotation carries it to edges of direction ``tangent`` (n, 3)."""
+    t0, a0 = frames
+    turn, cosine = np.cross(t0, tangent), np.sum(t0 * tangent, axis=1, keepdims=True)
+    along = np.sum(turn * a0, axis=1, keepdims=True) / (1.0 + cosine)
+    moved = cosine * a0 + np.cross(turn, a0) + along * turn
+    # rounding must not gather over the steps
+    return unit(moved - np.sum(moved * tangent, axis=1, keepdims=True) * tangent)
+
+
+def some_perpendicular(tangent: Array) -> Array:
+    """Unit vectors (n, 3) perpendicular to others, by a rule that knows nothing but these."""
+    axis = np.eye(3)[np.argmin(np.abs(tangent), axis=1)]
+    return unit(axis - np.sum(axis * tangent, axis=1, keepdims=True) * tangent)
+
+
+@kernel()
+def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-untyped-def]
+    """Of edges (n, 2): director d, γ [1/m] and ρ [1/m], into out (n, 9).
+
+    γ changes with the edge by −γ ρᵀ and an antisymmetric part. d is 0 where an edge is too far from its
+    frame.
+    """
+    for k in range(ends.shape[0]):
+        e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
+        length = math.sqrt(dot(e, e))
+        t = scaled(1.0 / length, e)
+        t0 = tangent[k, 0], tangent[k, 1], tangent[k, 2]
+        a0 = across[k, 0], across[k, 1], across[k, 2]
+        c, b = dot(t0, t), cross(t0, t)
+        if not c > FARTHEST:
+            out[k, :] = 0.0
+            continue
+        inverse = 1.0 / (1.0 + c)
+        ba, along = cross(b, a0), dot(b, a0) * inverse
+        a = (
+            c * a0[0] + ba[0] + along * b[0],
+            c * a0[1] + ba[1] + along * b[1],
+            c * a0[2] + ba[2] + along * b[2],
+        )
+        w = cross(t, a)
+        inverse /= length
+        for i in range(3):
+            out[k, i] = cosine[k] * a[i] + sine[k] * w[i]
+            out[k, 3 + i] = -inverse * b[i]
+            out[k, 6 + i] = inverse * ((2.0 + c) * t[i] + t0[i])
+
+
+@kernel(inline="always")
+def row(values, k, first):  # type: ignore[no-untyped-def]
+    """Three numbers of row k from a column on."""
+    k = Index(k)
+    return values[k, first], values[k, first + 1], values[k, first + 2]
+
+
+@kernel(inline="always")
+def edges_of(x0, x1, x2):  # type: ignore[no-untyped-def]
+    """Edges e_i of a triangle, its normal N = 2A n, and |N|²."""
+    e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
+    normal = cross(e1, e2)
+    return e0, e1, e2, normal, dot(normal, normal)
+
+
+@kernel(inline="always")
+def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
+    """tan α of a director on an edge of a triangle with this normal N; d · N [m²]."""
+    height = dot(d, normal)
+    return dot(d, cross(e, normal)) / (math.sqrt(dot(e, e)) * height), height
+
+
+@kernel()
+def tangents(x, stencil, edges, shape, out):  # type: ignore[no-untyped-def]
+    """tan α_i of triangles (E, 3) into out (E, 3); NaN in those where a director lies at 90° or beyond."""
+    for e in range(stencil.shape[0]):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        e0, e1, e2, normal, _ = edges_of(x0, x1, x2)
+        f0, h0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        f1, h1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        f2, h2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        out[e, 0], out[e, 1], out[e, 2] = f0, f1, f2
+        if not min(h0, h1, h2) > 0.0:
+            out[e, :] = np.nan
