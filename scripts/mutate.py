@@ -62,8 +62,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "stage_equations.py",
-        "step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)",
-        "step = Step(self.t0, self.t1, self.t0, self.x, self.reference.at)",
+        "step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)\n        self.frozen |= {",
+        "step = Step(self.t0, self.t1, self.t0, self.x, self.reference.at)\n        self.frozen |= {",
         (BOOKS + "test_a_turning_clamp_stores_energy_where_it_stands[midpoint]",),
     ),
     Change(
@@ -275,8 +275,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "convergence.py",
-        "residual <= self._tolerances.force_tolerance * self._equations.largest_force()",
-        "residual <= 100.0 * self._tolerances.force_tolerance * self._equations.largest_force()",
+        "return float(self._tolerances.force_tolerance *",
+        "return float(100.0 * self._tolerances.force_tolerance *",
         ("tests/stepping/test_tolerances.py",),
     ),
     Change(

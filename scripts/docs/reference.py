@@ -45,6 +45,7 @@ OPTIONS = {
     "snes_rtol": "Relative residual at which a step stops, where given, before `solver` says so.",
     "snes_atol": "Residual [N] at which a step stops, likewise; it fails above `solver.force_tolerance`.",
     "snes_stol": "Relative increment at which a step stops, likewise.",
+    "snes_convergence_test": "Refused: `solver` has the tolerances.",
     "ksp_rtol": "Relative tolerance of linear solves; without it 1e-2, and down to 1e-6 where Newton is "
     "slow; "
     "`semi-implicit`: 1e-6.",
