@@ -123,6 +123,7 @@ class Trial:
             if values is not None:
                 target[: problem.points.n_vertices] = values[problem.points.original]
                 problem.points.update_ghosts(target)
+        self.simulation.ledger.measure()  # from which steps reckon what they did to energy
 
     def total(self, owned: Array) -> float:
         """Sum over all ranks of this rank's values; collective."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import CLOTH, SteppedScene, grid
+from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.pattern import BlockPattern
@@ -27,7 +27,7 @@ def symmetric(points: Points, pattern: BlockPattern, shift: float) -> np.ndarray
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["aij", "baij", "sbaij"])
 def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
-    with SteppedScene({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         first, second = symmetric(points, pattern, 0.0), symmetric(points, pattern, 1.0)
         once, twice = (AssembledMatrix(points, pattern, kind) for _ in range(2))
@@ -54,7 +54,7 @@ def test_new_values_replace_old_ones(kind: str, comm: MPI.Comm) -> None:
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "sbaij"])
 def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Comm) -> None:
-    with SteppedScene({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         matrix = AssembledMatrix(points, pattern, kind)
         matrix.set(symmetric(points, pattern, 0.5))
@@ -72,7 +72,7 @@ def test_copies_of_a_matrix_multiply_by_their_own_values(kind: str, comm: MPI.Co
 
 @pytest.mark.parallel
 def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> None:
-    with SteppedScene({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         assembled, ours = AssembledMatrix(points, pattern, "baij"), BlockMatrix(points, pattern)
         told = []
@@ -99,7 +99,7 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "aij", "sbaij"])
 def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> None:
-    with SteppedScene({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
         enlarged = values.copy()
@@ -120,7 +120,7 @@ def test_a_larger_diagonal_is_that_of_larger_rows(kind: str, comm: MPI.Comm) -> 
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind", ["baij", "aij"])
 def test_of_a_diagonal_matrix_other_blocks_are_left_out(kind: str, comm: MPI.Comm) -> None:
-    with SteppedScene({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
         points, pattern = simulation.problem.points, simulation.problem.pattern
         values = symmetric(points, pattern, 0.5)
         part = AssembledMatrix(points, pattern, kind, diagonal=True)

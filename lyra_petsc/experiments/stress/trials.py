@@ -189,7 +189,6 @@ def _run(trial: Trial, case: StressCase, record: Record, deadline: float) -> Non
     if case.shape is not None:
         shape = case.shape(trial.x, simulation.problem.outline.spacing)
         trial.set_state(x=shape)
-        simulation.ledger.measure()
     record.start_energy = _energy(trial)
     if case.observe is not None:
         record.observed.append(case.observe(trial))
