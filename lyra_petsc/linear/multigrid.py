@@ -66,10 +66,10 @@ class Multigrid:
         if pc.getType() != PETSc.PC.Type.PYTHON:
             raise InputError(f"'{ksp.getType()}' takes no such preconditioner; take another", key="-ksp_type")
         self._pc = pc
-        self._cycle: VCycle = pc.getPythonContext()
-        self._cycle.attach(self.hierarchy, self._renew)
         # at the end of a program that destroys nothing PETSc would call Python when that is gone
         self._at_exit = weakref.finalize(self, pc.setType, PETSc.PC.Type.NONE)
+        self._cycle: VCycle = pc.getPythonContext()
+        self._cycle.attach(self.hierarchy, self._renew)
 
     def _follow(self, values: Array) -> None:
         self._values = values

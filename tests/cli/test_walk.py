@@ -37,6 +37,7 @@ REFUSED = [
     ["-snes_fd_color"],
     ["-fp_trap"],
     ["-snes_convergence_test", "skip"],
+    ["-pc_type", "mg", "-mg_coarse_pc_type", "nosuch"],
     ["-snes_convergence_estimate"],
     ["-snes_grid_sequence", "1"],
     ["-snes_monitor_fields"],
