@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 _PETSC = re.compile(r"-[A-Za-z_]")
@@ -65,9 +66,16 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
 def petsc_cannot_start(words: Sequence[str]) -> str:
     """Why PETSc would fail or crash while it reads these options, PETSC_OPTIONS and its files; or nothing."""
     every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
-    if "-skip_petscrc" not in every:
-        places = [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
-        every += [word for place in places if os.path.isfile(place) for word in ("-options_file", place)]
+    files = [] if "-skip_petscrc" in every else [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
+    for path in filter(os.path.isfile, files):
+        with suppress(OSError, ValueError), open(path, encoding="utf-8") as file:
+            if why := _cannot_start(_words_of(file.read()), [os.path.realpath(path)]):
+                return f"{path}: {why}"
+    return _cannot_start(every, [])
+
+
+def _cannot_start(every: Sequence[str], files: list[str]) -> str:
+    """Why PETSc would not start with these options, in the last of ``files`` that include one another."""
     for option, value in itertools.pairwise([*every, ""]):
         if not option.startswith("-"):
             continue
@@ -79,26 +87,28 @@ def petsc_cannot_start(words: Sequence[str]) -> str:
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or "it is no text"
                 return f"-{name}: cannot read '{value}': {why}"
+            path = os.path.realpath(value)
+            if path in files:
+                return f"-{name}: '{value}' includes itself"
             if name == "options_file":
-                given = re.sub(r"(?m)#.*$", "", text).split()
-                wrong = _wrong_line(text) or _trapping(given)
-                if wrong:
-                    return f"-{name}: {value}: {wrong}"
+                why = _wrong_line(text) or _cannot_start(_words_of(text), [*files, path])
+                if why:
+                    return f"-{name}: {value}: {why}"
         if name == "python":
             return "-python: starts a program of Python's own; leave it out"
         if name == "history":
             folder = Path(value).parent if value and not value.startswith("-") else Path.home()
             if not os.access(folder, os.W_OK):
                 return f"-history: cannot write into '{folder}'"
-    return _trapping(every)
-
-
-def _trapping(words: Sequence[str]) -> str:
-    """Why no run survives ``-fp_trap``, if that is among the options."""
-    for option, value in itertools.pairwise([*words, ""]):
-        if option.lstrip("-").lower() == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
+        if name == "fp_trap" and value.lower() not in ("0", "false", "no", "off"):
             return "-fp_trap: ends Python at numbers that overflow, which here make a step fail; leave it out"
     return ""
+
+
+def _words_of(text: str) -> list[str]:
+    """The words of an options file without its comments."""
+    lines = (line.split("#")[0].split() for line in text.splitlines())
+    return [word for words in lines if words and words[0][0] not in "!%" for word in words]
 
 
 def start_petsc(words: Sequence[str]) -> str:

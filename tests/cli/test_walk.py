@@ -191,3 +191,21 @@ def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: li
     assert "Traceback" not in left.stdout + left.stderr
     told = {"-prefix_pop": "prefixes popped"}.get(words[-1], words[-1].removeprefix(":").removesuffix("/log"))
     assert told in left.stderr
+
+
+@pytest.mark.parametrize(
+    "line", ["-fp_trap", "-python", "-history /nonexistent/log", "-options_file .petscrc"]
+)
+def test_files_of_options_are_looked_at_before_petsc_reads_them(tmp_path: Path, line: str) -> None:
+    (tmp_path / ".petscrc").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
+    left = subprocess.run(
+        [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert left.returncode == 2, left.stderr
+    (told,) = left.stderr.splitlines()
+    assert told.startswith(f"lyra-petsc: .petscrc: {line.split()[0]}: ")
