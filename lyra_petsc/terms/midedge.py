@@ -41,7 +41,7 @@ from lyra_petsc.terms.midedge_shape import (
 )
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, Offsets, Step
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -180,6 +180,23 @@ class MidEdge(Elastic):
         numbers = self.of_edges.of_triangles, data["sign"], shape
         midedge_energy.hessians(
             x, self.stencil, lo, hi, blend, *numbers, *self._constants, data["length"], out
+        )
+
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: Frames,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        before: Array | None = None,
+    ) -> None:
+        data, shape = self.elements.data, self._shape(x, frozen)
+        numbers = self.of_edges.of_triangles, data["sign"], shape
+        constants = *self._constants, data["length"], self.edges
+        midedge_energy.add_hessian(
+            x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
         )
 
     def force_scale(self, size: float) -> Array:

@@ -25,7 +25,9 @@ import math
 
 import numpy as np
 
+from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
 from lyra_petsc.terms.midedge_shape import edges_of, row, tangent_of
@@ -123,22 +125,16 @@ def add_gradient(  # type: ignore[no-untyped-def]
         flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
 
 
-@kernel(inline="always")
-def _outer(h, a, b, factor, left, right):  # type: ignore[no-untyped-def]
-    """Add factor left rightᵀ to the block (a, b) of h (12, 12)."""
-    for i in range(3):
-        for j in range(3):
-            h[3 * a + i, 3 * b + j] += factor * left[i] * right[j]
-
-
 @kernel()
-def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, h):  # type: ignore[no-untyped-def]
-    """The Hessian of triangle e into the upper blocks of h (12, 12); g (3, 12) becomes the ∇α_i."""
-    h[:] = 0.0
+def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):  # type: ignore[no-untyped-def]
+    """The Hessian of triangle e into h (12, 12), but for what is below the diagonal blocks; whether it is not 0.
+
+    g (3, 12) becomes the ∇α_i; beyond the vertices' part it must be 0 off the diagonal. w (3, 9) is scratch.
+    """
     x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
     e0, e1, e2, normal, square = edges_of(x0, x1, x2)
     if square <= GONE * limit[e]:
-        return
+        return False
     side = (e0, e1, e2)
     inverse = 1.0 / math.sqrt(square)  # 1 / 2A
     n = scaled(inverse, normal)
@@ -146,64 +142,81 @@ def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, leng
     t1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
     t2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
     f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
-    moment = _moments(stiffness, e, f0, f1, f2)
-    tangent = (t0, t1, t2)
-    steep = (1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2)
-    energy = 0.5 * (f0 * moment[0] + f1 * moment[1] + f2 * moment[2])
+    m0, m1, m2 = _moments(stiffness, e, f0, f1, f2)
+    a0, a1, a2 = 1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2
     exact = 1.0 - blend
     # ∇α_i
-    g[:] = 0.0
     for i in range(3):
-        size = math.sqrt(dot(side[i], side[i]))
+        turn = -inverse / math.sqrt(dot(side[i], side[i]))
+        for c in range(3):
+            factor = turn * dot(side[i], side[c])
+            for k in range(3):
+                g[i, 3 * c + k] = factor * n[k]
         spin = row(shape, edges[e, i], 3)
         tail, head = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            turn = -dot(side[i], side[c]) / size * inverse
-            for k in range(3):
-                g[i, 3 * c + k] = turn * n[k]
         for k in range(3):
             g[i, 3 * head + k] += spin[k]
             g[i, 3 * tail + k] -= spin[k]
         g[i, 9 + i] = sign[e, i] / length[e, i]
     # ∇f K ∇fᵀ, and what tan adds as it bends
-    number = 0
-    for i in range(3):
-        for j in range(i, 3):
-            factor = steep[i] * stiffness[e, number] * steep[j]
-            number += 1
-            if i == j:
-                factor += exact * 2.0 * tangent[i] * steep[i] * moment[i]
-            for a in range(12):
-                left, right = factor * g[i, a], factor * g[j, a]
-                for b in range(a, 12):
-                    h[a, b] += left * g[j, b]
-                    if i != j:
-                        h[a, b] += right * g[i, b]
+    k00 = a0 * (a0 * stiffness[e, 0] + exact * 2.0 * t0 * m0)
+    k11 = a1 * (a1 * stiffness[e, 3] + exact * 2.0 * t1 * m1)
+    k22 = a2 * (a2 * stiffness[e, 5] + exact * 2.0 * t2 * m2)
+    k01, k02, k12 = a0 * a1 * stiffness[e, 1], a0 * a2 * stiffness[e, 2], a1 * a2 * stiffness[e, 4]
+    for b in range(9):
+        g0, g1, g2 = g[0, b], g[1, b], g[2, b]
+        w[0, b] = k00 * g0 + k01 * g1 + k02 * g2
+        w[1, b] = k01 * g0 + k11 * g1 + k12 * g2
+        w[2, b] = k02 * g0 + k12 * g1 + k22 * g2
+    q0, q1, q2 = g[0, 9], g[1, 10], g[2, 11]
+    for a in range(9):
+        g0, g1, g2 = g[0, a], g[1, a], g[2, a]
+        for b in range(9):
+            h[a, b] = g0 * w[0, b] + g1 * w[1, b] + g2 * w[2, b]
+        h[a, 9], h[a, 10], h[a, 11] = q0 * w[0, a], q1 * w[1, a], q2 * w[2, a]
+    h[9, 9], h[9, 10], h[9, 11] = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02
+    h[10, 10], h[10, 11], h[11, 11] = q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
     if exact > 0.0:
-        for i in range(3):
-            p = exact * moment[i] * steep[i]
-            size = math.sqrt(dot(side[i], side[i]))
-            tail, head = (i + 1) % 3, (i + 2) % 3
-            spin, about = row(shape, edges[e, i], 3), row(shape, edges[e, i], 6)
-            across = scaled(-0.5 / size**3, cross(side[i], n))
-            for c in range(3):
-                turn_c = -dot(side[i], side[c]) / size * inverse
-                for d in range(c, 3):
-                    turn_d = -dot(side[i], side[d]) / size * inverse
-                    _outer(h, c, d, -p * turn_d * inverse, n, cross(n, side[c]))
-                    _outer(h, c, d, -p * turn_c * inverse, cross(n, side[d]), n)
-                    if c != i and d != i:
-                        ends = p if c == d else -p
-                        _outer(h, c, d, ends, n, across)
-                        _outer(h, c, d, ends, across, n)
-                        _outer(h, c, d, -0.5 * ends * sign[e, i], spin, about)
-                        _outer(h, c, d, -0.5 * ends * sign[e, i], about, spin)
+        pulls = exact * m0 * a0, exact * m1 * a1, exact * m2 * a2
+        _add_turns(e, edges, sign, shape, side, n, inverse, pulls, h)
     if square < limit[e]:
-        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, moment, steep, g, h)
+        energy = 0.5 * (f0 * m0 + f1 * m1 + f2 * m2)
+        pulls = m0 * a0, m1 * a1, m2 * a2
+        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, pulls, g, h)
+    return True
 
 
 @kernel()
-def _fade_hessian(corners, normal, square, limit, energy, exact, moment, steep, g, h):  # type: ignore[no-untyped-def]
+def _add_turns(e, edges, sign, shape, side, n, inverse, pulls, h):  # type: ignore[no-untyped-def]
+    """Add Σ_i pulls_i ∂²α_i of triangle e to h (12, 12)."""
+    slope = np.zeros(3)
+    ends = np.empty((3, 3, 3))
+    for i in range(3):
+        square = dot(side[i], side[i])
+        turn = -pulls[i] * inverse / math.sqrt(square)
+        for c in range(3):
+            slope[c] += turn * dot(side[i], side[c])
+        across = scaled(-0.5 * pulls[i] / (square * math.sqrt(square)), cross(side[i], n))
+        spin, about = row(shape, edges[e, i], 3), row(shape, edges[e, i], 6)
+        spin = scaled(-0.5 * pulls[i] * sign[e, i], spin)
+        for k in range(3):
+            for m in range(3):
+                ends[i, k, m] = n[k] * across[m] + across[k] * n[m] + spin[k] * about[m] + about[k] * spin[m]
+    for c in range(3):
+        one = scaled(inverse, cross(n, side[c]))
+        for d in range(c, 3):
+            other = scaled(inverse, cross(n, side[d]))
+            for k in range(3):
+                for m in range(3):
+                    if c == d:
+                        more = ends[(c + 1) % 3, k, m] + ends[(c + 2) % 3, k, m]
+                    else:
+                        more = -ends[3 - c - d, k, m]
+                    h[3 * c + k, 3 * d + m] += more - slope[d] * n[k] * one[m] - slope[c] * other[k] * n[m]
+
+
+@kernel()
+def _fade_hessian(corners, normal, square, limit, energy, exact, pulls, g, h):  # type: ignore[no-untyped-def]
     """Turn the Hessian of f in h (12, 12) into that of f w; of the rest, the regularised one has nothing."""
     weight, first, second = fade(square, limit)
     h *= weight
@@ -215,7 +228,7 @@ def _fade_hessian(corners, normal, square, limit, energy, exact, moment, steep, 
             slopes[3 * c + i] = 2.0 * turned[i]
     for i in range(3):
         for a in range(12):
-            force[a] += moment[i] * steep[i] * g[i, a]
+            force[a] += pulls[i] * g[i, a]
     add_square_hessian(corners, normal, (0, 1, 2), first, bent)
     for a in range(12):
         for b in range(a, 12):
@@ -230,10 +243,61 @@ def hessians(  # type: ignore[no-untyped-def]
     x, stencil, lo, hi, blend, edges, sign, shape, stiffness, rest, limit, length, out
 ):
     """Hessians [N/m] of triangles lo..hi into out (hi − lo, 12, 12)."""
-    g = np.empty((3, 12))
+    g, w = np.zeros((3, 12)), np.empty((3, 9))
     for e in range(lo, hi):
         h = out[e - lo]
-        _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, h)
+        if not _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):
+            h[:] = 0.0
         for a in range(12):
             for b in range(a):
                 h[a, b] = h[b, a]
+
+
+@kernel()
+def add_hessian(  # type: ignore[no-untyped-def]
+    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, length, places, weight, offsets, values
+):
+    """Add weight (E,) times the Hessians to block rows, as ``scatter.add_mixed_elements`` does.
+
+    Without its loops over any number of vertices and edges, and its array of Hessians.
+    """
+    g, w, h = np.zeros((3, 12)), np.empty((3, 9)), np.empty((12, 12))
+    for e in range(stencil.shape[0]):
+        fetch_ahead(e, offsets, values, 21)
+        if not _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):
+            continue
+        factor, pair = weight[e], 0
+        for a in range(3):
+            for b in range(a, 3):
+                at = offsets[e, pair]
+                pair += 1
+                if at >= 0:
+                    k = Index(at >> 1)
+                    for i in range(3):
+                        for j in range(3):
+                            first, second = (j, i) if at & 1 else (i, j)
+                            values[k, i, j] += factor * h[3 * a + first, 3 * b + second]
+            for b in range(3):
+                at = offsets[e, pair]
+                pair += 1
+                if at >= 0:
+                    k, place = Index(at >> 1), Index(places[e, b] % 3)
+                    for i in range(3):
+                        if at & 1:
+                            values[k, place, i] += factor * h[3 * a + i, 9 + b]
+                        else:
+                            values[k, i, place] += factor * h[3 * a + i, 9 + b]
+        for a in range(3):
+            row_a, one = places[e, a] // 3, Index(places[e, a] % 3)
+            for b in range(a, 3):
+                at = offsets[e, pair]
+                pair += 1
+                if at >= 0:
+                    k, other = Index(at >> 1), Index(places[e, b] % 3)
+                    value = factor * h[9 + a, 9 + b]
+                    if at & 1:
+                        values[k, other, one] += value
+                    else:
+                        values[k, one, other] += value
+                        if a != b and row_a == places[e, b] // 3:
+                            values[k, other, one] += value
