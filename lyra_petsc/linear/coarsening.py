@@ -107,28 +107,38 @@ def _around(n: int, triangles: Ints) -> tuple[Ints, Ints]:
 
 
 def _fewest(start: Ints, neighbours: Ints, border: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Which vertices (N,) stay, begun from corners and borders, or where that leaves many from elsewhere.
+    """Which vertices (N,) stay: as on a regular grid, or where that leaves many in another order.
 
-    From a corner that no diagonal meets half of a grid of alternating diagonals would stay.
+    From a corner that no diagonal meets half of a grid of alternating diagonals would stay. On irregular
+    meshes fewest stay where those come first that most others can go beside.
     """
-    seeds = (np.argsort(-key, kind="stable") for key in (border, np.diff(start)))
-    regular, sparse = (_independent(start, neighbours, border, order) for order in seeds)
+    corners, degrees = (np.argsort(-key, kind="stable") for key in (border, np.diff(start)))
+    orders = (corners, False), (degrees, False), (corners, True)
+    regular, *others = (_independent(start, neighbours, border, *order) for order in orders)
+    sparse = min(others, key=np.count_nonzero)
     chosen: NDArray[np.bool_] = sparse if sparse.sum() < FEWER * regular.sum() else regular
     return chosen
 
 
 @cached()
-def _spread(start, neighbours, seed, only, border, state, layer, ordered):  # type: ignore[no-untyped-def]
+def _spread(start, neighbours, seed, only, border, greedy, state, layer, ordered, most):  # type: ignore[no-untyped-def]
     """Decide the vertices reachable from seed, nearest first; those with border ≥ only.
 
     Of equally near ones those with most neighbours come first: on a grid of alternating diagonals they are
     every fourth vertex and have two kinds of neighbours, while those with four are half of the vertices.
+    If ``greedy``, only those neighbours count that are not decided yet.
     """
     layer[0] = seed
     n = 1
     state[seed] |= 4
     while n > 0:
-        _by_degree(start, layer[:n], ordered)
+        for i in range(n):
+            v = layer[i]
+            most[v] = start[v + 1] - start[v]
+            if greedy:
+                for k in range(start[v], start[v + 1]):
+                    most[v] -= state[neighbours[k]] & 3 > 0
+        _by_size(layer[:n], most, ordered)
         m = 0
         for i in range(n):
             v = ordered[i]
@@ -149,37 +159,37 @@ def _spread(start, neighbours, seed, only, border, state, layer, ordered):  # ty
 
 
 @cached()
-def _by_degree(start, vertices, ordered):  # type: ignore[no-untyped-def]
-    """Put the vertices into ``ordered``, those with most neighbours first, others as they stand."""
+def _by_size(vertices, size, ordered):  # type: ignore[no-untyped-def]
+    """Put the vertices into ``ordered``, those of the largest size (N,) first, others as they stand."""
     most = 0
     for v in vertices:
-        most = max(most, start[v + 1] - start[v])
+        most = max(most, size[v])
     at = np.zeros(most + 2, np.int64)
     for v in vertices:
-        at[most - (start[v + 1] - start[v]) + 1] += 1
+        at[most - size[v] + 1] += 1
     for i in range(most + 1):
         at[i + 1] += at[i]
     for v in vertices:
-        i = most - (start[v + 1] - start[v])
+        i = most - size[v]
         ordered[at[i]] = v
         at[i] += 1
 
 
 @cached()
-def _independent(start, neighbours, border, seeds):  # type: ignore[no-untyped-def]
+def _independent(start, neighbours, border, seeds, greedy):  # type: ignore[no-untyped-def]
     """Which vertices stay: no two neighbours, and all others beside one. Corners first, then borders.
 
-    ``seeds`` (N,) is the order in which vertices are begun with.
+    ``seeds`` (N,) is the order in which vertices are begun with; ``greedy`` as for `_spread`.
     """
     n = len(border)
     state = np.zeros(n, np.uint8)  # 1 stays, 2 goes, 4 was looked at
-    layer, ordered = np.empty(n, np.int64), np.empty(n, np.int64)
+    layer, ordered, most = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     for only in (2, 1, 0):
         for v in range(n):
             state[v] &= 3
         for v in seeds:
             if border[v] >= only and state[v] & 4 == 0:
-                _spread(start, neighbours, v, only, border, state, layer, ordered)
+                _spread(start, neighbours, v, only, border, greedy, state, layer, ordered, most)
     return (state & 1) > 0
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from lyra_petsc.linear.coarsening import Coarse, coarsen
+from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.grids import grid_sheet
 from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
-from lyra_petsc.scene.schema import Grid
+from lyra_petsc.scene.schema import Grid, MeshSource
 
 
 def grid(n: int, jitter: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -57,6 +60,25 @@ def test_coarse_meshes_of_every_pattern_are_as_small(pattern: Any, cells: int, n
 def test_irregular_meshes_are_interpolated_from_as_few() -> None:
     for stay, parents in levels(*grid(61, 0.3), 3):
         assert stay < 0.32
+        assert parents < 4.3
+
+
+SQUARE = """
+Point(1) = {0, 0, 0, h}; Point(2) = {1, 0, 0, h}; Point(3) = {1, 1, 0, h}; Point(4) = {0, 1, 0, h};
+Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+"""
+
+
+def test_meshes_of_gmsh_have_coarse_ones_as_small(tmp_path: Path) -> None:
+    """Patches of a regular mesh, which do not fit together."""
+    script = tmp_path / "square.geo"
+    script.write_text(f"h = {math.sqrt(2 / math.sqrt(3) / 6000)};{SQUARE}", encoding="ascii")
+    mesh = build_mesh([MeshSource(file=script)])
+    position = locality_order(vertex_graph([mesh.triangles], mesh.n_vertices))
+    x, triangles = mesh.positions[np.argsort(position)], position[mesh.triangles]
+    for stay, parents in levels(x, triangles, 3):
+        assert stay < 0.27
         assert parents < 4.3
 
 
