@@ -17,7 +17,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import Any
 
@@ -295,6 +295,12 @@ class StageEquations:
         return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
+
+    def carry_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
+        """Let the frames of directors follow to the present shape, from those in use or ``frozen``."""
+        for term in self.elastic:
+            if term.registration.edge_state:
+                term.accept(self.x, (frozen or self.frozen)[term])
 
     @property
     def edges_lag(self) -> bool:
