@@ -789,7 +789,8 @@ class Output(Block):
     checkpoint : CheckpointInterval
         How often a checkpoint is written at least.
     reactions : bool
-        Write the forces at the handles to reactions.csv.
+        Write the forces [N] at the handles to reactions.csv, and under ``midedge`` the moments [N·m] about
+        the mean position of those with ``clamp`` or ``symmetry``.
     vtkhdf : bool
         Announce the states also in states.vtkhdf, which newer ParaView reads faster than the XDMF.
     """

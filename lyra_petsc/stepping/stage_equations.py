@@ -264,6 +264,11 @@ class StageEquations:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
         return self._vs[: self.points.n_owned]
 
+    @property
+    def stage_positions(self) -> Array:
+        """Positions (n_local, 3) [m] of the stage of the step just accepted."""
+        return self._xs
+
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
         self.prescribed.put(v, self.prescribed.velocity)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.terms.midedge import MidEdge, edge_numbers, normals_of
-from lyra_petsc.terms.midedge_shape import carried, unit
+from lyra_petsc.terms.midedge_shape import Frames, carried, unit
 from lyra_petsc.terms.motion import Motion, Window
 from lyra_petsc.terms.rest import RestShape
 
@@ -116,7 +116,7 @@ class ClampedEdges:
         edges, (t0, a0) = self._term.of_edges, self._term.frames
         tangent = unit(plane.edge)
         director = unit(np.cross(plane.edge, plane.inward))
-        across = carried(type(self._term.frames)(t0[each.edges], a0[each.edges]), tangent)
+        across = carried(Frames(t0[each.edges], a0[each.edges]), tangent)
         sine = np.sum(np.cross(tangent, across) * director, axis=1)
         angle = np.arctan2(sine, np.sum(across * director, axis=1))
         length = edges.length[each.edges]
@@ -139,6 +139,26 @@ class ClampedEdges:
         cosine = 1.0 + np.sum(t0 * tangent, axis=1)
         frame = -np.sum(np.cross(t0, tangent) * de, axis=1) / (cosine * size)
         out[each.places] = self._term.of_edges.length[each.edges] * (spin - frame)
+
+    def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
+        """Moment (3,) [N·m] of a handle on its edges of this rank beside that of the forces at their ends.
+
+        ``reaction`` (n,) [N] is the force on all owned unknowns at positions x (n_local, 3) [m]. The work of
+        that on φ in a rotation, in which φ turns by ω · t − γ · (ω × e), is that of this moment.
+        """
+        each = self._handles.get(number)
+        if each is None:
+            return np.zeros(3)
+        tail, head = self._term.of_edges.ends[each.edges].T
+        tangent, start = unit(x[head] - x[tail]), frames.tangent[each.edges]
+        about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
+        total: Array = (reaction[each.places] * self._term.of_edges.length[each.edges]) @ about
+        return total
+
+    @property
+    def term(self) -> MidEdge:
+        """Whose edges they are."""
+        return self._term
 
     def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
         rows, start = each.stencil, each.window.start
