@@ -13,9 +13,10 @@ from examples import BENDING, curved_sheet
 from mpi4py import MPI
 from numpy.typing import NDArray
 from oracle import directors_along_normals, gradient
-from physics import CLOTH, Simulation, gathered, grid, obj_file, rotation, scene_of
+from physics import CLOTH, Simulation, gathered, grid, obj_file, reference, rotation, scene_of
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
 from lyra_petsc.stepping.simulation import StepReport
@@ -556,3 +557,44 @@ def test_the_moment_of_a_clamp_that_turns(comm: MPI.Comm, shared_tmp: Path) -> N
     acceleration = 4.0 * np.pi * (6.0 - 12.0 * 0.1) / 4.0
     inertia = 0.6 * 0.2 * 0.6**2 / 3.0
     assert found["handle0_my"] == pytest.approx(inertia * acceleration, rel=0.05)
+
+
+# -- strips --------------------------------------------------------------------------------------------
+
+
+def jittered(n: int, m: int) -> tuple[Array, NDArray[np.int64]]:
+    """A strip of length 1 in n × m square cells, its vertices moved within it by up to 0.2 of a cell."""
+    vertices, triangles = rectangle(n, m, 1.0, m / n, alternating=False)
+    vertices = vertices[:, :2].copy()
+    random = np.random.default_rng(1)
+    for axis, end in enumerate((1.0, m / n)):
+        free = (vertices[:, 0] > 1e-9) & (vertices[:, 0] < 1.0 - 1e-9)
+        free &= (vertices[:, axis] > 1e-9) & (vertices[:, axis] < end - 1e-9)
+        vertices[free, axis] += random.uniform(-0.2, 0.2, free.sum()) / n
+    return np.column_stack([vertices, np.zeros(len(vertices))]), triangles
+
+
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "jittered"])
+@pytest.mark.parametrize("weight", [0.0, 10.0])
+def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path: Path) -> None:
+    """Under a tip load 4 B/L² (Bisshopp & Drucker 1945), or their weight 10 B/L³, with B as it stands."""
+    n, m = 50, 2
+    mesh = grid(1.0, m / n, n, m, pattern)
+    if pattern == "jittered":
+        mesh = obj_file(tmp_path / "strip.obj", *jittered(n, m))
+    tip = {"box": [[1.0, -1.0, -1.0], [2.0, 1.0, 1.0]], "force": [0.0, 0.0, -4.0 * m / n]}
+    scene = {
+        "mesh": mesh,
+        "material": STIFF | {"bending": {"d11": 1.0, "d22": 1.0, "d33": 0.5}},
+        "handles": [{"box": [[-1, -1, -1], [0, 1, 1]], "clamp": True}],
+        "gravity": [0, 0, -weight],
+        "loads": [] if weight else [tip],
+        "time": {"analysis": "static"},
+        "solver": {"force_tolerance": 1e-7},
+    }
+    x, _ = outcome(MPI.COMM_SELF, scene)
+    end = x.reshape(m + 1, n + 1, 3)[:, -1].mean(axis=0)
+    rows = reference("cantilevers")["own_weight" if weight else "tip_load"]["rows"]
+    row = next(row for row in rows if row[0] == (weight or 4.0))
+    drop, reach = (row[1], row[2]) if weight else (row[3], 1.0 - row[2])
+    np.testing.assert_allclose([-end[2], end[0]], [drop, reach], rtol=0.0, atol=2e-4)
