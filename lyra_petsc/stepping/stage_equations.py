@@ -446,7 +446,7 @@ class StageEquations:
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
         parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
-        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
+        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

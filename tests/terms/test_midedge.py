@@ -598,3 +598,33 @@ def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path:
     row = next(row for row in rows if row[0] == (weight or 4.0))
     drop, reach = (row[1], row[2]) if weight else (row[3], 1.0 - row[2])
     np.testing.assert_allclose([-end[2], end[0]], [drop, reach], rtol=0.0, atol=2e-4)
+
+
+# -- extremes ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scheme", ["beuler", "semi-implicit", "alpha2"])
+@pytest.mark.parametrize("kind", ["spin", "noise", "pressed"])
+def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
+    """Edges that turn by 230° in a nominal step, a crumpled start, two edges brought together."""
+    scene: dict[str, Any] = {
+        "mesh": grid(0.4, 0.4, 6, 6, "alternating"),
+        "material": CLOTH | {"bending": 2e-4, "bending_model": "midedge"},
+        "gravity": [0, 0, -9.81],
+        "handles": [],
+        "initial": {"noise": 0.03, "seed": 2},
+        "time": {"end": 0.1, "step": 0.01, "integrator": scheme},
+        "solver": {},
+    }
+    if kind == "spin":
+        scene |= {"initial": {"angular_velocity": [3.0, 5.0, 400.0]}, "gravity": [0, 0, 0]}
+        scene["material"] |= {"membrane": {"c11": 1e5, "c22": 1e5, "c12": 0.0, "c33": 5e4}}
+    elif kind == "pressed":
+        there = [{"time": 0.0}, {"time": 0.1, "translate": [-0.38, 0.0, 0.0]}]
+        moved = {"group": "right", "motion": "press", "interpolation": "linear"}
+        scene |= {"handles": [{"group": "left"}, moved], "motions": {"press": there}}
+        scene["initial"] = {"noise": 1e-3, "seed": 1}
+    x, energies = outcome(MPI.COMM_SELF, scene)
+    assert np.isfinite(x).all()
+    assert np.isfinite(energies).all()
+    assert np.linalg.norm(np.ptp(x, axis=0)) > 0.1
