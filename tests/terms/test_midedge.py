@@ -603,8 +603,14 @@ def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path:
 # -- extremes ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scheme", ["beuler", "semi-implicit", "alpha2"])
-@pytest.mark.parametrize("kind", ["spin", "noise", "pressed"])
+SCHEMES = ["beuler", "semi-implicit", "alpha2"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scheme"),
+    [(kind, scheme) for kind in ("spin", "noise") for scheme in SCHEMES]
+    + [("pressed", scheme) for scheme in ("beuler", "alpha2")],  # one linear solve a step is not enough
+)
 def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
     """Edges that turn by 230° in a nominal step, a crumpled start, two edges brought together."""
     scene: dict[str, Any] = {
