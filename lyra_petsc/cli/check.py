@@ -44,7 +44,14 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     problem = simulation.problem
     points, pattern = problem.points, problem.pattern
     mine = np.array(
-        [points.n_owned, points.n_local - points.n_owned, pattern.n_couplings, _elements(simulation)]
+        [
+            points.n_owned,
+            points.n_local - points.n_owned,
+            pattern.n_couplings,
+            _elements(simulation),
+            points.n_vertices,
+            points.n_edges,
+        ]
     )
     every = comm.gather(mine, root=0)
     if every is not None:
@@ -93,7 +100,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
         (
             "nonzeros",
-            f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / outline.n_vertices:.1f} blocks a row",
+            f"{9 * blocks} in {blocks} blocks of 3 x 3, {blocks / ranks[:, 0].sum():.1f} blocks a row",
         ),
         ("memory", f"about {_megabytes(ranks):.0f} MB on the fullest rank, beside Python and PETSc"),
         ("integrator", time.scheme),
@@ -105,7 +112,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
         plan.add_row(name, value)
     console.print(plan)
     console.print(_rank_table(ranks))
-    owned = ranks[:, 0]
+    owned = ranks[:, 4]
     console.print(f"load imbalance {owned.max() / owned.mean():.3f} (most owned vertices over mean)")
     for note in simulation.notes:
         console.print(f"note: {note}")
@@ -124,16 +131,18 @@ def _count(ratio: float) -> float:
 
 
 def _rank_table(ranks: Counts) -> Table:
-    table = Table(
-        "rank", "owned vertices", "ghosts", "ghost share", "blocks", "elements", box=None, header_style=""
-    )
+    """What each rank has; ghosts are rows of vertices, and of edges three to a row."""
+    edges = ["owned edges"] if ranks[:, 5].any() else []
+    heads = ["rank", "owned vertices", *edges, "ghosts", "ghost share", "blocks", "elements"]
+    table = Table(*heads, box=None, header_style="")
     shown = list(enumerate(ranks))
     if len(shown) > LISTED_RANKS:
-        order = np.argsort(ranks[:, 0])
+        order = np.argsort(ranks[:, 4])
         shown = [(int(rank), ranks[rank]) for rank in (*order[:2], *order[-2:])]
-    for rank, (owned, ghosts, blocks, elements) in shown:
-        share = ghosts / max(owned + ghosts, 1)
-        table.add_row(str(rank), str(owned), str(ghosts), f"{share:.1%}", str(blocks), str(elements))
+    for rank, (owned, ghosts, blocks, elements, n_vertices, n_edges) in shown:
+        counts = [n_vertices, n_edges] if edges else [n_vertices]
+        share = f"{ghosts / max(owned + ghosts, 1):.1%}"
+        table.add_row(*map(str, (rank, *counts, ghosts, share, blocks, elements)))
     return table
 
 

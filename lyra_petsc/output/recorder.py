@@ -194,13 +194,15 @@ class Recorder:
 
     def _tables(self) -> dict[str, tuple[str, ...]]:
         """Names and columns of the tables that the scene asks for."""
-        scene = self._simulation.scene
+        scene, system = self._simulation.scene, self._simulation.problem.system
         more = tuple(self._simulation.ledger.column_names)
         tables: dict[str, tuple[str, ...]] = {"history.csv": (*HISTORY_COLUMNS, *more)}
         if scene.probes:
             tables["probes.csv"] = vector_columns(list(scene.probes))
         if scene.output.reactions and scene.handles:
-            tables["reactions.csv"] = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
+            moments = [f"handle{n}_m{axis}" for n in system.held.with_slopes for axis in "xyz"]
+            forces = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
+            tables["reactions.csv"] = (*forces, *moments)
         return tables
 
     def _open(self, folder: Path, resume_after: int | None) -> None:
@@ -272,7 +274,9 @@ class Recorder:
         if self._reactions is not None:
             pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
             forces = {f"handle{n}": force for n, force in enumerate(pulls)}
-            rows.append((self._reactions, self._vectors(report, forces)))
+            moments = self._simulation.ledger.handle_moments().items()
+            turning = {f"handle{n}_m{axis}": float(m[i]) for n, m in moments for i, axis in enumerate("xyz")}
+            rows.append((self._reactions, self._vectors(report, forces) | turning))
 
         def work() -> bool:
             for table, row in rows:

@@ -464,6 +464,9 @@ class Handle(Selector):
         Directions that are held.
     clamp : bool
         Keep the slope of held boundary edges; needs all axes.
+    symmetry : "x", "y" or "z", or None
+        The vertices lie in a plane normal to this axis, in which the sheet is mirrored: they stay in it, and
+        the sheet stays normal to it. Takes the place of ``axes``; bends by ``midedge`` only.
     motion : str or None
         Name in ``motions``; without: held in place.
     interpolation : str
@@ -483,10 +486,29 @@ class Handle(Selector):
             "keeps the slope of an edge that does not move by itself; hold all axes, or leave clamp out",
             "clamp",
         ),
+        Rule(
+            when(
+                given("symmetry"),
+                {
+                    "properties": {
+                        "axes": _ALL_AXES,
+                        "clamp": {"const": False},
+                        "from": {"maximum": 0},
+                        "fade": {"maximum": 0},
+                        "motion": {"type": "null"},
+                        "stiffness": {"type": "null"},
+                    }
+                },
+            ),
+            "is a plane that stands still and mirrors the sheet; leave out axes, clamp, motion, stiffness, "
+            "from and fade",
+            "symmetry",
+        ),
     )
 
     axes: Annotated[tuple[Direction, ...], JsonSchema(_AXES)] = AXES
     clamp: Flag = False
+    symmetry: Direction | None = None
     motion: Name | None = None
     interpolation: Literal["hermite", "linear"] = "hermite"
     start: Number = Field(default=0.0, alias="from")
@@ -496,8 +518,13 @@ class Handle(Selector):
 
     @property
     def axis_numbers(self) -> tuple[int, ...]:
-        """``axes`` as 0, 1, 2, ascending."""
-        return tuple(AXES.index(axis) for axis in self.axes)
+        """The directions that are held as 0, 1, 2, ascending."""
+        return tuple(AXES.index(axis) for axis in (self.symmetry or self.axes))
+
+    @property
+    def holds_slope(self) -> bool:
+        """Whether it holds the directors of its edges, where they have them."""
+        return self.clamp or self.symmetry is not None
 
     @field_validator("axes", mode="before")
     @classmethod
@@ -544,25 +571,28 @@ class Keyframe(Block):
 
 
 class AppliedLoad(VertexChoice):
-    """A force, a pressure or a traction.
+    """A force, a pressure, a traction or a moment.
 
     Attributes
     ----------
     group : str or None
         A group of the mesh, or a sheet's name; for pressure and traction a surface group, or nothing (every
-        triangle).
+        triangle); for a moment one of boundary edges.
     force : (3,) [N] or None
         Total, shared by the selected vertices.
     pressure : float [Pa] or None
         Along the current normal.
     traction : (3,) [N/m²] or None
         Per rest area, direction fixed in space.
+    moment : float [N·m/m] or None
+        Per rest length about the boundary edges of the group, which it follows; positive lifts their free
+        side towards the sheet's normal. Bends by ``midedge`` only.
     start, until : float [s]
         Acts for from ≤ t ≤ until (without: to the end).
     """
 
     rules = (
-        exactly_one("force", "pressure", "traction"),
+        exactly_one("force", "pressure", "traction", "moment"),
         Rule(
             when(given("force"), one_of("group", "nodes", "box")),
             "needs exactly one of group, nodes, box to act on",
@@ -573,11 +603,13 @@ class AppliedLoad(VertexChoice):
             for kind in ("pressure", "traction")
             for key in ("box", "nodes")
         ),
+        Rule(when(given("moment"), given("group")), "needs a group of boundary edges to act on", "moment"),
     )
 
     force: Vector | None = None
     pressure: Number | None = None
     traction: Vector | None = None
+    moment: Number | None = None
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
@@ -757,7 +789,8 @@ class Output(Block):
     checkpoint : CheckpointInterval
         How often a checkpoint is written at least.
     reactions : bool
-        Write the forces at the handles to reactions.csv.
+        Write the forces [N] at the handles to reactions.csv, and under ``midedge`` the moments [N·m] about
+        the mean position of those with ``clamp`` or ``symmetry``.
     vtkhdf : bool
         Announce the states also in states.vtkhdf, which newer ParaView reads faster than the XDMF.
     """

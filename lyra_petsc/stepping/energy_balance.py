@@ -219,3 +219,23 @@ class Ledger:
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)
         return list(total)
+
+    def handle_moments(self) -> dict[int, Array]:
+        """Moment [N·m] in the last step of each handle that holds slopes, about its mean; collective."""
+        system, reaction, x = self._system, self.reaction, self._system.stage_positions
+        edges, numbers = system.held.edges, system.held.with_slopes
+        if edges is None:
+            return {}
+        frames, active = system.frozen[edges.term], system.held.active(system.t0, system.t1)
+        local = np.zeros((len(numbers), 10))  # moment about the origin, force, positions, count
+        for row, number in zip(local, numbers, strict=True):
+            mine = system.held.vertices(number)
+            row[6:9], row[9] = x[mine].sum(axis=0), len(mine)
+            if number in active:
+                row[:3] = np.cross(x[mine], reaction[mine]).sum(axis=0)
+                row[:3] += edges.moment(number, reaction.ravel(), x, frames)
+                row[3:6] = reaction[mine].sum(axis=0)
+        total = np.empty_like(local)
+        system.points.comm.Allreduce(local, total)
+        moments = total[:, :3] - np.cross(total[:, 6:9] / total[:, 9:], total[:, 3:6])
+        return dict(zip(numbers, moments, strict=True))

@@ -117,7 +117,8 @@ class Equilibrium:
         attempt = Attempt(False, 0, 0, 0.0)
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
-            anchored = anchored if solves else system.moving_energy_before
+            if not solves:
+                anchored, frozen = system.moving_energy_before, system.frozen
             history.append(_row(force, attempt if solves else None))
             if arrived and force <= self._allowed():
                 system.moving_energy_before = anchored
@@ -138,6 +139,7 @@ class Equilibrium:
             linear += attempt.linear_iterations
             if attempt.converged:
                 arrived = True
+                system.carry_frames()  # edges may turn far until they are in equilibrium
                 self._integrator.pseudo = min(
                     self._integrator.pseudo * growth(attempt.newton_iterations), self._longest
                 )
@@ -149,6 +151,7 @@ class Equilibrium:
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
+        system.carry_frames(frozen)
         return dataclasses.replace(
             attempt,
             converged=False,
@@ -260,6 +263,9 @@ class Equilibrium:
         if first and norm > 0.0:
             n = system.points.n_vertices
             fastest = float(np.abs(force[:n] / system.mass[:n, None]).max(initial=0.0))
+            if system.points.n_edges_global:  # loads may act on edges alone, which have no mass
+                mass = system.points.summed(float(system.mass.sum()))[0] / system.points.n_vertices_global
+                fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
             self._integrator.pseudo = float(np.sqrt(self._spacing / fastest))
             self._longest = LONGEST * self._integrator.pseudo

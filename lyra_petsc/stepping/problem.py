@@ -27,13 +27,13 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators.registry import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.motion import Window, motion_of
-from lyra_petsc.terms.prescribed_handles import Held, disagreements, is_exact, select_held
+from lyra_petsc.terms.prescribed_handles import Held, Selection, disagreements, is_exact, select_held
 from lyra_petsc.terms.registry import Role, active, registered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Term
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+FLAT = 1e-6
+"""Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
 
 
 @dataclass
@@ -193,7 +196,8 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     held = select_held(scene, mesh)
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
-    if "midedge" in names and any(handle.clamp for handle in scene.handles):
+    _check_symmetry(rest, held)
+    if "midedge" in names and any(handle.holds_slope for handle in scene.handles):
         from lyra_petsc.terms import clamped_edges  # of use for nothing else
 
         clamps = clamped_edges.elements(rest)
@@ -222,6 +226,28 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges)
 
 
+def _check_symmetry(rest: RestShape, held: Selection) -> None:
+    """Refuse symmetry planes that are none, or on which hinges end."""
+    scene, mesh = rest.scene, rest.mesh
+    slack = FLAT * float(np.ptp(mesh.positions, axis=0).max())
+    for number, vertices in held.items():
+        axis = scene.handles[number].symmetry
+        if axis is None:
+            continue
+        along = mesh.positions[vertices][:, AXES.index(axis)]
+        off = np.abs(along - np.median(along))
+        problem = ""
+        if off.max() > slack:
+            problem = (
+                f"vertex {vertices[off.argmax()]} lies {off.max():.2g} m beside the plane {axis} = "
+                f"{np.median(along):.6g} m; choose only vertices in one plane, or hold axes instead"
+            )
+        elif (np.isin(mesh.triangles[rest.bends_by("hinge")], vertices).sum(axis=1) > 1).any():
+            problem = "is not kept by hinges; give the material bending_model: midedge, or hold axes instead"
+        if problem:
+            raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
+
+
 def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:
     layout = part.layout
     terms: dict[str, Term] = {}
@@ -229,6 +255,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         entry = registered(name)
         terms[name] = entry.module().make(part.elements.get(name), scene, part.vertex_data["mass"])
         terms[name].registration = entry
+    _let_moments_act(terms)
     integrator = integrator_of(scene.time.scheme, _spectral_radius(scene))
     roles = {Role.ELASTIC, Role.CONSTRAINT} | (set() if integrator.lagged_loads else {Role.VISCOUS})
     coupling = [term for term in terms.values() if term.registration.role in roles]
@@ -278,10 +305,22 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     )
 
 
+def _let_moments_act(terms: Mapping[str, Term]) -> None:
+    """Give the moments of loads the edges that they turn."""
+    if "moment" in terms:
+        from lyra_petsc.terms.midedge import MidEdge
+        from lyra_petsc.terms.moment import Moment
+
+        moment, bending = terms["moment"], terms["midedge"]
+        assert isinstance(moment, Moment)
+        assert isinstance(bending, MidEdge)
+        moment.act_on(bending)
+
+
 def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:
     """The edges that handles clamp, where they have unknowns."""
-    numbers = [n for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements]
-    if not numbers:
+    clamping = {n: handle for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements}
+    if not clamping:
         return None
     from lyra_petsc.terms.clamped_edges import ClampedEdges
     from lyra_petsc.terms.midedge import MidEdge
@@ -290,8 +329,8 @@ def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> Clamp
     assert isinstance(term, MidEdge)
     return ClampedEdges(
         term,
-        {n: part.elements[f"clamp {n}"] for n in numbers},
-        {n: (motion_of(scene, n), Window.of(scene.handles[n])) for n in numbers},
+        {n: part.elements[f"clamp {n}"] for n in clamping},
+        {n: (motion_of(scene, n), Window.of(h), h.symmetry is not None) for n, h in clamping.items()},
         layout.edge_places,
     )
 

@@ -17,7 +17,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import Any
 
@@ -264,6 +264,11 @@ class StageEquations:
         """Velocities (n_owned, 3) [m/s] of the stage of the step just accepted."""
         return self._vs[: self.points.n_owned]
 
+    @property
+    def stage_positions(self) -> Array:
+        """Positions (n_local, 3) [m] of the stage of the step just accepted."""
+        return self._xs
+
     def prescribe(self, v: Array) -> None:
         """Overwrite the prescribed unknowns of v (n_owned, 3) by their velocities at the stage."""
         self.prescribed.put(v, self.prescribed.velocity)
@@ -295,6 +300,12 @@ class StageEquations:
         return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
+
+    def carry_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
+        """Let the frames of directors follow to the present shape, from those in use or ``frozen``."""
+        for term in self.elastic:
+            if term.registration.edge_state:
+                term.accept(self.x, (frozen or self.frozen)[term])
 
     @property
     def edges_lag(self) -> bool:
@@ -435,7 +446,7 @@ class StageEquations:
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
         parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
-        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max()))
+        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

@@ -1,8 +1,10 @@
-"""Directors that handles with ``clamp`` hold: they turn as the plane does that the sheet had at the start.
+"""Directors that handles hold.
 
-That plane is the mean of those of the triangles on the edge, when the handle starts to act; it moves as the
-handle does. Where only springs hold the ends of an edge the director keeps its angle in the frame that
-follows the edge.
+With ``clamp`` they turn as the plane does that the sheet had at the start: the mean of those of the triangles
+on the edge, when the handle starts to act; it moves as the handle does. Where only springs hold the ends of
+an edge the director keeps its angle in the frame that follows the edge. With ``symmetry`` the director begins
+in the plane (``midedge.elements``). The smallest rotation from one edge in that plane to another keeps what
+is in it there, so that the director stays in it at an angle that never changes.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.terms.midedge import MidEdge, edge_numbers, normals_of
-from lyra_petsc.terms.midedge_shape import carried, unit
+from lyra_petsc.terms.midedge_shape import Frames, carried, unit
 from lyra_petsc.terms.motion import Motion, Window
 from lyra_petsc.terms.rest import RestShape
 
@@ -46,6 +48,8 @@ class _Handle:
         Their numbers among the term's.
     stencil : (n, 8)
         Local rows: ends, corners of one triangle, corners of the other or the same.
+    symmetric : bool
+        They lie in a symmetry plane, and keep their unknowns.
     """
 
     places: Ints
@@ -53,6 +57,7 @@ class _Handle:
     stencil: Ints
     motion: Motion
     window: Window
+    symmetric: bool
 
 
 class ClampedEdges:
@@ -63,7 +68,8 @@ class ClampedEdges:
     term : MidEdge
     elements : mapping of handle number → Elements
         As by ``elements``, after distribution.
-    handles : mapping of handle number → (Motion, Window)
+    handles : mapping of handle number → (Motion, Window, bool)
+        The last: whether it is a symmetry plane.
     owned : (n,) int64
         Places of all edges that this rank owns.
     """
@@ -72,7 +78,7 @@ class ClampedEdges:
         self,
         term: MidEdge,
         elements: Mapping[int, Elements],
-        handles: Mapping[int, tuple[Motion, Window]],
+        handles: Mapping[int, tuple[Motion, Window, bool]],
         owned: Ints,
     ) -> None:
         self._term = term
@@ -104,13 +110,13 @@ class ClampedEdges:
     def targets(self, number: int, at: float, reference: Callable[[float, Ints], Array], out: Array) -> None:
         """Write a handle's unknowns at time ``at`` [s] over the present ones in ``out`` (n,)."""
         each = self._handles.get(number)
-        if each is None:
+        if each is None or each.symmetric:
             return
         plane = self._plane(each, at, reference)
         edges, (t0, a0) = self._term.of_edges, self._term.frames
         tangent = unit(plane.edge)
         director = unit(np.cross(plane.edge, plane.inward))
-        across = carried(type(self._term.frames)(t0[each.edges], a0[each.edges]), tangent)
+        across = carried(Frames(t0[each.edges], a0[each.edges]), tangent)
         sine = np.sum(np.cross(tangent, across) * director, axis=1)
         angle = np.arctan2(sine, np.sum(across * director, axis=1))
         length = edges.length[each.edges]
@@ -120,7 +126,7 @@ class ClampedEdges:
     def rates(self, number: int, at: float, reference: Callable[[float, Ints], Array], out: Array) -> None:
         """Write the rates of a handle's unknowns at time ``at`` [s] into ``out`` (n,)."""
         each = self._handles.get(number)
-        if each is None:
+        if each is None or each.symmetric:
             return
         e, w, de, dw = self._plane(each, at, reference)
         size = np.linalg.norm(e, axis=1)
@@ -133,6 +139,26 @@ class ClampedEdges:
         cosine = 1.0 + np.sum(t0 * tangent, axis=1)
         frame = -np.sum(np.cross(t0, tangent) * de, axis=1) / (cosine * size)
         out[each.places] = self._term.of_edges.length[each.edges] * (spin - frame)
+
+    def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
+        """Moment (3,) [N·m] of a handle on its edges of this rank beside that of the forces at their ends.
+
+        ``reaction`` (n,) [N] is the force on all owned unknowns at positions x (n_local, 3) [m]. The work of
+        that on φ in a rotation, in which φ turns by ω · t − γ · (ω × e), is that of this moment.
+        """
+        each = self._handles.get(number)
+        if each is None:
+            return np.zeros(3)
+        tail, head = self._term.of_edges.ends[each.edges].T
+        tangent, start = unit(x[head] - x[tail]), frames.tangent[each.edges]
+        about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
+        total: Array = (reaction[each.places] * self._term.of_edges.length[each.edges]) @ about
+        return total
+
+    @property
+    def term(self) -> MidEdge:
+        """Whose edges they are."""
+        return self._term
 
     def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
         rows, start = each.stencil, each.window.start
@@ -150,7 +176,7 @@ class ClampedEdges:
 
 
 def elements(rest: RestShape) -> dict[int, Elements]:
-    """Of each handle with ``clamp`` the edges whose ends it holds, by its number (rank 0, whole mesh)."""
+    """Of each handle that holds slopes the edges whose ends it holds, by its number (rank 0, whole mesh)."""
     chosen = np.flatnonzero(rest.bends_by("midedge"))
     triangles = rest.mesh.triangles[chosen]
     number, _ = edge_numbers(rest, triangles)
@@ -160,7 +186,7 @@ def elements(rest: RestShape) -> dict[int, Elements]:
     one, two = (triangles[by_edge[first + k * (count - 1)] // 3] for k in (0, 1))
     ends, found = rest.edges[edges], {}
     for handle, each in enumerate(rest.scene.handles):
-        if each.clamp:
+        if each.holds_slope:
             held = select_vertices(rest.mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
             row = np.flatnonzero(np.isin(ends, held).all(axis=1))
             found[handle] = Elements(

@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.midedge_shape import (
@@ -282,12 +283,15 @@ def elements(rest: RestShape) -> Elements:
     at_rest = np.zeros_like(size)
     if surface.any():
         director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges)
+        _mirror(director, rest, triangles, number, mesh.rest)
         at_rest[surface] = _tangents_of(mesh.rest, triangles[surface], director[number[surface]])
         _check(at_rest, number, edges, rest, "rest shape")
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
-    director = mean_directors(mesh.positions, triangles, number, n_edges)[number]
+    director = mean_directors(mesh.positions, triangles, number, n_edges)
+    _mirror(director, rest, triangles, number, mesh.positions)
+    director = director[number]
     _check(_tangents_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
     ends: Array = mesh.positions[edges[number]]
     data = {
@@ -305,6 +309,32 @@ def elements(rest: RestShape) -> Elements:
         "damping": rest.per_triangle("damping")[chosen],
     }
     return Elements(triangles, data, edges=number)
+
+
+def _mirror(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:
+    """Turn directors (n_edges, 3) at positions x into the symmetry planes of handles in which edges lie.
+
+    Such a plane is given at the start; on the rest shape it lies to each triangle as it does there.
+    """
+    mesh = rest.mesh
+    for handle, each in enumerate(rest.scene.handles):
+        if each.symmetry is None:
+            continue
+        held = select_vertices(mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
+        ends = triangles[:, [[1, 2], [2, 0], [0, 1]]]
+        face, side = np.nonzero(np.isin(ends, held).all(axis=2))
+        edges, corners = number[face, side], ends[face, side]
+
+        def axes(at: Array, face: Ints = face, corners: Ints = corners) -> Array:
+            """Edge, direction in the triangle normal to it, and normal, (n, 3, 3)."""
+            normal, along = normals_of(at, triangles[face]), unit(at[corners[:, 1]] - at[corners[:, 0]])
+            return np.stack([along, np.cross(normal, along), normal], axis=1)
+
+        start, here = axes(mesh.positions), axes(x)
+        plane = np.einsum("eik,ei->ek", here, start[:, :, AXES.index(each.symmetry)])
+        inside = unit(np.cross(plane, here[:, 0]))
+        towards = np.sum(inside * director[edges], axis=1, keepdims=True)
+        director[edges] = np.where(towards < 0.0, -inside, inside)
 
 
 def _tangents_of(x: Array, triangles: Ints, director: Array) -> Array:

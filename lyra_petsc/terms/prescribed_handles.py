@@ -98,10 +98,14 @@ class Held:
         Owned vertices of each exact handle, local numbering.
     edges : ClampedEdges or None
         Whose unknowns are prescribed, too.
+
+    Attributes
+    ----------
+    edges : ClampedEdges or None
     """
 
     def __init__(self, scene: Scene, owned: Selection, edges: ClampedEdges | None = None) -> None:
-        self._vertices, self._edges = owned, edges
+        self._vertices, self.edges = owned, edges
         self._axes = {
             number: np.array(scene.handles[number].axis_numbers, dtype=np.int64) for number in owned
         }
@@ -123,8 +127,8 @@ class Held:
         for number in self.active(t0, t1):
             if number in self._places:
                 mask[self._places[number]] = True
-            if self._edges is not None:
-                mask.ravel()[self._edges.places(number)] = True
+            if self.edges is not None:
+                mask.ravel()[self.edges.places(number)] = True
         return mask
 
     def targets(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
@@ -133,8 +137,8 @@ class Held:
         The latter are the present ones, and say how often directors have turned.
         """
         for number in self.active(t0, t1):
-            if self._edges is not None:
-                self._edges.targets(number, at, reference, out.ravel())
+            if self.edges is not None:
+                self.edges.targets(number, at, reference, out.ravel())
             if number not in self._places:
                 continue
             start = self._windows[number].start
@@ -144,8 +148,8 @@ class Held:
     def velocities(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
         """Write the velocities [m/s] ẋ*(at) of the step from t0 to t1 into ``out`` (n_owned, 3)."""
         for number in self.active(t0, t1):
-            if self._edges is not None:
-                self._edges.rates(number, at, reference, out.ravel())
+            if self.edges is not None:
+                self.edges.rates(number, at, reference, out.ravel())
             if number not in self._places:
                 continue
             start = self._windows[number].start
@@ -155,13 +159,19 @@ class Held:
     @property
     def reference_rows(self) -> NDArray[np.int64]:
         """Local rows (n,) whose reference positions are asked for."""
-        edges = [self._edges.reference_rows] if self._edges is not None else []
+        edges = [self.edges.reference_rows] if self.edges is not None else []
         return np.concatenate([np.empty(0, dtype=np.int64), *self._vertices.values(), *edges])
 
     @property
     def numbers(self) -> list[int]:
         """Numbers of the exact handles in the scene."""
         return list(self._vertices)
+
+    @property
+    def with_slopes(self) -> list[int]:
+        """Numbers of those that hold directors of edges, too."""
+        windows = {} if self.edges is None else self.edges.windows
+        return [number for number in self._vertices if number in windows]
 
     def vertices(self, number: int) -> NDArray[np.int64]:
         """Owned vertices of a handle, local numbering."""

@@ -124,6 +124,9 @@ REGISTRY: list[Registration] = [
     Registration(
         "force", lambda scene, shells: any(load.force or load.traction for load in scene.loads), Role.LOAD
     ),
+    Registration(
+        "moment", lambda scene, shells: any(load.moment is not None for load in scene.loads), Role.LOAD
+    ),
 ]
 
 

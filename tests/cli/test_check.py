@@ -36,6 +36,20 @@ def test_plan(tmp_path: Path, ranks: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
 
 
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_edges_with_an_unknown_are_counted_apart(tmp_path: Path, ranks: int) -> None:
+    """320 of them, three to a row of the matrix."""
+    (tmp_path / "bends.yaml").write_text(MEMBRANE)
+    bends = ["--set", "material.bending=1e-3", "--set", "material.bending_model=midedge"]
+    result = lyra(["check", "bends.yaml", *bends], tmp_path, ranks=ranks)
+    assert result.code == 0, result.err
+    assert "683 (velocities)" in result.out
+    table = [
+        line.split() for line in result.out.splitlines() if line.split()[:1] and line.split()[0].isdigit()
+    ]
+    assert [sum(int(row[k]) for row in table) for k in (1, 2)] == [121, 320]
+
+
 SQUARE = """
 Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
 Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};

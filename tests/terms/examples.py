@@ -24,6 +24,10 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "wind": {"wind": {"velocity": [1.0, 2.0, -3.0], "density": 1.2, "drag": 0.4}},
     "pressure": {"loads": [{"pressure": 7.0}]},
     "force": {"loads": [{"nodes": [3, 4], "force": [1.0, 2.0, 3.0]}, {"traction": [0.0, 5.0, -1.0]}]},
+    "moment": {
+        "material": BENDING | {"bending_model": "midedge"},
+        "loads": [{"group": "sheet", "moment": 2.0}],
+    },
 }
 
 NX, NY = 3, 2
@@ -48,5 +52,8 @@ def curved_sheet(path: Path) -> dict[str, Any]:
 
 def example(name: str, folder: Path) -> Simulation:
     """The curved sheet with the term ``name`` active, on this process alone."""
-    content = {"mesh": curved_sheet(folder / "sheet.obj"), "material": BENDING} | FRAGMENTS[name]
+    content = {
+        "mesh": curved_sheet(folder / "sheet.obj") | {"name": "sheet"},
+        "material": BENDING,
+    } | FRAGMENTS[name]
     return Simulation(content, MPI.COMM_SELF)

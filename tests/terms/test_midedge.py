@@ -13,13 +13,16 @@ from examples import BENDING, curved_sheet
 from mpi4py import MPI
 from numpy.typing import NDArray
 from oracle import directors_along_normals, gradient
-from physics import CLOTH, Simulation, gathered, grid, obj_file, rotation, scene_of
+from physics import CLOTH, Simulation, gathered, grid, obj_file, reference, rotation, scene_of
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
 from lyra_petsc.stepping.simulation import StepReport
 from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.midedge_shape import unit
+from lyra_petsc.terms.moment import Moment
 
 Array = NDArray[np.float64]
 
@@ -333,3 +336,301 @@ def test_one_sheet_bends_by_one_model() -> None:
     simulation = Run(MPI.COMM_SELF, scene_of(sheets))
     assert {"bending", "midedge"} <= set(simulation.problem.terms)
     simulation.destroy()
+
+
+# -- symmetry planes -----------------------------------------------------------------------------------
+
+
+def mirrored(path: Path, planes: str, n: int = 3) -> tuple[dict[str, Any], Array]:
+    """A shallow vault over x, y in [0, 1], with its images in the planes x = 0 and y = 0; its vertices."""
+    side = np.linspace(0.0, 1.0, n + 1)
+    flat = np.array([(x, y) for y in side for x in side])
+    first = [j * (n + 1) + i for j in range(n) for i in range(n)]
+    faces = np.array([t for a in first for t in ((a, a + 1, a + n + 2), (a, a + n + 2, a + n + 1))])
+    for axis in range(2):
+        if "xy"[axis] in planes:
+            image = flat * np.where(np.arange(2) == axis, -1.0, 1.0)
+            faces = np.concatenate([faces, faces[:, ::-1] + len(flat)])
+            flat, same = np.unique(np.round(np.concatenate([flat, image]), 12), axis=0, return_inverse=True)
+            faces = same.ravel()[faces]
+    height = 0.4 * (1.0 - flat[:, 0] ** 2) + 0.2 * (1.0 - flat[:, 1] ** 2)
+    vertices = np.column_stack([flat, height])
+    return obj_file(path, vertices, faces), vertices
+
+
+def vault(mesh: dict[str, Any], handles: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
+    material = {"young": 1e8, "poisson": 0.3, "thickness": 0.02, "density": 200.0}
+    static = {"time": {"analysis": "static", "step": 0.5}, "gravity": [0, 0, -9.81]}
+    rim = {"box": [[0.999, -2, -1], [2, 2, 1]]}
+    return {"mesh": mesh, "material": material, "handles": [rim, *handles], "solver": TIGHT} | static | more
+
+
+def planes(axes: str) -> list[dict[str, Any]]:
+    boxes = {"x": [[0, -2, -1], [0, 2, 1]], "y": [[-2, 0, -1], [2, 0, 1]]}
+    return [{"box": boxes[axis], "symmetry": axis} for axis in axes]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("motion", [False, True])
+def test_a_part_with_symmetry_planes_moves_as_the_whole(
+    comm: MPI.Comm, shared_tmp: Path, motion: bool
+) -> None:
+    """A vault under its weight; the rest shape is curved across both planes."""
+    more: dict[str, Any] = {"time": {"end": 0.05, "step": 0.01, "integrator": "alpha2"}} if motion else {}
+    other = [{"box": [[-2, -2, -1], [-0.999, 2, 1]]}]
+    meshes = {name: (shared_tmp / f"part-{name}.obj", "xy".replace(name, "")) for name in ("xy", "x", "")}
+    made = {name: mirrored(path, images) for name, (path, images) in meshes.items()} if comm.rank == 0 else {}
+    made = comm.bcast(made)
+    results = {}
+    for name, (mesh, start) in made.items():
+        x, energies = outcome(comm, vault(mesh, planes(name) + ([] if "x" in name else other), **more))
+        part = np.flatnonzero((start[:, :2] >= 0.0).all(axis=1))
+        part = part[np.lexsort(start[part, :2].T)]
+        results[name] = x[part], energies * 2.0 ** len(name), np.abs(x - start).max()
+    whole = results[""]
+    assert whole[2] > 1e-5
+    for name in ("x", "xy"):
+        np.testing.assert_allclose(results[name][0], whole[0], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(results[name][1], whole[1], rtol=1e-5, atol=1e-9)
+
+
+def test_a_symmetry_plane_is_one(tmp_path: Path) -> None:
+    mesh, _ = mirrored(tmp_path / "vault.obj", "")
+    for handle, material, words in (
+        ({"box": [[-1, -1, -1], [0.5, 2, 1]], "symmetry": "x"}, {}, "beside the plane x = "),
+        (planes("x")[0], {"bending_model": "hinge"}, "is not kept by hinges"),
+    ):
+        content = vault(mesh, [handle])
+        content["material"] = content["material"] | material
+        with pytest.raises(InputError, match=words):
+            Run(MPI.COMM_SELF, scene_of(content))
+
+
+# -- moments -------------------------------------------------------------------------------------------
+
+
+def rolled(comm: MPI.Comm, n: int, pattern: str, **more: Any) -> tuple[Array, Array]:
+    """A strip of length 12 and stiffness 100 N·m whose end moment makes a circle of it: B2 of Sze et al."""
+    scene = {
+        "mesh": grid(12.0, 1.0, n, 2, pattern),
+        "material": {"young": 1.2e6, "poisson": 0.0, "thickness": 0.1, "density": 1.0},
+        "handles": [{"group": "left", "clamp": True}],
+        "loads": [{"group": "right", "moment": 2.0 * np.pi * 100.0 / 12.0}],
+        "gravity": [0, 0, 0],
+        "time": {"analysis": "static", "step": 1.0},
+        "solver": {"force_tolerance": 1e-8},
+    }
+    return outcome(comm, scene | more)
+
+
+ROLLED_UP = 0.5 * 100.0 * (2.0 * np.pi / 12.0) ** 2 * 12.0
+
+
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
+def test_an_end_moment_rolls_a_strip_into_a_circle(pattern: str) -> None:
+    """In one load step; κ = M / D, and the load's work is the energy where it grows with the turn."""
+    errors = []
+    for n in (24, 48):
+        x, energies = rolled(MPI.COMM_SELF, n, pattern)
+        start = np.isclose(np.linalg.norm(x[:, [0, 2]], axis=1), 0.0)
+        assert start.sum() >= 3
+        middle = np.argmax(x[:, 2])
+        errors.append([x[middle, 2] / (12.0 / np.pi) - 1.0, energies[2] / ROLLED_UP - 1.0])
+        assert abs(x[middle, 1] - 0.5) <= 0.5 + 1e-6
+        assert energies[4] == pytest.approx(energies[1] + energies[2], rel=0.02)
+    assert np.abs(errors[1]).max() < 0.01
+    assert np.abs(errors[1][1] / errors[0][1]) < 0.3
+
+
+@pytest.mark.parallel
+def test_moments_do_not_depend_on_ranks(comm: MPI.Comm) -> None:
+    x, energies = rolled(comm, 24, "alternating")
+    alone = rolled(MPI.COMM_SELF, 24, "alternating") if comm.rank == 0 else (x, energies)
+    np.testing.assert_allclose(x, alone[0], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(energies, alone[1], rtol=1e-6, atol=1e-6)
+
+
+def test_a_moment_works_through_the_turn_of_directors() -> None:
+    """Far from the shape of the frames, where these turn, too: against differences of directors."""
+    scene = {"mesh": grid(1.0, 1.0, 2, 3), "material": STIFF, "loads": [{"group": "top", "moment": 0.7}]}
+    with Simulation(scene, MPI.COMM_SELF) as simulation:
+        bending, load = midedge_of(simulation), simulation.problem.terms["moment"]
+        assert isinstance(load, Moment)
+        x = simulation.system.x.copy()
+        random = np.random.default_rng(3)
+        x += random.uniform(-0.2, 0.2, x.shape)
+        way = random.uniform(-1.0, 1.0, x.shape)
+        force = np.zeros_like(x)
+        load.add_force(x, 0.0, 0.0, force)
+
+        def shape(at: Array) -> Array:
+            return bending._computed(at, bending.frames)[:, :3]
+
+        step = 1e-6
+        rate = (shape(x + step * way) - shape(x - step * way)) / (2.0 * step)
+        tail, head = bending.of_edges.ends.T
+        tangent = unit(x[head] - x[tail])
+        turn = np.sum(rate * np.cross(tangent, shape(x)), axis=1)
+        rest = simulation.problem.surface.x
+        top = (rest[tail, 1] > 0.99) & (rest[head, 1] > 0.99)
+        assert top.sum() == 2
+        # counter-clockwise is against x here, and positive moments turn against that
+        along = np.sign(rest[head, 0] - rest[tail, 0])[top]
+        expected = 0.7 * np.sum(bending.of_edges.length[top] * along * turn[top])
+        assert np.sum(force * way) == pytest.approx(expected, rel=1e-7)
+
+
+def test_moments_need_an_edge_that_has_them() -> None:
+    flat = {"mesh": grid(1.0, 1.0, 2, 2), "material": STIFF}
+    load = {"group": "right", "moment": 1.0}
+    for change, words in (
+        ({"material": STIFF | {"bending": 1.0, "bending_model": "hinge"}}, "has no moments on edges"),
+        ({"loads": [load | {"group": "corner"}]}, "no group 'corner'"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Run(MPI.COMM_SELF, scene_of(flat | {"loads": [load]} | change))
+
+
+# -- reactions -----------------------------------------------------------------------------------------
+
+CANTILEVER = {
+    "mesh": grid(0.6, 0.2, 12, 4, "criss-cross"),
+    "material": STIFF,
+    "gravity": [0, 0, 0],
+    "time": {"analysis": "static", "step": 1.0},
+    "solver": TIGHT,
+    "output": {"reactions": True},
+}
+
+
+def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path) -> dict[str, float]:
+    """The last row of reactions.csv."""
+    simulation = Run(comm, scene_of(scene))
+    recorder = Recorder(simulation)
+    if comm.rank == 0:
+        folder.mkdir()
+    comm.Barrier()
+    recorder.begin(folder)
+    while not simulation.finished:
+        recorder.record(simulation.step())
+    recorder.settle()
+    recorder.close()
+    simulation.destroy()
+    lines = (folder / "reactions.csv").read_text().splitlines()
+    return dict(zip(lines[0].split(","), map(float, lines[-1].split(",")), strict=True))
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("kind", ["clamp", "symmetry"])
+def test_reaction_moments_balance_the_loads(comm: MPI.Comm, kind: str, shared_tmp: Path) -> None:
+    """A force at the corner and a moment at the end: what the clamp or the plane of symmetry carries."""
+    hold: dict[str, Any] = {"clamp": True} if kind == "clamp" else {"symmetry": "x"}
+    loads: list[dict[str, Any]] = [{"group": "right", "moment": 0.04}]
+    handles = [{"group": "left", **hold}]
+    if kind == "clamp":
+        loads.append({"nodes": [12], "force": [0.0, 0.0, 0.02]})
+    else:
+        handles.append({"nodes": [0, 52], "axes": ["y", "z"]})
+    found = reactions(comm, CANTILEVER | {"handles": handles, "loads": loads}, shared_tmp / "run")
+    assert list(found)[2 + 3 * len(handles) :] == ["handle0_mx", "handle0_my", "handle0_mz"]
+    moments = [found[f"handle0_m{axis}"] for axis in "xyz"]
+    if kind == "clamp":
+        assert found["handle0_z"] == pytest.approx(-0.02, rel=1e-5)
+        # of the force about (0, 0.1, 0), to first order in the deflection
+        np.testing.assert_allclose(moments[:2], [0.1 * 0.02, 0.6 * 0.02 + 0.04 * 0.2], rtol=0.002)
+    else:
+        np.testing.assert_allclose(moments, [0.0, 0.04 * 0.2, 0.0], atol=1e-6)
+
+
+@pytest.mark.parallel
+def test_the_moment_of_a_clamp_that_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Angular momentum: of a stiff sheet that turns about its edge with constant acceleration."""
+    turn = [{"time": 0.0}, {"time": 2.0, "rotate": {"axis": [0, 1, 0], "degrees": 720}}]
+    scene = CANTILEVER | {
+        "handles": [{"group": "left", "clamp": True, "motion": "turn"}],
+        "motions": {"turn": turn},
+        "time": {"end": 0.2, "step": 0.01},
+        "material": STIFF | {"bending": {"d11": 1e3, "d22": 1e3, "d33": 5e2}},
+    }
+    found = reactions(comm, scene, shared_tmp / "run")
+    # φ = 4π (3 s² − 2 s³), s = t/2, at t = 0.2 s; the lag of the steps and of the sheet are of order 1 %
+    acceleration = 4.0 * np.pi * (6.0 - 12.0 * 0.1) / 4.0
+    inertia = 0.6 * 0.2 * 0.6**2 / 3.0
+    assert found["handle0_my"] == pytest.approx(inertia * acceleration, rel=0.05)
+
+
+# -- strips --------------------------------------------------------------------------------------------
+
+
+def jittered(n: int, m: int) -> tuple[Array, NDArray[np.int64]]:
+    """A strip of length 1 in n × m square cells, its vertices moved within it by up to 0.2 of a cell."""
+    vertices, triangles = rectangle(n, m, 1.0, m / n, alternating=False)
+    vertices = vertices[:, :2].copy()
+    random = np.random.default_rng(1)
+    for axis, end in enumerate((1.0, m / n)):
+        free = (vertices[:, 0] > 1e-9) & (vertices[:, 0] < 1.0 - 1e-9)
+        free &= (vertices[:, axis] > 1e-9) & (vertices[:, axis] < end - 1e-9)
+        vertices[free, axis] += random.uniform(-0.2, 0.2, free.sum()) / n
+    return np.column_stack([vertices, np.zeros(len(vertices))]), triangles
+
+
+@pytest.mark.parametrize("pattern", ["diagonal", "alternating", "jittered"])
+@pytest.mark.parametrize("weight", [0.0, 10.0])
+def test_cantilevers_bend_as_the_elastica(pattern: str, weight: float, tmp_path: Path) -> None:
+    """Under a tip load 4 B/L² (Bisshopp & Drucker 1945), or their weight 10 B/L³, with B as it stands."""
+    n, m = 50, 2
+    mesh = grid(1.0, m / n, n, m, pattern)
+    if pattern == "jittered":
+        mesh = obj_file(tmp_path / "strip.obj", *jittered(n, m))
+    tip = {"box": [[1.0, -1.0, -1.0], [2.0, 1.0, 1.0]], "force": [0.0, 0.0, -4.0 * m / n]}
+    scene = {
+        "mesh": mesh,
+        "material": STIFF | {"bending": {"d11": 1.0, "d22": 1.0, "d33": 0.5}},
+        "handles": [{"box": [[-1, -1, -1], [0, 1, 1]], "clamp": True}],
+        "gravity": [0, 0, -weight],
+        "loads": [] if weight else [tip],
+        "time": {"analysis": "static"},
+        "solver": {"force_tolerance": 1e-7},
+    }
+    x, _ = outcome(MPI.COMM_SELF, scene)
+    end = x.reshape(m + 1, n + 1, 3)[:, -1].mean(axis=0)
+    rows = reference("cantilevers")["own_weight" if weight else "tip_load"]["rows"]
+    row = next(row for row in rows if row[0] == (weight or 4.0))
+    drop, reach = (row[1], row[2]) if weight else (row[3], 1.0 - row[2])
+    np.testing.assert_allclose([-end[2], end[0]], [drop, reach], rtol=0.0, atol=2e-4)
+
+
+# -- extremes ------------------------------------------------------------------------------------------
+
+
+SCHEMES = ["beuler", "semi-implicit", "alpha2"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "scheme"),
+    [(kind, scheme) for kind in ("spin", "noise") for scheme in SCHEMES]
+    + [("pressed", scheme) for scheme in ("beuler", "alpha2")],  # one linear solve a step is not enough
+)
+def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
+    """Edges that turn by 230° in a nominal step, a crumpled start, two edges brought together."""
+    scene: dict[str, Any] = {
+        "mesh": grid(0.4, 0.4, 6, 6, "alternating"),
+        "material": CLOTH | {"bending": 2e-4, "bending_model": "midedge"},
+        "gravity": [0, 0, -9.81],
+        "handles": [],
+        "initial": {"noise": 0.03, "seed": 2},
+        "time": {"end": 0.1, "step": 0.01, "integrator": scheme},
+        "solver": {},
+    }
+    if kind == "spin":
+        scene |= {"initial": {"angular_velocity": [3.0, 5.0, 400.0]}, "gravity": [0, 0, 0]}
+        scene["material"] |= {"membrane": {"c11": 1e5, "c22": 1e5, "c12": 0.0, "c33": 5e4}}
+    elif kind == "pressed":
+        there = [{"time": 0.0}, {"time": 0.1, "translate": [-0.38, 0.0, 0.0]}]
+        moved = {"group": "right", "motion": "press", "interpolation": "linear"}
+        scene |= {"handles": [{"group": "left"}, moved], "motions": {"press": there}}
+        scene["initial"] = {"noise": 1e-3, "seed": 1}
+    x, energies = outcome(MPI.COMM_SELF, scene)
+    assert np.isfinite(x).all()
+    assert np.isfinite(energies).all()
+    assert np.linalg.norm(np.ptp(x, axis=0)) > 0.1

@@ -1,0 +1,117 @@
+"""Moments on boundary edges: M per rest length about the edge, which they follow.
+
+A moment M [N·m/m] on an edge of rest length L does the work M L times the angle by which the edge's director
+turns about it. In the frame that follows the edge that angle is φ̇ + γ · ė (``midedge_shape``), so that the
+load is M L on φ and M L γ at the ends; γ vanishes where the frames are those of the present shape. M > 0
+lifts the free side of the edge towards the normal of its triangle: it turns against the counter-clockwise
+direction of the edge, with which κ grows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.select import find_group
+from lyra_petsc.mesh.topology import boundary_edges
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.midedge_shape import unit
+from lyra_petsc.terms.motion import Window
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Load
+
+Array = NDArray[np.float64]
+
+
+class Moment(Load):
+    """The moments of all loads.
+
+    Parameters
+    ----------
+    elements : Elements
+        Stencil (E, 2) and edges (E, 1); data ``moment`` (E,) [N·m/m] about the edge from its lesser vertex,
+        ``load`` (E,) the number of the scene's load.
+    """
+
+    def __init__(self, elements: Elements, windows: list[Window]) -> None:
+        super().__init__(elements)
+        self._load = elements.data["load"].astype(np.int64)
+        self._windows = windows
+
+    def act_on(self, term: MidEdge) -> None:
+        """Turn the directors of this term; before anything else is asked."""
+        assert self.edges is not None
+        self._term = term
+        self._places = self.edges[:, 0]
+        self._numbers = np.searchsorted(term.of_edges.places, self._places)
+
+    def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
+        strength = np.array([window.strength(t0, t1) for window in self._windows])
+        moment = self.elements.data["moment"] * strength[self._load]
+        np.add.at(out.reshape(-1), self._places, moment)
+        tail, head = self.stencil.T
+        edge, from_frame = x[head] - x[tail], self._term.frames.tangent[self._numbers]
+        tangent = unit(edge)
+        size = np.linalg.norm(edge, axis=1) * (1.0 + np.sum(from_frame * tangent, axis=1))
+        turn = -moment * self._term.of_edges.length[self._numbers] / size
+        pull = turn[:, None] * np.cross(from_frame, tangent)
+        np.add.at(out, head, pull)
+        np.subtract.at(out, tail, pull)
+
+
+def elements(rest: RestShape) -> Elements:
+    """The edges under each moment (rank 0).
+
+    Raises
+    ------
+    InputError
+        A group without boundary edges, or where the sheet does not bend by ``midedge``.
+    """
+    mesh, scene = rest.mesh, rest.scene
+    ends, faces, _ = boundary_edges(mesh.triangles)
+    n = mesh.n_vertices
+    lesser, greater = ends.min(axis=1), ends.max(axis=1)
+    keys, sign = lesser * n + greater, np.where(ends[:, 0] < ends[:, 1], -1.0, 1.0)
+    number = np.searchsorted(rest.edges[:, 0] * n + rest.edges[:, 1], keys)
+    rows, moments, loads = [], [], []
+    for each, load in enumerate(scene.loads):
+        if load.moment is None:
+            continue
+        assert load.group is not None
+        key = f"loads[{each}]"
+        group = find_group(mesh, load.group, key=f"{key}.group", file=scene.source)
+        if len(group.edges):
+            wanted = np.unique(group.edges.min(axis=1) * n + group.edges.max(axis=1))
+            row = np.flatnonzero(np.isin(keys, wanted))
+            complete = len(row) == len(wanted)
+        else:
+            row = np.flatnonzero(np.isin(ends, group.vertices).all(axis=1))
+            complete = len(row) > 0
+        if not complete:
+            raise InputError(
+                f"a moment acts on boundary edges, which group '{load.group}' is not made of; take a curve "
+                "group on the boundary",
+                file=scene.source,
+                key=f"{key}.group",
+            )
+        if not rest.bends_by("midedge")[faces[row]].all():
+            raise InputError(
+                f"the material at group '{load.group}' has no moments on edges; give it "
+                "bending_model: midedge and a bending stiffness",
+                file=scene.source,
+                key=f"{key}.moment",
+            )
+        rows.append(row)
+        moments.append(load.moment * sign[row])
+        loads.append(np.full(len(row), float(each)))
+    row = np.concatenate(rows)
+    data = {"moment": np.concatenate(moments), "load": np.concatenate(loads)}
+    return Elements(np.column_stack([lesser[row], greater[row]]), data, edges=number[row][:, None])
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Moment:
+    """The load on one rank."""
+    return Moment(elements, [Window(load.start, load.until) for load in scene.loads])
