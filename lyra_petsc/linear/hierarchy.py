@@ -130,8 +130,8 @@ class Hierarchy:
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
-            first = below is not None and level is self.levels[0]
-            level.galerkin = Galerkin(level.points, below.pattern if first else level.pattern, *rows)
+            fine = below.pattern if below is not None and level is self.levels[0] else level.pattern
+            level.galerkin = Galerkin(level.points, fine, *rows)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
 

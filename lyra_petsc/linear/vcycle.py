@@ -168,7 +168,6 @@ class Smoother:
         if len(lagged):
             self.b[lagged] = right
 
-
     def _add_interpolated(self, coarse: Floats) -> None:
         if self._turns is None:
             sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)

@@ -1,8 +1,8 @@
 """The Jacobian of vertices alone, that the coarse levels of multigrid are made of where edges carry unknowns.
 
 Eliminating the edges would couple vertices far apart. In its place stands the Jacobian of the same sheet with
-hinges: the eliminated one lies between 0.23 and 1.67 times it, on any mesh, and what is left the cycle's sweeps
-on all unknowns see.
+hinges: the eliminated one lies between 0.23 and 1.67 times it, on any mesh, and what is left the sweeps over
+all unknowns see.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class VertexEquations:
         self.turns = EdgeTurns(bent[0], layout.n_owned)
 
     def values(self, held: Mask) -> Array:
-        """Block rows (n_blocks, 3, 3) at the stage last evaluated, prescribed unknowns (n_local, 3) decoupled."""
+        """Block rows (n_blocks, 3, 3) at the stage last evaluated; held (n_local, 3) are decoupled."""
         equations, rows = self._equations, self._rows
         (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.acts
         self.turns.set(x, held)

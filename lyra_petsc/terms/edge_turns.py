@@ -1,9 +1,9 @@
 """How the directors of edges follow the vertices when no triangle's bending is to change, on the average.
 
 As vertices move by u the normal n of a triangle turns about its edge i by −Σ_c ω_ic n · u_c, ω as in
-``midedge_energy``. The director of an edge follows the mean of its triangles. Coarse levels of multigrid have no
-unknowns of edges: without this they would bend a sheet whose directors stand still, which is stiffer than the
-sheet by (size / edge)². Rigid motions are followed exactly. All in single precision, as what sweeps read.
+``midedge_energy``. The director of an edge follows the mean of its triangles. Coarse levels of multigrid have
+no unknowns of edges: without this they would bend a sheet whose directors stand still, which is stiffer than
+the sheet by (size / edge)². Rigid motions are followed exactly. All in single precision, as what sweeps read.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Mask = NDArray[np.bool_]
 
 
 @kernel()
-def _set(x, stencil, places, share, out):  # type: ignore[no-untyped-def]
-    """n, −e_i · e_c / 2A and share / |e_i| of triangles (E, 3), into out (E, 12); 0 of those without a normal."""
+def _set(x, stencil, share, out):  # type: ignore[no-untyped-def]
+    """n, −e_i · e_c / 2A and share / |e_i| of triangles (E, 3) into out (E, 12); 0 without a normal."""
     for e in range(stencil.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
@@ -36,8 +36,16 @@ def _set(x, stencil, places, share, out):  # type: ignore[no-untyped-def]
         inverse = 1.0 / math.sqrt(square)
         for i in range(3):
             out[e, i] = inverse * normal[i]
-        out[e, 3], out[e, 4], out[e, 5] = -inverse * dot(e0, e0), -inverse * dot(e0, e1), -inverse * dot(e0, e2)
-        out[e, 6], out[e, 7], out[e, 8] = -inverse * dot(e1, e1), -inverse * dot(e1, e2), -inverse * dot(e2, e2)
+        out[e, 3], out[e, 4], out[e, 5] = (
+            -inverse * dot(e0, e0),
+            -inverse * dot(e0, e1),
+            -inverse * dot(e0, e2),
+        )
+        out[e, 6], out[e, 7], out[e, 8] = (
+            -inverse * dot(e1, e1),
+            -inverse * dot(e1, e2),
+            -inverse * dot(e2, e2),
+        )
         out[e, 9] = share[e, 0] / math.sqrt(dot(e0, e0))
         out[e, 10] = share[e, 1] / math.sqrt(dot(e1, e1))
         out[e, 11] = share[e, 2] / math.sqrt(dot(e2, e2))
@@ -61,7 +69,7 @@ def _follow(stencil, places, turns, x):  # type: ignore[no-untyped-def]
 
 @cached(fastmath=True)
 def _gather(stencil, places, turns, r):  # type: ignore[no-untyped-def]
-    """Add to the vertices of r (n_local, 4) what the transpose of ``_follow`` makes of the edges' unknowns."""
+    """Add to the vertices of r (n_local, 4) what the transpose of ``_follow`` makes of its edges."""
     for e in range(Index(len(stencil))):
         p, q, s = Index(places[e, 0]), Index(places[e, 1]), Index(places[e, 2])
         f0 = turns[e, 9] * r[p // Index(3), p % Index(3)]
@@ -105,9 +113,9 @@ class EdgeTurns:
         self._turns = np.zeros((len(edges), 12), dtype=np.float32)
 
     def set(self, x: Array, held: Mask) -> None:
-        """Take positions x (n_local, 3), and which unknowns (n_local, 3) are prescribed: these do not follow."""
+        """Take positions x (n_local, 3); unknowns that are held (n_local, 3) do not follow."""
         share = np.where(held.ravel()[self._places], 0.0, self._share)
-        _set(x, self._stencil, self._places, share, self._turns)
+        _set(x, self._stencil, share, self._turns)
 
     def follow(self, x: Floats) -> None:
         """Add to x (n_local, 3), all 0 in the edges' unknowns, what its vertices make of those owned."""
