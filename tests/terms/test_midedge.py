@@ -17,7 +17,7 @@ from physics import CLOTH, Simulation, gathered, grid, obj_file, rotation, scene
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.stepping.simulation import Simulation as Run
+from lyra_petsc.stepping.simulation import SteppedScene as Run
 from lyra_petsc.stepping.simulation import StepReport
 from lyra_petsc.terms.midedge import MidEdge
 
