@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from lyra_petsc.linear.coarsening import coarsen
 from lyra_petsc.linear.galerkin import Galerkin
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.points import Layout, Points
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.edge_turns import EdgeTurns
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -61,6 +65,24 @@ class InterpolationRows:
     weights: Array
 
 
+class WithoutEdges(Protocol):
+    """Stands for the finest level's matrix where coarser ones, without unknowns of edges, are made.
+
+    Attributes
+    ----------
+    pattern : BlockPattern
+        Of the same rows as the finest level's; those of edges are empty.
+    turns : EdgeTurns
+        How edges follow vertices.
+    """
+
+    pattern: BlockPattern
+    turns: EdgeTurns
+
+    def values(self, held: Mask) -> Array:
+        """Its block rows (n_blocks, 3, 3) now, and ``turns`` with them; held (n_local, 3) are prescribed."""
+
+
 class Level:
     """Points of one level, and, but for the coarsest, what makes the next coarser one.
 
@@ -70,10 +92,12 @@ class Level:
     pattern : BlockPattern
     galerkin : Galerkin or None
         Interpolates from the next coarser level, and makes its block rows.
+    turns : EdgeTurns or None
+        How unknowns of edges, that nothing is interpolated to, follow the vertices.
     """
 
-    def __init__(self, points: Points, pattern: BlockPattern) -> None:
-        self.points, self.pattern = points, pattern
+    def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
+        self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
 
 
@@ -86,6 +110,8 @@ class Hierarchy:
     pattern : BlockPattern
     interpolations : sequence of InterpolationRows
         Between the levels, finest first.
+    below : WithoutEdges, optional
+        Where edges carry unknowns.
 
     Attributes
     ----------
@@ -93,13 +119,19 @@ class Hierarchy:
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, interpolations: Sequence[InterpolationRows]
+        self,
+        points: Points,
+        pattern: BlockPattern,
+        interpolations: Sequence[InterpolationRows],
+        below: WithoutEdges | None = None,
     ) -> None:
-        level = Level(points, pattern)
+        self._below = below
+        level = Level(points, pattern, below.turns if below else None)
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
-            level.galerkin = Galerkin(level.points, level.pattern, *rows)
+            fine = below.pattern if below is not None and level is self.levels[0] else level.pattern
+            level.galerkin = Galerkin(level.points, fine, *rows)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
 
@@ -124,6 +156,8 @@ class Hierarchy:
         free = np.where(held[: self.levels[0].points.n_owned], 0.0, 1.0)
         for level in self.levels:
             yield values, free
+            if self._below is not None and level is self.levels[0]:
+                values = self._below.values(held)
             if level.galerkin is not None:
                 values, free = level.galerkin.project(values, free)
 

@@ -47,7 +47,7 @@ class Smoother:
     b, x : (n_local, 3)
         Right-hand side and solution.
     r : (n_owned, 4)
-        Residual, and numbers without a meaning.
+        Residual, and numbers without a meaning; n_local rows where edges follow vertices.
     """
 
     def __init__(self, level: Level) -> None:
@@ -63,7 +63,8 @@ class Smoother:
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
-        self.r = np.zeros((n, 4), dtype=np.float32)
+        self._turns = level.turns
+        self.r = np.zeros((points.n_local if self._turns else n, 4), dtype=np.float32)
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
@@ -126,6 +127,8 @@ class Smoother:
         self._subtract_ghosts(seen)
         start, *parents = self._parents
         with PETSc.Log.Event(TRANSFER):
+            if self._turns is not None:
+                self._turns.gather(self.r)
             sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
             PETSc.Log.logFlops(self._transfer_flops)
             self._coarse.add_to_owners(coarse)
@@ -153,7 +156,7 @@ class Smoother:
         """
         with PETSc.Log.Event(TRANSFER):
             self._coarse.update_ghosts(coarse)
-            sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+            self._add_interpolated(coarse)
             PETSc.Log.logFlops(self._transfer_flops)
         lagged = self._lagged
         if len(lagged):
@@ -164,6 +167,16 @@ class Smoother:
             PETSc.Log.logFlops(self._sweep_flops)
         if len(lagged):
             self.b[lagged] = right
+
+    def _add_interpolated(self, coarse: Floats) -> None:
+        if self._turns is None:
+            sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+            return
+        more = np.zeros_like(self.x)
+        sweeps.add_interpolated(*self._parents, self._free, coarse, more)
+        self._turns.follow(more)
+        self.x += more
+        self.points.update_ghosts(self.x)  # edges of others have followed there
 
 
 def _product(values: Array, vectors: Array) -> Array:

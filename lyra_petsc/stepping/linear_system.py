@@ -94,7 +94,12 @@ class LinearSystem:
             found = interpolations(discretisation.layout, self._surface, multigrid.most_levels())
         if discretisation.changes:
             self._interpolations = found
-        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found)
+        below = None
+        if self._equations.hinges is not None and not discretisation.changes:
+            from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
+
+            below = VertexEquations(self._equations)
+        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below)
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
     def attach(self, ksp: PETSc.KSP) -> None:

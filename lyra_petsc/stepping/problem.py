@@ -202,6 +202,10 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
 
         clamps = clamped_edges.elements(rest)
         elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
+    if "midedge" in names:
+        from lyra_petsc.terms import bending  # where all bending is by edges nothing else needs it
+
+        elements["hinges"] = bending.elements(rest, ("hinge", "midedge"))
     for name, selector in scene.probes.items():
         vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
         elements[f"probe {name}"] = Elements(vertices[:, None])
@@ -277,6 +281,10 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         starts=[Window.of(handle).start for handle in scene.handles],
         events=events(scene),
     )
+    if "hinges" in part.elements:
+        hinged = registered("bending")
+        system.hinges = hinged.module().make(part.elements["hinges"], scene, part.vertex_data["mass"])
+        system.hinges.registration = hinged
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     system.x[rows] = data["position"]
     layout.update_ghosts(system.x)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -38,6 +38,9 @@ from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.bending import Bending
 
 Array = NDArray[np.float64]
 
@@ -80,6 +83,8 @@ class StageEquations:
     unbalanced, given_loads : (n_owned, 3) or None
         Static: force [N] that holds the start shape, reduced as the load factor grows; loads in place of the
         present ones.
+    hinges : Bending or None
+        Where edges carry unknowns: of the same sheet with hinges, for the preconditioner.
     """
 
     def __init__(
@@ -123,6 +128,7 @@ class StageEquations:
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
         self.given_loads: Array | None = None
+        self.hinges: Bending | None = None
         self._iterates: tuple[Array | None, Array | None] = (None, None)
         self._last_parts: dict[str, Array] = {}
 
@@ -409,6 +415,11 @@ class StageEquations:
         np.multiply(self._vs, self.stage.reach, out=self._xs)
         self._xs += self._xh
         self._follow(self._xs)
+        return self._xs, self._vs
+
+    @property
+    def evaluated(self) -> tuple[Array, Array]:
+        """What ``evaluate_at`` last returned."""
         return self._xs, self._vs
 
     def forces_at_stage(self) -> dict[str, Array]:

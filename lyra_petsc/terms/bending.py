@@ -11,7 +11,7 @@ Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -155,7 +155,11 @@ def _corners_of(triangles: NDArray[np.int64], vertices: NDArray[np.int64]) -> ND
 
 
 def edge_in_material(
-    rest: RestShape, triangle: NDArray[np.int64], tail: NDArray[np.int64], head: NDArray[np.int64]
+    rest: RestShape,
+    triangle: NDArray[np.int64],
+    tail: NDArray[np.int64],
+    head: NDArray[np.int64],
+    models: Sequence[str] = ("hinge",),
 ) -> tuple[Array, Array]:
     """An edge (tail → head) of each triangle in its material plane.
 
@@ -164,7 +168,7 @@ def edge_in_material(
     edge : (n, 2) float64
         Its material vector [m], warp axis first.
     stiffness : (n,) float64
-        B [N·m] of the triangle's hinges for that direction.
+        B [N·m] of the triangle's hinges for that direction, 0 for materials of other bending models.
     """
     corners, uv = rest.mesh.triangles[triangle], rest.mesh.triangle_uv[triangle]
     row = np.arange(len(triangle))
@@ -178,9 +182,15 @@ def edge_in_material(
     stiffness = np.zeros(len(triangle))
     for number, shell in enumerate(rest.shells):
         mine = rest.shell_of[triangle] == number
-        if not shell.bends_by("hinge"):
+        if shell.model not in models or not shell.bends_by(shell.model):
             continue
-        stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)
+        if shell.model == "hinge":
+            stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)
+        else:
+            along = edge[mine] / np.linalg.norm(edge[mine], axis=1, keepdims=True)
+            x, y = along[:, 1], -along[:, 0]
+            bent = np.stack([x * x, y * y, 2.0 * x * y])
+            stiffness[mine] = np.einsum("in,ij,jn->n", bent, np.array(shell.plate_matrix), bent)
     return edge, stiffness
 
 
@@ -236,15 +246,16 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
     return half
 
 
-def elements(rest: RestShape) -> Elements:
-    """All interior edges with their constants (rank 0).
+def elements(rest: RestShape, models: Sequence[str] = ("hinge",)) -> Elements:
+    """All interior edges of materials of these bending models, with their constants (rank 0).
 
     Between two materials the smaller B counts, as in the original; rest lengths are means over the
     two faces where a seam makes them differ.
     """
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     edges, stiffnesses = zip(
-        *(edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1]) for side in range(2)), strict=True
+        *(edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], models) for side in range(2)),
+        strict=True,
     )
     length = 0.5 * (np.linalg.norm(edges[0], axis=1) + np.linalg.norm(edges[1], axis=1))
     b = np.minimum(*stiffnesses)

@@ -35,6 +35,7 @@ from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.midedge_shape import (
     Frames,
     carried,
+    directions,
     directors,
     some_perpendicular,
     tangents,
@@ -127,8 +128,9 @@ class MidEdge(Elastic):
         return Frames(tangent, carried(frames, tangent))
 
     def _tangents(self, x: Array) -> Array:
-        tail, head = self.of_edges.ends.T
-        return unit(x[head] - x[tail])
+        tangent = np.empty((len(self.of_edges.ends), 3))
+        directions(x, self.of_edges.ends, tangent)
+        return tangent
 
     def edge_state(self) -> dict[str, Array]:
         tangent, across = self.frames

@@ -127,7 +127,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
 
 @kernel()
 def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):  # type: ignore[no-untyped-def]
-    """The Hessian of triangle e into h (12, 12), but for what is below the diagonal blocks; whether it is not 0.
+    """The Hessian of triangle e into h (12, 12), of edges what is above the diagonal; whether it is not 0.
 
     g (3, 12) becomes the ∇α_i; beyond the vertices' part it must be 0 off the diagonal. w (3, 9) is scratch.
     """
@@ -135,7 +135,6 @@ def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, leng
     e0, e1, e2, normal, square = edges_of(x0, x1, x2)
     if square <= GONE * limit[e]:
         return False
-    side = (e0, e1, e2)
     inverse = 1.0 / math.sqrt(square)  # 1 / 2A
     n = scaled(inverse, normal)
     t0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
@@ -146,17 +145,33 @@ def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, leng
     a0, a1, a2 = 1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2
     exact = 1.0 - blend
     # ∇α_i
+    s00, s11, s22, s01, s02, s12 = (
+        dot(e0, e0),
+        dot(e1, e1),
+        dot(e2, e2),
+        dot(e0, e1),
+        dot(e0, e2),
+        dot(e1, e2),
+    )
+    r0, r1, r2 = -inverse / math.sqrt(s00), -inverse / math.sqrt(s11), -inverse / math.sqrt(s22)
+    spin0, spin1, spin2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
+    for k in range(3):
+        g[0, k], g[0, 3 + k], g[0, 6 + k] = (
+            r0 * s00 * n[k],
+            r0 * s01 * n[k] - spin0[k],
+            r0 * s02 * n[k] + spin0[k],
+        )
+        g[1, k], g[1, 3 + k], g[1, 6 + k] = (
+            r1 * s01 * n[k] + spin1[k],
+            r1 * s11 * n[k],
+            r1 * s12 * n[k] - spin1[k],
+        )
+        g[2, k], g[2, 3 + k], g[2, 6 + k] = (
+            r2 * s02 * n[k] - spin2[k],
+            r2 * s12 * n[k] + spin2[k],
+            r2 * s22 * n[k],
+        )
     for i in range(3):
-        turn = -inverse / math.sqrt(dot(side[i], side[i]))
-        for c in range(3):
-            factor = turn * dot(side[i], side[c])
-            for k in range(3):
-                g[i, 3 * c + k] = factor * n[k]
-        spin = row(shape, edges[e, i], 3)
-        tail, head = (i + 1) % 3, (i + 2) % 3
-        for k in range(3):
-            g[i, 3 * head + k] += spin[k]
-            g[i, 3 * tail + k] -= spin[k]
         g[i, 9 + i] = sign[e, i] / length[e, i]
     # ∇f K ∇fᵀ, and what tan adds as it bends
     k00 = a0 * (a0 * stiffness[e, 0] + exact * 2.0 * t0 * m0)
@@ -177,8 +192,29 @@ def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, leng
     h[9, 9], h[9, 10], h[9, 11] = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02
     h[10, 10], h[10, 11], h[11, 11] = q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
     if exact > 0.0:
-        pulls = exact * m0 * a0, exact * m1 * a1, exact * m2 * a2
-        _add_turns(e, edges, sign, shape, side, n, inverse, pulls, h)
+        # Σ_i p_i ∂²α_i
+        p0, p1, p2 = exact * m0 * a0, exact * m1 * a1, exact * m2 * a2
+        c0, c1, c2 = p0 * r0, p1 * r1, p2 * r2
+        area = math.sqrt(square)
+        _turn(spin0, row(shape, edges[e, 0], 6), e0, n, 0.5 * area * c0 / s00, p0, sign[e, 0], 0, w)
+        _turn(spin1, row(shape, edges[e, 1], 6), e1, n, 0.5 * area * c1 / s11, p1, sign[e, 1], 1, w)
+        _turn(spin2, row(shape, edges[e, 2], 6), e2, n, 0.5 * area * c2 / s22, p2, sign[e, 2], 2, w)
+        b0, b1, b2 = (
+            scaled(inverse, cross(n, e0)),
+            scaled(inverse, cross(n, e1)),
+            scaled(inverse, cross(n, e2)),
+        )
+        v0, v1, v2 = (
+            c0 * s00 + c1 * s01 + c2 * s02,
+            c0 * s01 + c1 * s11 + c2 * s12,
+            c0 * s02 + c1 * s12 + c2 * s22,
+        )
+        _add_own(h, 0, n, v0, b0, 1, 2, w)
+        _add_own(h, 3, n, v1, b1, 2, 0, w)
+        _add_own(h, 6, n, v2, b2, 0, 1, w)
+        _add_pair(h, 0, 3, n, v0, v1, b0, b1, 2, w)
+        _add_pair(h, 0, 6, n, v0, v2, b0, b2, 1, w)
+        _add_pair(h, 3, 6, n, v1, v2, b1, b2, 0, w)
     if square < limit[e]:
         energy = 0.5 * (f0 * m0 + f1 * m1 + f2 * m2)
         pulls = m0 * a0, m1 * a1, m2 * a2
@@ -186,33 +222,32 @@ def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, leng
     return True
 
 
-@kernel()
-def _add_turns(e, edges, sign, shape, side, n, inverse, pulls, h):  # type: ignore[no-untyped-def]
-    """Add Σ_i pulls_i ∂²α_i of triangle e to h (12, 12)."""
-    slope = np.zeros(3)
-    ends = np.empty((3, 3, 3))
-    for i in range(3):
-        square = dot(side[i], side[i])
-        turn = -pulls[i] * inverse / math.sqrt(square)
-        for c in range(3):
-            slope[c] += turn * dot(side[i], side[c])
-        across = scaled(-0.5 * pulls[i] / (square * math.sqrt(square)), cross(side[i], n))
-        spin, about = row(shape, edges[e, i], 3), row(shape, edges[e, i], 6)
-        spin = scaled(-0.5 * pulls[i] * sign[e, i], spin)
-        for k in range(3):
-            for m in range(3):
-                ends[i, k, m] = n[k] * across[m] + across[k] * n[m] + spin[k] * about[m] + about[k] * spin[m]
-    for c in range(3):
-        one = scaled(inverse, cross(n, side[c]))
-        for d in range(c, 3):
-            other = scaled(inverse, cross(n, side[d]))
-            for k in range(3):
-                for m in range(3):
-                    if c == d:
-                        more = ends[(c + 1) % 3, k, m] + ends[(c + 2) % 3, k, m]
-                    else:
-                        more = -ends[3 - c - d, k, m]
-                    h[3 * c + k, 3 * d + m] += more - slope[d] * n[k] * one[m] - slope[c] * other[k] * n[m]
+@kernel(inline="always")
+def _turn(spin, about, e, n, scale, pull, sign, i, w):  # type: ignore[no-untyped-def]
+    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge into row i of w (3, 9)."""
+    across, spin = scaled(scale, cross(e, n)), scaled(-0.5 * pull * sign, spin)
+    for k in range(3):
+        for m in range(3):
+            w[i, 3 * k + m] = n[k] * across[m] + across[k] * n[m] + spin[k] * about[m] + about[k] * spin[m]
+
+
+@kernel(inline="always")
+def _add_own(h, first, n, slope, b, one, two, w):  # type: ignore[no-untyped-def]
+    """Add −slope (n bᵀ + b nᵀ) and two rows of w to the block of a corner."""
+    for k in range(3):
+        for m in range(3):
+            more = w[one, 3 * k + m] + w[two, 3 * k + m]
+            h[first + k, first + m] += more - slope * (n[k] * b[m] + b[k] * n[m])
+
+
+@kernel(inline="always")
+def _add_pair(h, first, second, n, slope_c, slope_d, b_c, b_d, opposite, w):  # type: ignore[no-untyped-def]
+    """Add −slope_d n b_cᵀ − slope_c b_d nᵀ without a row of w to the blocks of two corners."""
+    for k in range(3):
+        for m in range(3):
+            more = -w[opposite, 3 * k + m] - slope_d * n[k] * b_c[m] - slope_c * b_d[k] * n[m]
+            h[first + k, second + m] += more
+            h[second + m, first + k] += more
 
 
 @kernel()
@@ -231,10 +266,10 @@ def _fade_hessian(corners, normal, square, limit, energy, exact, pulls, g, h):  
             force[a] += pulls[i] * g[i, a]
     add_square_hessian(corners, normal, (0, 1, 2), first, bent)
     for a in range(12):
-        for b in range(a, 12):
+        for b in range(12):
             h[a, b] += exact * first * (force[a] * slopes[b] + slopes[a] * force[b])
             h[a, b] += exact * energy * second * slopes[a] * slopes[b]
-            if b < 9:
+            if max(a, b) < 9:
                 h[a, b] += exact * energy * bent[a // 3, b // 3, a % 3, b % 3]
 
 
@@ -261,7 +296,8 @@ def add_hessian(  # type: ignore[no-untyped-def]
 
     Without its loops over any number of vertices and edges, and its array of Hessians.
     """
-    g, w, h = np.zeros((3, 12)), np.empty((3, 9)), np.empty((12, 12))
+    g, w, h = np.zeros((3, 12)), np.empty((3, 9)), np.zeros((12, 12))
+    blocks = values.reshape(-1, 9)
     for e in range(stencil.shape[0]):
         fetch_ahead(e, offsets, values, 21)
         if not _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):
@@ -272,32 +308,30 @@ def add_hessian(  # type: ignore[no-untyped-def]
                 at = offsets[e, pair]
                 pair += 1
                 if at >= 0:
-                    k = Index(at >> 1)
+                    k, swapped = Index(at >> 1), at & 1
+                    first, second = Index(3 * (a + swapped * (b - a))), Index(3 * (b - swapped * (b - a)))
                     for i in range(3):
                         for j in range(3):
-                            first, second = (j, i) if at & 1 else (i, j)
-                            values[k, i, j] += factor * h[3 * a + first, 3 * b + second]
+                            blocks[k, 3 * i + j] += factor * h[first + Index(i), second + Index(j)]
             for b in range(3):
                 at = offsets[e, pair]
                 pair += 1
                 if at >= 0:
-                    k, place = Index(at >> 1), Index(places[e, b] % 3)
+                    k, swapped, place = Index(at >> 1), at & 1, Index(places[e, b]) % Index(3)
+                    first, way = place * Index(1 + 2 * swapped), Index(3 - 2 * swapped)
                     for i in range(3):
-                        if at & 1:
-                            values[k, place, i] += factor * h[3 * a + i, 9 + b]
-                        else:
-                            values[k, i, place] += factor * h[3 * a + i, 9 + b]
+                        blocks[k, first + way * Index(i)] += factor * h[3 * a + i, 9 + b]
         for a in range(3):
-            row_a, one = places[e, a] // 3, Index(places[e, a] % 3)
+            row_a, one = Index(places[e, a]) // Index(3), Index(places[e, a]) % Index(3)
             for b in range(a, 3):
                 at = offsets[e, pair]
                 pair += 1
                 if at >= 0:
-                    k, other = Index(at >> 1), Index(places[e, b] % 3)
+                    k, swapped, other = Index(at >> 1), at & 1, Index(places[e, b]) % Index(3)
                     value = factor * h[9 + a, 9 + b]
-                    if at & 1:
-                        values[k, other, one] += value
+                    if swapped:
+                        blocks[k, Index(3) * other + one] += value
                     else:
-                        values[k, one, other] += value
-                        if a != b and row_a == places[e, b] // 3:
-                            values[k, other, one] += value
+                        blocks[k, Index(3) * one + other] += value
+                        if a != b and row_a == Index(places[e, b]) // Index(3):
+                            blocks[k, Index(3) * other + one] += value

@@ -53,20 +53,49 @@ def unit(vectors: Array) -> Array:
     return made
 
 
-def carried(frames: Frames, tangent: Array) -> Array:
-    """a (n, 3): a₀ as the smallest rotation carries it to edges of direction ``tangent`` (n, 3)."""
-    t0, a0 = frames
-    turn, cosine = np.cross(t0, tangent), np.sum(t0 * tangent, axis=1, keepdims=True)
-    along = np.sum(turn * a0, axis=1, keepdims=True) / (1.0 + cosine)
-    moved = cosine * a0 + np.cross(turn, a0) + along * turn
-    # rounding must not gather over the steps
-    return unit(moved - np.sum(moved * tangent, axis=1, keepdims=True) * tangent)
-
-
 def some_perpendicular(tangent: Array) -> Array:
     """Unit vectors (n, 3) perpendicular to others, by a rule that knows nothing but these."""
     axis = np.eye(3)[np.argmin(np.abs(tangent), axis=1)]
     return unit(axis - np.sum(axis * tangent, axis=1, keepdims=True) * tangent)
+
+
+@kernel()
+def directions(x, ends, out):  # type: ignore[no-untyped-def]
+    """Unit vectors along edges (n, 2), into out (n, 3); NaN of those without a length."""
+    for k in range(ends.shape[0]):
+        e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
+        out[k, 0], out[k, 1], out[k, 2] = scaled(1.0 / math.sqrt(dot(e, e)), e)
+
+
+@kernel()
+def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
+    for k in range(len(out)):
+        t = present[k, 0], present[k, 1], present[k, 2]
+        t0 = tangent[k, 0], tangent[k, 1], tangent[k, 2]
+        a = _turned(t0, (across[k, 0], across[k, 1], across[k, 2]), t)
+        # rounding must not gather over the steps
+        along = dot(a, t)
+        a = a[0] - along * t[0], a[1] - along * t[1], a[2] - along * t[2]
+        out[k, 0], out[k, 1], out[k, 2] = scaled(1.0 / math.sqrt(dot(a, a)), a)
+
+
+def carried(frames: Frames, tangent: Array) -> Array:
+    """a (n, 3): a₀ as the smallest rotation carries it to edges of direction ``tangent`` (n, 3)."""
+    out = np.empty_like(tangent)
+    _carry(*frames, tangent, out)
+    return out
+
+
+@kernel(inline="always")
+def _turned(t0, a0, t):  # type: ignore[no-untyped-def]
+    """a₀ carried from t₀ to t."""
+    c, b = dot(t0, t), cross(t0, t)
+    ba, along = cross(b, a0), dot(b, a0) / (1.0 + c)
+    return (
+        c * a0[0] + ba[0] + along * b[0],
+        c * a0[1] + ba[1] + along * b[1],
+        c * a0[2] + ba[2] + along * b[2],
+    )
 
 
 @kernel()
@@ -86,15 +115,9 @@ def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-u
         if not c > FARTHEST:
             out[k, :] = 0.0
             continue
-        inverse = 1.0 / (1.0 + c)
-        ba, along = cross(b, a0), dot(b, a0) * inverse
-        a = (
-            c * a0[0] + ba[0] + along * b[0],
-            c * a0[1] + ba[1] + along * b[1],
-            c * a0[2] + ba[2] + along * b[2],
-        )
+        a = _turned(t0, a0, t)
         w = cross(t, a)
-        inverse /= length
+        inverse = 1.0 / (length * (1.0 + c))
         for i in range(3):
             out[k, i] = cosine[k] * a[i] + sine[k] * w[i]
             out[k, 3 + i] = -inverse * b[i]

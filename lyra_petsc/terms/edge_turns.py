@@ -1,0 +1,126 @@
+"""How the directors of edges follow the vertices when no triangle's bending is to change, on the average.
+
+As vertices move by u the normal n of a triangle turns about its edge i by −Σ_c ω_ic n · u_c, ω as in
+``midedge_energy``. The director of an edge follows the mean of its triangles. Coarse levels of multigrid have
+no unknowns of edges: without this they would bend a sheet whose directors stand still, which is stiffer than
+the sheet by (size / edge)². Rigid motions are followed exactly. All in single precision, as what sweeps read.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.hinge import dot, point
+from lyra_petsc.terms.midedge import MidEdge
+from lyra_petsc.terms.midedge_shape import edges_of
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@kernel()
+def _set(x, stencil, share, out):  # type: ignore[no-untyped-def]
+    """n, −e_i · e_c / 2A and share / |e_i| of triangles (E, 3) into out (E, 12); 0 without a normal."""
+    for e in range(stencil.shape[0]):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+        if not square > 0.0:
+            out[e, :] = 0.0
+            continue
+        inverse = 1.0 / math.sqrt(square)
+        for i in range(3):
+            out[e, i] = inverse * normal[i]
+        out[e, 3], out[e, 4], out[e, 5] = (
+            -inverse * dot(e0, e0),
+            -inverse * dot(e0, e1),
+            -inverse * dot(e0, e2),
+        )
+        out[e, 6], out[e, 7], out[e, 8] = (
+            -inverse * dot(e1, e1),
+            -inverse * dot(e1, e2),
+            -inverse * dot(e2, e2),
+        )
+        out[e, 9] = share[e, 0] / math.sqrt(dot(e0, e0))
+        out[e, 10] = share[e, 1] / math.sqrt(dot(e1, e1))
+        out[e, 11] = share[e, 2] / math.sqrt(dot(e2, e2))
+
+
+@cached(fastmath=True)
+def _follow(stencil, places, turns, x):  # type: ignore[no-untyped-def]
+    """Add to the edges' unknowns of x (n_local, 3) what its vertices make of them."""
+    for e in range(Index(len(stencil))):
+        n0, n1, n2 = turns[e, 0], turns[e, 1], turns[e, 2]
+        a, b, c = Index(stencil[e, 0]), Index(stencil[e, 1]), Index(stencil[e, 2])
+        h0 = n0 * x[a, 0] + n1 * x[a, 1] + n2 * x[a, 2]
+        h1 = n0 * x[b, 0] + n1 * x[b, 1] + n2 * x[b, 2]
+        h2 = n0 * x[c, 0] + n1 * x[c, 1] + n2 * x[c, 2]
+        w01, w02, w12 = turns[e, 4], turns[e, 5], turns[e, 7]
+        p, q, r = Index(places[e, 0]), Index(places[e, 1]), Index(places[e, 2])
+        x[p // Index(3), p % Index(3)] += turns[e, 9] * (turns[e, 3] * h0 + w01 * h1 + w02 * h2)
+        x[q // Index(3), q % Index(3)] += turns[e, 10] * (w01 * h0 + turns[e, 6] * h1 + w12 * h2)
+        x[r // Index(3), r % Index(3)] += turns[e, 11] * (w02 * h0 + w12 * h1 + turns[e, 8] * h2)
+
+
+@cached(fastmath=True)
+def _gather(stencil, places, turns, r):  # type: ignore[no-untyped-def]
+    """Add to the vertices of r (n_local, 4) what the transpose of ``_follow`` makes of its edges."""
+    for e in range(Index(len(stencil))):
+        p, q, s = Index(places[e, 0]), Index(places[e, 1]), Index(places[e, 2])
+        f0 = turns[e, 9] * r[p // Index(3), p % Index(3)]
+        f1 = turns[e, 10] * r[q // Index(3), q % Index(3)]
+        f2 = turns[e, 11] * r[s // Index(3), s % Index(3)]
+        w01, w02, w12 = turns[e, 4], turns[e, 5], turns[e, 7]
+        h0 = turns[e, 3] * f0 + w01 * f1 + w02 * f2
+        h1 = w01 * f0 + turns[e, 6] * f1 + w12 * f2
+        h2 = w02 * f0 + w12 * f1 + turns[e, 8] * f2
+        n0, n1, n2 = turns[e, 0], turns[e, 1], turns[e, 2]
+        a, b, c = Index(stencil[e, 0]), Index(stencil[e, 1]), Index(stencil[e, 2])
+        r[a, 0] += h0 * n0
+        r[a, 1] += h0 * n1
+        r[a, 2] += h0 * n2
+        r[b, 0] += h1 * n0
+        r[b, 1] += h1 * n1
+        r[b, 2] += h1 * n2
+        r[c, 0] += h2 * n0
+        r[c, 1] += h2 * n1
+        r[c, 2] += h2 * n2
+
+
+class EdgeTurns:
+    """The linear map T from movements of vertices to those of this rank's edge unknowns, and its transpose.
+
+    Parameters
+    ----------
+    term : MidEdge
+    n_owned : int
+        Block rows that this rank owns.
+    """
+
+    def __init__(self, term: MidEdge, n_owned: int) -> None:
+        assert term.edges is not None
+        self._stencil, self._places = term.stencil, term.edges.astype(np.int32)
+        edges = term.of_edges.of_triangles
+        # all triangles of an edge that this rank owns are here
+        share = 1.0 / np.bincount(edges.ravel())[edges]
+        share[term.edges >= 3 * n_owned] = 0.0
+        self._share = -share * term.elements.data["length"] * term.elements.data["sign"]
+        self._turns = np.zeros((len(edges), 12), dtype=np.float32)
+
+    def set(self, x: Array, held: Mask) -> None:
+        """Take positions x (n_local, 3); unknowns that are held (n_local, 3) do not follow."""
+        share = np.where(held.ravel()[self._places], 0.0, self._share)
+        _set(x, self._stencil, share, self._turns)
+
+    def follow(self, x: Floats) -> None:
+        """Add to x (n_local, 3), all 0 in the edges' unknowns, what its vertices make of those owned."""
+        _follow(self._stencil, self._places, self._turns, x)
+
+    def gather(self, r: Floats) -> None:
+        """Add to the vertices, ghosts too, of r (n_local, 4) the transpose times the edges' unknowns."""
+        _gather(self._stencil, self._places, self._turns, r)
