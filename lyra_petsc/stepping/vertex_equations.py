@@ -39,7 +39,7 @@ class VertexEquations:
     def __init__(self, equations: StageEquations) -> None:
         assert equations.hinges is not None
         self._equations, layout = equations, equations.points
-        bent = [term for term in equations.elastic if isinstance(term, MidEdge)]
+        self._bent = next(term for term in equations.elastic if isinstance(term, MidEdge))
         others = [t for t in equations.elastic if t.name not in ("bending", "midedge")]
         self._elastic: list[Elastic] = [*others, equations.hinges]
         self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.viscous
@@ -48,7 +48,7 @@ class VertexEquations:
             couplings |= term.couplings
         self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.pattern = self._rows.pattern
-        self.turns = EdgeTurns(bent[0], layout.n_owned)
+        self.turns = EdgeTurns(self._bent, layout.n_owned)
 
     def values(self, held: Mask) -> Array:
         """Block rows (n_blocks, 3, 3) at the stage last evaluated; held (n_local, 3) are decoupled."""
@@ -65,5 +65,28 @@ class VertexEquations:
         for wind in self._viscous:
             wind.add_hessian(vs, equations.frozen[wind], self.pattern.offsets, values)
         if held.any():
+            self._add_clamps(x, held, values)
             rows.constrain(values, held, rows.beside(held)[0])
         return values
+
+    def _add_clamps(self, x: Array, held: Mask, values: Array) -> None:
+        """Where a director is held its triangles resist as hinges do: to their third corner, at its height.
+
+        No hinge does at the border, and a clamped sheet would swing freely about its clamp.
+        """
+        term, data = self._bent, self._bent.elements.data
+        assert term.edges is not None
+        triangle, corner = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
+        opposite, tail, head = (x[term.stencil[triangle, (corner + k) % 3]] for k in range(3))
+        edge = head - tail
+        normal = np.cross(edge, opposite - tail)
+        square = np.sum(normal * normal, axis=1)
+        factor = data["stiffness"][triangle, np.array([0, 3, 5])[corner]] * self._equations.stage.reach
+        if self._equations.damping.acts:
+            factor *= 1.0 + data["damping"][triangle] / self._equations.stage.reach
+        # n nᵀ / height²
+        factor *= np.divide(
+            np.sum(edge * edge, axis=1), square**2, out=np.zeros_like(square), where=square > 0.0
+        )
+        blocks = factor[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        np.add.at(values, self.pattern.indptr[term.stencil[triangle, corner]], blocks)

@@ -68,13 +68,16 @@ def test_iterations_hardly_grow_with_the_mesh(kind: str, comm: MPI.Comm) -> None
     assert fine <= 1.5 * coarse + 1
 
 
+@pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize("scheme", ["semi-implicit", "beuler"])
-def test_unknowns_of_edges_cost_few_iterations(scheme: str, comm: MPI.Comm) -> None:
+def test_unknowns_of_edges_cost_few_iterations(scheme: str, clamped: bool, comm: MPI.Comm) -> None:
     """Coarse levels have none: directors must follow the vertices, or bending is far too stiff on them."""
     counts = []
     for model in ("hinge", "midedge"):
         content = hanging(75, integrator=scheme)
         content["material"] |= {"bending_model": model, "bending_scale": 100.0}
+        if clamped:
+            content["handles"] = [{"box": [[-1, -1, -1], [0.001, 2, 1]], "clamp": True}]
         counts.append(max(stepped(comm, content, 2, "python")[1]))
     assert counts[1] <= 1.6 * counts[0] + 1
 
