@@ -1,10 +1,8 @@
-"""What every experiment is made of: a case, what came of it, and the verdicts on that.
+"""What every experiment is made of: a case, what came of it and the verdicts on that.
 
-Dataclasses as JSON files: requests, jobs and results that outlive a process.
-
-Entries by name, whose modules are imported when they are asked for.
-
-``--ranks P``: each case in an mpirun of its own, of this program with the same PETSc options.
+Beside these, what all experiments share: a registry of cases, whose modules are imported when they are
+asked for; dataclasses as JSON files, which outlive a process; and the launcher of ``--ranks P``, which
+runs each case in an mpirun of its own with the same PETSc options.
 """
 
 from __future__ import annotations

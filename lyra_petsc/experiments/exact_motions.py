@@ -1,27 +1,20 @@
-"""What an exact solution gives: positions and energies at any time.
+"""Motions that are known exactly, by name: positions and energies at any time.
 
-A scene with its mesh and masses, whole, on rank 0: what exact solutions check their assumptions on.
+Sheets fall as a whole, freely, flat in still air or edge-on in it. With lumped masses (a third of each
+triangle's mass to each corner) and nodal wind forces (a third of each triangle's force to each corner),
+gravity and drag of a uniform flat sheet accelerate every vertex alike, on any mesh. The sheet stays
+undeformed, and the motion solves the spatially discrete equations exactly.
 
-Sheets that fall as a whole: freely, flat in still air, edge-on in still air.
-
-With lumped masses (a third of each triangle's mass to each corner) and nodal wind forces (a third of
-each triangle's force to each corner), gravity and drag of a uniform flat sheet accelerate every vertex
-alike, on any mesh. The sheet stays undeformed, and the motion solves the spatially discrete equations
-exactly.
-
-One equilateral triangle that breathes: a large, nonlinear oscillation in closed form.
-
-With circumradius R, areal density ρ and c11 = c22, a start stretched by λ₀ in all directions stays
-equilateral; the strain is (λ² − 1)/2 in every direction, the energy A (c11 + c12)(λ² − 1)²/4, the
-kinetic energy ρ A R² λ'²/2 with lumped masses, hence (Duffing)::
+One equilateral triangle breathes, a large, nonlinear oscillation in closed form. With circumradius R,
+areal density ρ and c11 = c22, a start stretched by λ₀ in all directions stays equilateral; the strain is
+(λ² − 1)/2 in every direction, the energy A (c11 + c12)(λ² − 1)²/4, the kinetic energy ρ A R² λ'²/2 with
+lumped masses, hence (Duffing)::
 
     λ'' = −k (λ³ − λ),   k = (c11 + c12) / (ρ R²)
     λ = a dn(a √(k/2) t, m),   m = 2 − 2/a²,   a the largest stretch, 1 < a < √2
 
-(dn: Jacobi's elliptic function; DLMF 22.13.15). Released at its smallest stretch it starts half a
-period later.
-
-Exact solutions by name; one line each.
+(dn: Jacobi's elliptic function; DLMF 22.13.15). Released at its smallest stretch it starts half a period
+later.
 """
 
 from __future__ import annotations

@@ -1,31 +1,24 @@
-"""Elastic forces along the straight way of a step: what they add up to, if they are an energy's.
+"""What a step did to energy and momenta, from its two states and the terms alone.
 
-What one step of backward Euler did to energy and momenta, from its two states and the terms alone.
-
-The energy identity, with the masses M, the elastic energy E and x' − x = Δt v' =: Δx::
+For backward Euler the energy identity, with the masses M, the elastic energy E and x' − x = Δt v' =: Δx::
 
     Δ(kinetic + potential) = −½ ‖Δv‖²_M − Δt v'ᵀ D v' + bracket + work
     bracket = ∫₀¹ ∇E(x + s Δx)·Δx ds − ∇E(x')·Δx
 
 The left side is made of energies and the right of forces, so that forces which are not the gradient of
 their energy break it as surely as a step that was not solved. The integral of the membrane is exact (its
-energy is a quartic along a line); that of the hinges is refined until it stands, and where hinges jump, which
-their model does beyond 180°, it is replaced by their energies' difference.
+energy is a quartic along a line); that of the hinges is refined until it stands, and where hinges jump,
+which their model does beyond 180°, it is replaced by their energies' difference.
 
-Every step leaves a residual r on the free coordinates, of which the solver promises ‖r‖ ≤ force tolerance ×
-forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may be
-off by no more than ‖r‖ ‖Δx‖ and the round-off of its own summands, and the balance of momentum by √V ‖r‖ Δt:
-these are the tolerances, none is chosen.
+Every step leaves a residual r on the free coordinates, of which the solver promises ‖r‖ ≤ force tolerance
+× forces at work, or the floor of round-off: that is judged for itself. With r as it is, the identity may
+be off by no more than ‖r‖ ‖Δx‖ and the round-off of its own summands, and the balance of momentum by √V
+‖r‖ Δt: these are the tolerances, none is chosen.
 
-What one step of an integrator other than backward Euler can be held to.
-
-Its stage solves M v̇ + ∇E + D v = f, and that is judged as for backward Euler: by what is left on the free
-coordinates, and by what the forces within the sheet add up to. There is no identity for its energies; but
-along the way of a step the elastic forces must add up to the change of the elastic energy.
-
-What was seen while a case ran.
-
-What physics says of a record: pure functions, the same on every rank.
+The stage of any other integrator solves M v̇ + ∇E + D v = f, and that is judged as for backward Euler: by
+what is left on the free coordinates, and by what the forces within the sheet add up to. There is no
+identity for its energies; but along the way of a step the elastic forces must add up to the change of the
+elastic energy.
 """
 
 from __future__ import annotations

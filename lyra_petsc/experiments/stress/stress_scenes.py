@@ -1,8 +1,7 @@
-"""A case of ``stress``: a scene that a user would call mad, and what physics says of it.
+"""A case of ``stress``: an extreme scene, made of the user's or of a hung square of cotton, and what it
+must keep.
 
-The sheet that is stressed when no scene is given: a square metre of cotton, hung by two corners.
-
-What cases do to a scene, in the keys of a scene file; every function changes it in place.
+Functions that change a scene work on the keys of a scene file, in place.
 """
 
 from __future__ import annotations

@@ -1,11 +1,4 @@
-"""Runs a case, takes the balance of every step, and judges.
-
-``--ranks P``: every case in an mpirun of its own.
-
-The families of cases, in the order in which ``stress`` runs them, and the modules that they are in.
-
-What ``stress`` tells: a line for each case, and a page on which the worst cases stand first.
-"""
+"""Runs the cases of ``stress``, takes the balance of every step, judges, and reports."""
 
 from __future__ import annotations
 

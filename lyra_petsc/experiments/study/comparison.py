@@ -1,13 +1,9 @@
-"""What a run left, at the sample times: positions by slabs, energies and probes as numbers.
+"""Errors of a run against a reference at the sample times, slab by slab: no rank holds a whole state.
 
-From one mesh to another of the same sheets: where a vertex of the one lies in the triangles of the other.
-
-Rest shapes are compared, sheet by sheet: each point goes to the nearest triangle of its sheet and gets
-the barycentric weights of the nearest place in it. On flat sheets that is linear interpolation in
-material coordinates; where a curved outline or surface is cut into different triangles the points are
-projected onto the nearest.
-
-Errors of a run against a reference, slab by slab: no rank holds a whole state.
+Between meshes of the same sheets rest shapes are compared, sheet by sheet: each point goes to the nearest
+triangle of its sheet and gets the barycentric weights of the nearest place in it. On flat sheets that is
+linear interpolation in material coordinates; where a curved outline or surface is cut into different
+triangles the points are projected onto the nearest.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
-"""Input and result of a case; both are files, so that studies resume and launch processes.
+"""A study's request, folder, and inputs and results of cases, kept as files so that it can be resumed.
 
-What the user asked of a study, as it is kept in its folder.
-
-The folder of a study: chosen before anything runs, locked while it does.
-
-Runs one case in this communicator: states from the first repeat, wall time from all.
-
-``--ranks P``: every case in an mpirun of its own, one after another.
+A case runs in this communicator, or with ``--ranks P`` in an mpirun of its own: states come from the first
+repeat, the wall time from all.
 """
 
 from __future__ import annotations

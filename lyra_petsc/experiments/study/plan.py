@@ -1,10 +1,5 @@
-"""What a study varies: ``--vary key=value,value,…`` into axes of checked values.
-
-One combination of settings, and the scene it makes of the study's scene.
-
-Quantities whose errors are measured: ``--quantities``.
-
-A study worked out before anything runs: combinations, their scenes, sample times, what is measured.
+"""What a study runs, worked out before anything does: axes of ``--vary``, combinations and their scenes,
+sample times, and the quantities whose errors are measured.
 """
 
 from __future__ import annotations

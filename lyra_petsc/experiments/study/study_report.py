@@ -1,11 +1,4 @@
-"""The rows of a study: errors that can be told, observed orders, the Pareto front.
-
-What to choose for an accuracy, in plain words and from what ran alone.
-
-study.csv and study.json.
-
-report.html and report.md of a study, with its diagrams.
-"""
+"""What a study tells: errors, observed orders, Pareto front and recommendation, as CSV, JSON and pages."""
 
 from __future__ import annotations
 

@@ -1,16 +1,11 @@
-"""Which reference each physical scene of a study gets; decided before anything runs, on rank 0.
+"""A study at work: runs what is not finished, and compares it with the reference of its physical scene.
 
-The reference where nothing is exact: which runs to make, finer than all that is studied.
-
-A second-order integrator at a quarter of the smallest Δt, and solver tolerances of a hundredth of the
-tightest. Where element sizes vary, half the smallest; and where nothing of the time integration varies
-beside them, that stays as it is, so that the errors are those of the mesh. Beside it stand coarser runs,
-each coarser in one thing by a factor of two from the next, from which its own error is estimated
-(Richardson).
-
-A study at work: runs what is not finished, compares all with the references.
-
-A whole study: runs, comparisons, and what it leaves in its folder.
+References are chosen on rank 0 before anything runs: an exact solution where there is one, else runs
+finer than all that is studied, by a second-order integrator at a quarter of the smallest Δt, with solver
+tolerances of a hundredth of the tightest. Where element sizes vary, half the smallest; and where nothing
+of the time integration varies beside them, that stays as it is, so that the errors are those of the mesh.
+Beside it stand coarser runs, each coarser in one thing by a factor of two from the next, from which its
+own error is estimated (Richardson).
 """
 
 from __future__ import annotations

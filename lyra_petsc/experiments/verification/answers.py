@@ -1,12 +1,5 @@
-"""What can be claimed of the errors of a case, and the verdict on it.
-
-A case of ``verify``: a question with a known answer, asked at several resolutions.
-
-Runs a case over its resolutions and judges it.
-
-The cases by name, in the order in which ``verify`` runs them, and the modules that they are in.
-
-What ``verify`` tells: every case with its tables, its verdicts and its plots.
+"""Cases of ``verify``: questions with known answers at several resolutions, how they are run and judged, and
+what is reported of them.
 """
 
 from __future__ import annotations

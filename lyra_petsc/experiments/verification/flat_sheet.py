@@ -3,10 +3,9 @@
 A flat sheet at rest has no coupling between its plane and the direction across it, so that one unknown
 per vertex, its height, is left. Everything here is gathered on every rank, in mesh order.
 
-Stiffness of an endless strip or sheet from the hinges of one of its periodic cells.
-
-The height is a quadratic with the mean curvatures plus a periodic part; the energy, least over the
-periodic part and whatever curvature is left free, gives the effective stiffness.
+The stiffness of an endless strip or sheet comes from the hinges of one of its periodic cells: the height
+is a quadratic with the mean curvatures plus a periodic part; the energy, least over the periodic part and
+whatever curvature is left free, gives the effective stiffness.
 """
 
 from __future__ import annotations

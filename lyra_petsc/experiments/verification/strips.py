@@ -1,9 +1,7 @@
-"""Cantilever strips one cell wide, clamped at x = 0: their scenes, and what is compared of them.
+"""Strips one cell wide: cantilevers clamped at x = 0, and strips hung between two supports.
 
-Of length 1 m with B = 1 N·m; c12 = 0. One cell across keeps apart what a plate adds to a strip: wider
-strips resist with their membrane against the lateral curvature that hinges give them.
-
-A strip one cell wide along x between two supports, started from an arc of its own length.
+Cantilevers are of length 1 m with B = 1 N·m; c12 = 0. One cell across keeps apart what a plate adds to a
+strip: wider strips resist with their membrane against the lateral curvature that hinges give them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Numbers as a reader wants them: few digits, handy units.
-
-A report as a list of blocks, written as self-contained HTML and as Markdown.
+"""A report as a list of blocks, written as self-contained HTML and as Markdown; numbers in few digits.
 
 ::
 
@@ -10,8 +8,6 @@ A report as a list of blocks, written as self-contained HTML and as Markdown.
     report.table(["integrator", "error"], [["beuler", 0.01]], caption="Errors")
     report.figure(drawing)              # from report.plots
     report.write(Path("studies/flag"))  # report.html, report.md, the figures' PNG and SVG
-
-How the pages about cases end, and how they are written with or without the packages for pictures.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Figures: errors against resolution with slopes, errors against run time with the Pareto front.
+"""Figures of errors against resolution and run time, of surfaces, and of quantities over time.
 
 Drawn with matplotlib's Agg and SVG backends alone: no display, no global state.
-
-Figures of surfaces and of quantities over time.
 """
 
 from __future__ import annotations

@@ -1,12 +1,5 @@
-"""What the files of a run say about how it went: sums and shares of its history and its summary.
-
-Figures of one run: energies, their balance, steps and iterations, wall time by phase.
-
-What to change about a run that was slow or inaccurate, as its history tells.
-
-The page about one run: pictures, energy, steps, time, settings, notes, what to change.
-
-report.html of a run, with pictures as ``render`` draws them where that can be.
+"""The page about one run, from the files of its folder: pictures, energies, steps, wall time, settings,
+notes, and what to change where it was slow or inaccurate.
 """
 
 from __future__ import annotations

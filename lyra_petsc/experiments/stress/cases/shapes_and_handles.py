@@ -1,8 +1,5 @@
-"""Shapes that no sheet starts from, and sheets that nothing holds.
-
-Meshes of bad elements.
-
-Handles that do what no hand does.
+"""Cases with bad elements, with shapes that no sheet starts from, with nothing held, and with violent
+handles.
 """
 
 from __future__ import annotations
