@@ -13,6 +13,9 @@ from lyra_petsc.experiments.verification.cases import CASES
 SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
+LONG = ("plate",)
+"""Cases whose finest resolutions take minutes."""
+
 
 @pytest.mark.parametrize("name", CASES.modules)
 def test_describes_itself(name: str) -> None:
@@ -39,7 +42,7 @@ def test_is_in_the_docs(name: str) -> None:
     "name", [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in CASES.modules]
 )
 def test_passes(comm: MPI.Comm, name: str) -> None:
-    # every resolution on one rank; on several those that show that they give the same
-    outcome = run_case(comm, CASES.load(name), quick=comm.size > 1, warm=False)
+    # on several ranks, those resolutions that show that they give the same
+    outcome = run_case(comm, CASES.load(name), quick=comm.size > 1 or name in LONG, warm=False)
     words = "; ".join(f"{quantity}: {verdict.words}" for quantity, verdict in outcome.verdicts.items())
     assert outcome.passed, words

@@ -52,7 +52,7 @@ def _beside(side: str) -> list[list[float]]:
     "Plates (C clamped, S supported, F free edges) under a small uniform load, bending_model: midedge: "
     "deflection against Kirchhoff's plate",
     source=EXACT["source"],
-    resolutions=(16, 32, 64, 128),
+    resolutions=(8, 16, 32, 64, 128),
     claim=Converges(2.0, 2e-3, slack=0.4),
 )
 def plate(bench: Bench, n: float) -> Sequence[Measured]:
