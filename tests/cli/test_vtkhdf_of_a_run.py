@@ -13,7 +13,9 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.scene.schema import FIELDS
 
+# the model of bending that has every field
 ON = ["--set", "output.vtkhdf=true", "--set", f"output.fields=[{', '.join(FIELDS)}]"]
+ON += ["--set", "material.bending_model=midedge"]
 
 
 def check(folder: Path) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 import lyra_petsc.stepping.simulation as simulation
 from lyra_petsc.cli.app import run_command_line
 
-step = simulation.Simulation.step
+step = simulation.SteppedScene.step
 taken = 0
 
 def slow(self):
@@ -33,7 +33,7 @@ def slow(self):
         time.sleep({seconds})
     return step(self)
 
-simulation.Simulation.step = slow
+simulation.SteppedScene.step = slow
 sys.exit(run_command_line(sys.argv))
 """
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import lyra_petsc.stepping.problem as problem
 from lyra_petsc.cli.app import run_command_line
 
-build = problem.build_mesh
+build = problem.mesh_of
 
 def slow(*arguments, **keywords):
     Path("in-set-up").touch()
@@ -27,7 +27,7 @@ def slow(*arguments, **keywords):
         time.sleep(0.01)
     return build(*arguments, **keywords)
 
-problem.build_mesh = slow
+problem.mesh_of = slow
 sys.exit(run_command_line(sys.argv))
 """
 

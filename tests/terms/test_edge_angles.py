@@ -51,7 +51,8 @@ def outcome(comm: MPI.Comm, scene: dict[str, Any], **petsc: Any) -> tuple[Array,
     while not simulation.finished:
         simulation.step()
     budget, layout = simulation.budget, simulation.problem.points
-    energies = np.array([budget.kinetic, budget.membrane, budget.bending, budget.potential])
+    bending = budget.bending + budget.more.get("angle_energy", 0.0)
+    energies = np.array([budget.kinetic, budget.membrane, bending, budget.potential])
     reactions = np.array(simulation.ledger.handle_forces(1))
     found = gathered(layout, simulation.problem.system.x), energies, reactions, layout.n_edges_global
     for name in [*petsc, *simulation.stepper.our_options]:
