@@ -24,7 +24,7 @@ DATA_FILE, XDMF_FILE, TEXT_FILE = "failure.h5", "failure.xdmf", "failure.txt"
 
 
 @dataclass(frozen=True)
-class Moment:
+class StateInTime:
     """Positions and fields at one time.
 
     Attributes
@@ -47,7 +47,7 @@ def write_failure(
     vertices: FileOrder,
     n_triangles: int,
     step: int,
-    moments: tuple[Moment, Moment],
+    states: tuple[StateInTime, StateInTime],
     text: str,
 ) -> None:
     """Write the state before a step and the iterate at which it failed; collective.
@@ -62,7 +62,7 @@ def write_failure(
         Triangles of the whole mesh.
     step : int
         Number of the state before.
-    moments : pair of Moment
+    states : pair of StateInTime
         The two.
     text : str
         For ``failure.txt``.
@@ -76,19 +76,19 @@ def write_failure(
     on_root(vertices.comm, lambda: replace_text(folder / TEXT_FILE, text))
     datasets: dict[str, Array] = {}
     attributes: dict[str, dict[str, int | float | str]] = {}
-    states = []
-    for number, moment in enumerate(moments):
+    written = []
+    for number, state in enumerate(states):
         group = group_name(number)
-        attributes[group] = {"time": moment.time, "step": step + number}
-        rows = {"position": moment.position, **moment.fields}
+        attributes[group] = {"time": state.time, "step": step + number}
+        rows = {"position": state.position, **state.fields}
         datasets |= {f"{group}/{name}": vertices.to_slab(values) for name, values in rows.items()}
         fields = tuple(
             StoredField(name, "vertex", (vertices.n_global, *values.shape[1:]), values.dtype.name)
-            for name, values in moment.fields.items()
+            for name, values in state.fields.items()
         )
-        states.append(WrittenState(number, step + number, moment.time, DATA_FILE, fields))
+        written.append(WrittenState(number, step + number, state.time, DATA_FILE, fields))
     write_collective([NewFile(folder / DATA_FILE, datasets, attributes)], vertices.comm)
-    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(states)
+    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / XDMF_FILE, document))
 
 

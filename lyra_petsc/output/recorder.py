@@ -16,7 +16,7 @@ from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
-from lyra_petsc.output.failure_files import Moment, remove_failure, write_failure
+from lyra_petsc.output.failure_files import StateInTime, remove_failure, write_failure
 from lyra_petsc.output.fields import Field, chosen
 from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
@@ -369,7 +369,7 @@ class Recorder:
             self._vertices,
             simulation.problem.outline.n_triangles,
             simulation.step_number,
-            (Moment(failure.time, system.x[:n], before), Moment(stuck.time, position, failing)),
+            (StateInTime(failure.time, system.x[:n], before), StateInTime(stuck.time, position, failing)),
             failure.text,
         )
 
