@@ -72,6 +72,11 @@ class ClampedEdges:
         The last: whether it is a symmetry plane.
     owned : (n,) int64
         Places of all edges that this rank owns.
+
+    Attributes
+    ----------
+    term : MidEdge
+        Whose edges they are.
     """
 
     def __init__(
@@ -81,7 +86,7 @@ class ClampedEdges:
         handles: Mapping[int, tuple[Motion, Window, bool]],
         owned: Ints,
     ) -> None:
-        self._term = term
+        self.term = term
         self._handles: dict[int, _Handle] = {}
         for number, each in elements.items():
             assert each.edges is not None
@@ -113,7 +118,7 @@ class ClampedEdges:
         if each is None or each.symmetric:
             return
         plane = self._plane(each, at, reference)
-        edges, (t0, a0) = self._term.of_edges, self._term.frames
+        edges, (t0, a0) = self.term.of_edges, self.term.frames
         tangent = unit(plane.edge)
         director = unit(np.cross(plane.edge, plane.inward))
         across = carried(Frames(t0[each.edges], a0[each.edges]), tangent)
@@ -135,10 +140,10 @@ class ClampedEdges:
         director = normal / height[:, None]
         turned = np.cross(de, w) + np.cross(e, dw)
         spin = np.sum(turned * np.cross(tangent, director), axis=1) / height
-        t0 = self._term.frames.tangent[each.edges]
+        t0 = self.term.frames.tangent[each.edges]
         cosine = 1.0 + np.sum(t0 * tangent, axis=1)
         frame = -np.sum(np.cross(t0, tangent) * de, axis=1) / (cosine * size)
-        out[each.places] = self._term.of_edges.length[each.edges] * (spin - frame)
+        out[each.places] = self.term.of_edges.length[each.edges] * (spin - frame)
 
     def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
         """Moment (3,) [N·m] of a handle on its edges of this rank beside that of the forces at their ends.
@@ -149,21 +154,16 @@ class ClampedEdges:
         each = self._handles.get(number)
         if each is None:
             return np.zeros(3)
-        tail, head = self._term.of_edges.ends[each.edges].T
+        tail, head = self.term.of_edges.ends[each.edges].T
         tangent, start = unit(x[head] - x[tail]), frames.tangent[each.edges]
         about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
-        total: Array = (reaction[each.places] * self._term.of_edges.length[each.edges]) @ about
+        total: Array = (reaction[each.places] * self.term.of_edges.length[each.edges]) @ about
         return total
-
-    @property
-    def term(self) -> MidEdge:
-        """Whose edges they are."""
-        return self._term
 
     def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
         rows, start = each.stencil, each.window.start
         points = reference(start, rows.ravel()).reshape(*rows.shape, 3)
-        n, local = len(points), np.arange(8 * len(points)).reshape(-1, 8)
+        local = np.arange(8 * len(points)).reshape(-1, 8)
         flat = points.reshape(-1, 3)
         normal = unit(normals_of(flat, local[:, 2:5]) + normals_of(flat, local[:, 5:8]))
         tail, head = points[:, 0], points[:, 1]
@@ -171,7 +171,6 @@ class ClampedEdges:
         three = np.concatenate([tail, head, beside])
         a, b, c = np.split(each.motion.carried(three, start, at), 3)
         da, db, dc = np.split(each.motion.velocity(three, start, at), 3)
-        assert len(a) == n
         return _Plane(b - a, c - a, db - da, dc - da)
 
 
