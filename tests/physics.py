@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.mesh.points import Layout
+from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.problem import Problem, build_problem
 from lyra_petsc.stepping.roundoff import residual_roundoff
+from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic
 
@@ -194,3 +196,37 @@ class Simulation:
         for _ in range(steps):
             self.step(dt)
         return self.x
+
+
+def end_on_one_rank(comm: MPI.Comm, scene: Scene, folder: Path, steps: int) -> Array | None:
+    """Positions at the end of a run (V, 3) in mesh order, on rank 0; None on the others; collective.
+
+    So many steps are taken on all ranks; the run goes on from its checkpoint in ``folder`` on rank 0 alone.
+    """
+    simulation = SteppedScene(comm, scene)
+    recorder = Recorder(simulation)
+    if comm.rank == 0:
+        folder.mkdir()
+    comm.Barrier()
+    recorder.begin(folder)
+    for _ in range(steps):
+        recorder.record(simulation.step())
+    recorder.write_checkpoint()
+    recorder.settle()
+    recorder.close()
+    simulation.destroy()
+    few, x = comm.Split(0 if comm.rank == 0 else 1), None
+    if comm.rank == 0:
+        resumed = SteppedScene(few, scene)
+        again = Recorder(resumed)
+        again.resume(folder)
+        assert resumed.step_number == steps
+        while not resumed.finished:
+            again.record(resumed.step())
+        again.settle()
+        again.close()
+        x = gathered(resumed.problem.points, resumed.problem.system.x)
+        resumed.destroy()
+    few.Free()
+    comm.Barrier()
+    return x

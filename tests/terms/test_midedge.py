@@ -13,13 +13,22 @@ from examples import BENDING, curved_sheet
 from mpi4py import MPI
 from numpy.typing import NDArray
 from oracle import directors_along_normals, gradient
-from physics import CLOTH, Simulation, gathered, grid, obj_file, reference, rotation, scene_of
+from physics import (
+    CLOTH,
+    Simulation,
+    end_on_one_rank,
+    gathered,
+    grid,
+    obj_file,
+    reference,
+    rotation,
+    scene_of,
+)
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
-from lyra_petsc.stepping.simulation import StepReport
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import unit
 from lyra_petsc.terms.moment import Moment
@@ -249,36 +258,9 @@ def test_a_clamp_turns_the_sheet_with_it() -> None:
 def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp: Path) -> None:
     scene = TURN | {"time": STEPS | {"integrator": scheme}}
     whole = outcome(comm, scene)[0]
-    folder = shared_tmp / "run"
-    simulation = Run(comm, scene_of(SHEET | scene))
-    recorder = Recorder(simulation)
+    x = end_on_one_rank(comm, scene_of(SHEET | scene), shared_tmp / "run", steps=4)
     if comm.rank == 0:
-        folder.mkdir()
-    comm.Barrier()
-    recorder.begin(folder)
-    for _ in range(4):
-        recorder.record(simulation.step())
-    recorder.write_checkpoint()
-    recorder.settle()
-    recorder.close()
-    simulation.destroy()
-    few = comm.Split(0 if comm.rank == 0 else 1)
-    if comm.rank == 0:
-        resumed = Run(few, scene_of(SHEET | scene))
-        again = Recorder(resumed)
-        again.resume(folder)
-        assert resumed.step_number == 4
-        reports: list[StepReport] = []
-        while not resumed.finished:
-            reports.append(resumed.step())
-            again.record(reports[-1])
-        again.settle()
-        again.close()
-        x = gathered(resumed.problem.points, resumed.problem.system.x)
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
-        resumed.destroy()
-    few.Free()
-    comm.Barrier()
 
 
 # -- rest shapes and refusals --------------------------------------------------------------------------
