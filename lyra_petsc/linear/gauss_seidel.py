@@ -69,6 +69,69 @@ def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
         inverse[row, 6], inverse[row, 7], inverse[row, 8] = r, v, w
 
 
+@cached()
+def invert_roots(rows, indptr, values, roots):  # type: ignore[no-untyped-def]
+    """L⁻¹ of the diagonal blocks L Lᵀ of rows (n,) into roots (2, n_local, 3), lower half row by row.
+
+    Directions without stiffness, or with a negative one, are left out.
+    """
+    for number in range(Index(len(rows))):
+        row = Index(rows[number])
+        k = Index(indptr[row])
+        least = 1e-12 * max(values[k, 0], values[k, 4], values[k, 8])
+        b, c, e = values[k, 1], values[k, 2], values[k, 5]
+        d, f = values[k, 4], values[k, 8]
+        p = q = r = l10 = l20 = l21 = 0.0
+        if values[k, 0] > least:
+            p = 1.0 / np.sqrt(values[k, 0])
+            l10, l20 = b * p, c * p
+        d -= l10 * l10
+        if d > least:
+            q = 1.0 / np.sqrt(d)
+            l21 = (e - l10 * l20) * q
+        f -= l20 * l20 + l21 * l21
+        if f > least:
+            r = 1.0 / np.sqrt(f)
+        roots[0, row, 0], roots[0, row, 1], roots[0, row, 2] = p, -q * l10 * p, q
+        roots[1, row, 0], roots[1, row, 1], roots[1, row, 2] = r * (l21 * q * l10 - l20) * p, -r * l21 * q, r
+
+
+@cached()
+def relative_couplings(rows, indptr, ends, columns, values, roots, sums):  # type: ignore[no-untyped-def]
+    """Sums (n,) over each row's couplings C_ij to ghosts of a bound of ‖L_i⁻¹ C_ij L_j⁻ᵀ‖.
+
+    The bound of a norm is the eighth root of the sum of the singular values' eighth powers.
+    """
+    m, squares = np.empty((3, 3)), np.empty((3, 3))
+    for number in range(Index(len(rows))):
+        row = Index(rows[number])
+        total = 0.0
+        a0, a1, a2 = roots[0, row, 0], roots[0, row, 1], roots[0, row, 2]
+        a3, a4, a5 = roots[1, row, 0], roots[1, row, 1], roots[1, row, 2]
+        for k in range(Index(ends[row]), Index(indptr[row + Index(1)])):
+            j = Index(columns[k])
+            for i in range(3):  # the stored block is the transpose: row i of it belongs to the ghost
+                s0, s1, s2 = values[k, 3 * i], values[k, 3 * i + 1], values[k, 3 * i + 2]
+                m[i, 0], m[i, 1] = s0 * a0, s0 * a1 + s1 * a2
+                m[i, 2] = s0 * a3 + s1 * a4 + s2 * a5
+            for i in range(3):
+                s0, s1, s2 = m[0, i], m[1, i], m[2, i]
+                m[0, i], m[1, i] = s0 * roots[0, j, 0], s0 * roots[0, j, 1] + s1 * roots[0, j, 2]
+                m[2, i] = s0 * roots[1, j, 0] + s1 * roots[1, j, 1] + s2 * roots[1, j, 2]
+            for i in range(3):
+                for n in range(3):
+                    squares[i, n] = m[0, i] * m[0, n] + m[1, i] * m[1, n] + m[2, i] * m[2, n]
+            eighth = 0.0
+            for i in range(3):
+                for n in range(3):
+                    fourth = 0.0
+                    for o in range(3):
+                        fourth += squares[i, o] * squares[o, n]
+                    eighth += fourth * fourth
+            total += eighth**0.125
+        sums[number] = total
+
+
 @cached(inline="always")
 def _solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
     """A point's unknowns by the inverse of its block."""

@@ -22,7 +22,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.linear import gauss_seidel as sweeps
 from lyra_petsc.linear.hierarchy import Hierarchy, Level
 from lyra_petsc.linear.matrix import AssembledMatrix
-from lyra_petsc.linear.pattern import begins
 from lyra_petsc.phases import SWEEP, TRANSFER
 
 Array = NDArray[np.float64]
@@ -36,7 +35,7 @@ HUGE = 1e30
 """No preconditioner has such entries."""
 
 SAFE = 0.9
-"""Fraction of a diagonal block that couplings to other ranks may reach."""
+"""What couplings to other ranks may reach in sum, relative to the diagonal blocks."""
 
 
 class Smoother:
@@ -55,10 +54,7 @@ class Smoother:
         self.points, self.n_couplings = points, pattern.n_couplings
         n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
-        self._edge = edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        counts = pattern.indptr[edge + 1] - pattern.ends[edge]
-        self._begins = begins(counts)[:-1]  # of each row's among the couplings to ghosts
-        self._to_ghosts = np.arange(counts.sum()) + np.repeat(pattern.ends[edge] - self._begins, counts)
+        self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
@@ -81,33 +77,29 @@ class Smoother:
         values, first = values.reshape(-1, 9), self._rows[0]
         sweeps.store(first, values, self._blocks)
         sweeps.invert_diagonal(first, values, self._inverse)
-        self._increase_diagonal(values.reshape(-1, 3, 3))
+        self._increase_diagonal(values)
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
 
     def _increase_diagonal(self, values: Array) -> None:
-        """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase.
+        """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
 
-        A block C couples x and y by at most (xᵀ|C|x + yᵀ|Cᵀ|y) / 2, |C| = (C Cᵀ)^½; where the sum S of
-        a row's |C| exceeds its diagonal block D the increase is the positive part of (S − D) / 2.
+        With D = L Lᵀ a coupling C of rows i and j is at most n (xᵢᵀ Dᵢ xᵢ + xⱼᵀ Dⱼ xⱼ) / 2, n the norm of
+        Lᵢ⁻¹ C Lⱼ⁻ᵀ. Where a row's n exceed 1 in sum, its diagonal block grows by half of what is too much.
         """
-        rows = self._edge
-        self._lagged, self._increase = rows[:0], self._increase[:0]
-        if not len(rows):
+        if self.points.comm.size == 1:
             return
-        blocks, diagonal = values[self._to_ghosts], values[self._rows[0][rows]]
-        if not (np.isfinite(blocks).all() and np.isfinite(diagonal).all()):
-            return
-        scale = max(float(np.abs(diagonal).max()), float(np.abs(blocks).max()))
-        sizes = np.add.reduceat(_sizes(blocks / scale), self._begins)
-        excess, directions = np.linalg.eigh(sizes - SAFE / scale * diagonal)
-        found = excess[:, -1] > 0.0
-        if not found.any():
-            return
-        self._lagged = rows[found]
-        increase = scale / 2.0 * _product(np.maximum(excess[found], 0.0), directions[found])
-        self._increase = increase.astype(np.float32)
-        self._inverse[self._lagged] = np.linalg.inv(diagonal[found] + increase).reshape(-1, 9)
+        roots = np.zeros((2, self.points.n_local, 3), dtype=np.float32)
+        sweeps.invert_roots(self._edge, self._rows[0], values, roots)
+        for half in roots:
+            self.points.update_ghosts(half)
+        sums = np.empty(len(self._edge))
+        sweeps.relative_couplings(self._edge, *self._rows, values, roots, sums)
+        found = sums > SAFE
+        self._lagged = rows = self._edge[found]
+        growth = (sums[found, None] - SAFE) / 2.0
+        self._inverse[rows] /= 1.0 + growth
+        self._increase = (growth * values[self._rows[0][rows]]).astype(np.float32).reshape(-1, 3, 3)
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
@@ -177,18 +169,6 @@ class Smoother:
         self._turns.follow(more)
         self.x += more
         self.points.update_ghosts(self.x)  # edges of others have followed there
-
-
-def _product(values: Array, vectors: Array) -> Array:
-    """Symmetric matrices (n, 3, 3) with these eigenvalues (n, 3) and eigenvectors (n, 3, 3)."""
-    product: Array = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
-    return product
-
-
-def _sizes(blocks: Array) -> Array:
-    """(C Cᵀ)^½ of each block C (n, 3, 3)."""
-    squares, vectors = np.linalg.eigh(blocks @ blocks.transpose(0, 2, 1))
-    return _product(np.sqrt(np.maximum(squares, 0.0)), vectors)
 
 
 class Coarsest:
