@@ -71,7 +71,7 @@ def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
 
 @cached()
 def invert_roots(rows, indptr, values, roots):  # type: ignore[no-untyped-def]
-    """L⁻¹ of the diagonal blocks L Lᵀ of rows (n,) into roots (2, n_local, 3), lower half row by row.
+    """L⁻¹ of the diagonal blocks L Lᵀ of rows (n,) into roots (n_local, 6), lower half row by row.
 
     Directions without stiffness, or with a negative one, are left out.
     """
@@ -92,43 +92,37 @@ def invert_roots(rows, indptr, values, roots):  # type: ignore[no-untyped-def]
         f -= l20 * l20 + l21 * l21
         if f > least:
             r = 1.0 / np.sqrt(f)
-        roots[0, row, 0], roots[0, row, 1], roots[0, row, 2] = p, -q * l10 * p, q
-        roots[1, row, 0], roots[1, row, 1], roots[1, row, 2] = r * (l21 * q * l10 - l20) * p, -r * l21 * q, r
+        roots[row, 0], roots[row, 1], roots[row, 2] = p, -q * l10 * p, q
+        roots[row, 3], roots[row, 4], roots[row, 5] = r * (l21 * q * l10 - l20) * p, -r * l21 * q, r
 
 
 @cached()
 def relative_couplings(rows, indptr, ends, columns, values, roots, sums):  # type: ignore[no-untyped-def]
     """Sums (n,) over each row's couplings C_ij to ghosts of a bound of ‖L_i⁻¹ C_ij L_j⁻ᵀ‖.
 
-    The bound of a norm is the eighth root of the sum of the singular values' eighth powers.
+    The bound of a norm is the fourth root of the sum of the singular values' fourth powers.
     """
-    m, squares = np.empty((3, 3)), np.empty((3, 3))
+    m = np.empty((3, 3))
     for number in range(Index(len(rows))):
         row = Index(rows[number])
         total = 0.0
-        a0, a1, a2 = roots[0, row, 0], roots[0, row, 1], roots[0, row, 2]
-        a3, a4, a5 = roots[1, row, 0], roots[1, row, 1], roots[1, row, 2]
+        a0, a1, a2 = roots[row, 0], roots[row, 1], roots[row, 2]
+        a3, a4, a5 = roots[row, 3], roots[row, 4], roots[row, 5]
         for k in range(Index(ends[row]), Index(indptr[row + Index(1)])):
             j = Index(columns[k])
-            for i in range(3):  # the stored block is the transpose: row i of it belongs to the ghost
+            b0, b1, b2 = roots[j, 0], roots[j, 1], roots[j, 2]
+            b3, b4, b5 = roots[j, 3], roots[j, 4], roots[j, 5]
+            for i in range(Index(3)):  # the stored block is the transpose: row i of it belongs to the ghost
                 s0, s1, s2 = values[k, 3 * i], values[k, 3 * i + 1], values[k, 3 * i + 2]
-                m[i, 0], m[i, 1] = s0 * a0, s0 * a1 + s1 * a2
-                m[i, 2] = s0 * a3 + s1 * a4 + s2 * a5
-            for i in range(3):
+                m[i, 0], m[i, 1], m[i, 2] = s0 * a0, s0 * a1 + s1 * a2, s0 * a3 + s1 * a4 + s2 * a5
+            xx = yy = zz = xy = xz = yz = 0.0
+            for i in range(Index(3)):
                 s0, s1, s2 = m[0, i], m[1, i], m[2, i]
-                m[0, i], m[1, i] = s0 * roots[0, j, 0], s0 * roots[0, j, 1] + s1 * roots[0, j, 2]
-                m[2, i] = s0 * roots[1, j, 0] + s1 * roots[1, j, 1] + s2 * roots[1, j, 2]
-            for i in range(3):
-                for n in range(3):
-                    squares[i, n] = m[0, i] * m[0, n] + m[1, i] * m[1, n] + m[2, i] * m[2, n]
-            eighth = 0.0
-            for i in range(3):
-                for n in range(3):
-                    fourth = 0.0
-                    for o in range(3):
-                        fourth += squares[i, o] * squares[o, n]
-                    eighth += fourth * fourth
-            total += eighth**0.125
+                x, y, z = s0 * b0, s0 * b1 + s1 * b2, s0 * b3 + s1 * b4 + s2 * b5
+                xx, yy, zz = xx + x * x, yy + y * y, zz + z * z
+                xy, xz, yz = xy + x * y, xz + x * z, yz + y * z
+            squares = xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)
+            total += np.sqrt(np.sqrt(squares))
         sums[number] = total
 
 

@@ -89,17 +89,18 @@ class Smoother:
         """
         if self.points.comm.size == 1:
             return
-        roots = np.zeros((2, self.points.n_local, 3), dtype=np.float32)
+        packed = np.empty((self.points.n_local, 3))  # six numbers in single precision: one message
+        roots = packed.view(np.float32)
         sweeps.invert_roots(self._edge, self._rows[0], values, roots)
-        for half in roots:
-            self.points.update_ghosts(half)
+        self.points.update_ghosts(packed)
         sums = np.empty(len(self._edge))
         sweeps.relative_couplings(self._edge, *self._rows, values, roots, sums)
-        found = sums > SAFE
+        found = np.flatnonzero(sums > SAFE)
         self._lagged = rows = self._edge[found]
-        growth = (sums[found, None] - SAFE) / 2.0
-        self._inverse[rows] /= 1.0 + growth
-        self._increase = (growth * values[self._rows[0][rows]]).astype(np.float32).reshape(-1, 3, 3)
+        if len(found):
+            growth = (sums[found, None] - SAFE) / 2.0
+            self._inverse[rows] /= 1.0 + growth
+            self._increase = (growth * values[self._rows[0][rows]]).astype(np.float32).reshape(-1, 3, 3)
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
