@@ -14,7 +14,8 @@ from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import hinge_hessian
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge, mean_directors
-from lyra_petsc.terms.midedge_shape import carried, unit
+from lyra_petsc.terms.midedge_energy import triangle_hessian
+from lyra_petsc.terms.midedge_shape import Frames, carried, unit
 from lyra_petsc.terms.term import Elastic, Step, Viscous
 from lyra_petsc.terms.wind import Wind
 
@@ -150,6 +151,18 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
     return out
 
 
+def midedge_blocks(term: MidEdge, x: Array, frames: Frames, blend: float, out: Array) -> None:
+    """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
+    data, shape, slopes = term.elements.data, term._shape(x, frames), np.empty((3, 9))
+    numbers = term.stencil, term.of_edges.of_triangles, data["sign"], shape
+    for e in range(term.n_elements):
+        upper, gradients = np.zeros((12, 12)), np.zeros((3, 12))
+        constants = *term._constants, data["length"], gradients, slopes
+        triangle_hessian(x, e, blend, *numbers, *constants, upper)
+        upper[:9, :9] = np.triu(upper[:9, :9])
+        out[e] = np.triu(upper) + np.triu(upper, 1).T
+
+
 def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
     """Element Hessians (E, 3, 3, 3, 3): a ninth of ∂²P/∂v_rel² to each pair of corners."""
     out = np.empty((term.n_elements, 3, 3, 3, 3))
@@ -187,7 +200,10 @@ def plain_hessian(term: Elastic, at: Array, frozen: Any, blend: float) -> Array:
     points, unknowns = 3 * term.stencil[:, :, None] + np.arange(3), term.edges
     index = np.concatenate([points.reshape(len(points), -1), unknowns], axis=1)
     out, blocks = np.zeros((at.size, at.size)), np.empty((len(index), index.shape[1], index.shape[1]))
-    term.hessians(at, frozen, 0, term.n_elements, blend, blocks)
+    if isinstance(term, MidEdge):
+        midedge_blocks(term, at, frozen, blend, blocks)
+    else:
+        term.hessians(at, frozen, 0, term.n_elements, blend, blocks)
     for rows, block in zip(index, blocks, strict=True):
         out[np.ix_(rows, rows)] += block
     return out.reshape(*at.shape, *at.shape)

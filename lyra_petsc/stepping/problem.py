@@ -5,8 +5,8 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -34,9 +34,9 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.motion import Window, motion_of
 from lyra_petsc.terms.prescribed_handles import Held, Selection, disagreements, is_exact, select_held
-from lyra_petsc.terms.registry import Role, active, registered
+from lyra_petsc.terms.registry import Role, active, made, registered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Term
+from lyra_petsc.terms.term import Elastic, Load, Term
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.clamped_edges import ClampedEdges
@@ -197,15 +197,14 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     for number, vertices in held.items():
         elements[f"held {number}"] = Elements(vertices[:, None])
     _check_symmetry(rest, held)
-    if "midedge" in names and any(handle.holds_slope for handle in scene.handles):
-        from lyra_petsc.terms import clamped_edges  # of use for nothing else
+    for entry in map(registered, names):
+        if entry.coarse:
+            elements[f"coarse {entry.name}"] = entry.module().coarse_elements(rest)
+        if entry.edge_state and any(handle.holds_slope for handle in scene.handles):
+            from lyra_petsc.terms import clamped_edges  # of use for nothing else
 
-        clamps = clamped_edges.elements(rest)
-        elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
-    if "midedge" in names:
-        from lyra_petsc.terms import bending  # where all bending is by edges nothing else needs it
-
-        elements["hinges"] = bending.elements(rest, ("hinge", "midedge"))
+            clamps = clamped_edges.elements(rest)
+            elements |= {f"clamp {number}": clamped for number, clamped in clamps.items()}
     for name, selector in scene.probes.items():
         vertices = select_vertices(mesh, selector, key=f"probes.{name}", file=scene.source)
         elements[f"probe {name}"] = Elements(vertices[:, None])
@@ -254,12 +253,11 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
 
 def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:
     layout = part.layout
-    terms: dict[str, Term] = {}
-    for name in outline.terms:
-        entry = registered(name)
-        terms[name] = entry.module().make(part.elements.get(name), scene, part.vertex_data["mass"])
-        terms[name].registration = entry
-    _let_moments_act(terms)
+    on_vertices = part.vertex_data["mass"]
+    terms = {n: made(registered(n), part.elements.get(n), scene, on_vertices) for n in outline.terms}
+    for load in terms.values():
+        if isinstance(load, Load):
+            load.connect(terms.values())
     integrator = integrator_of(scene.time.scheme, _spectral_radius(scene))
     roles = {Role.ELASTIC, Role.CONSTRAINT} | (set() if integrator.lagged_loads else {Role.VISCOUS})
     coupling = [term for term in terms.values() if term.registration.role in roles]
@@ -281,10 +279,12 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         starts=[Window.of(handle).start for handle in scene.handles],
         events=events(scene),
     )
-    if "hinges" in part.elements:
-        hinged = registered("bending")
-        system.hinges = hinged.module().make(part.elements["hinges"], scene, part.vertex_data["mass"])
-        system.hinges.registration = hinged
+    for term in system.elastic:
+        if term.registration.coarse:
+            entry, name = registered(term.registration.coarse), f"coarse {term.name}"
+            coarse = cast("Elastic", made(entry, part.elements[name], scene, on_vertices))
+            coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
+            system.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     system.x[rows] = data["position"]
     layout.update_ghosts(system.x)
@@ -313,18 +313,6 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     )
 
 
-def _let_moments_act(terms: Mapping[str, Term]) -> None:
-    """Give the moments of loads the edges that they turn."""
-    if "moment" in terms:
-        from lyra_petsc.terms.midedge import MidEdge
-        from lyra_petsc.terms.moment import Moment
-
-        moment, bending = terms["moment"], terms["midedge"]
-        assert isinstance(moment, Moment)
-        assert isinstance(bending, MidEdge)
-        moment.act_on(bending)
-
-
 def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:
     """The edges that handles clamp, where they have unknowns."""
     clamping = {n: handle for n, handle in enumerate(scene.handles) if f"clamp {n}" in part.elements}
@@ -333,8 +321,7 @@ def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> Clamp
     from lyra_petsc.terms.clamped_edges import ClampedEdges
     from lyra_petsc.terms.midedge import MidEdge
 
-    term, layout = terms["midedge"], part.layout
-    assert isinstance(term, MidEdge)
+    term, layout = next(term for term in terms.values() if isinstance(term, MidEdge)), part.layout
     return ClampedEdges(
         term,
         {n: part.elements[f"clamp {n}"] for n in clamping},

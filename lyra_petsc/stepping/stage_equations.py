@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -38,9 +38,6 @@ from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
-
-if TYPE_CHECKING:
-    from lyra_petsc.terms.bending import Bending
 
 Array = NDArray[np.float64]
 
@@ -83,8 +80,8 @@ class StageEquations:
     unbalanced, given_loads : (n_owned, 3) or None
         Static: force [N] that holds the start shape, reduced as the load factor grows; loads in place of the
         present ones.
-    hinges : Bending or None
-        Where edges carry unknowns: of the same sheet with hinges, for the preconditioner.
+    coarse : dict of Elastic → Elastic
+        Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
     """
 
     def __init__(
@@ -128,7 +125,7 @@ class StageEquations:
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
         self.given_loads: Array | None = None
-        self.hinges: Bending | None = None
+        self.coarse: dict[Elastic, Elastic] = {}
         self._iterates: tuple[Array | None, Array | None] = (None, None)
         self._last_parts: dict[str, Array] = {}
 

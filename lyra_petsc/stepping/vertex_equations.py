@@ -27,7 +27,7 @@ class VertexEquations:
     Parameters
     ----------
     equations : StageEquations
-        With ``hinges``.
+        With terms in ``coarse``.
 
     Attributes
     ----------
@@ -37,11 +37,9 @@ class VertexEquations:
     """
 
     def __init__(self, equations: StageEquations) -> None:
-        assert equations.hinges is not None
         self._equations, layout = equations, equations.points
         self._bent = next(term for term in equations.elastic if isinstance(term, MidEdge))
-        others = [t for t in equations.elastic if t.name not in ("bending", "midedge")]
-        self._elastic: list[Elastic] = [*others, equations.hinges]
+        self._elastic: list[Elastic] = [equations.coarse.get(term, term) for term in equations.elastic]
         self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.viscous
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):

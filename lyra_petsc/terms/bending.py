@@ -11,7 +11,7 @@ Below a tenth of a triangle's rest area its hinges fade out, see ``hinge_energy`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -29,10 +29,6 @@ from lyra_petsc.terms.term import Across, Couplings, Elastic, Offsets
 
 Array = NDArray[np.float64]
 Stencil = NDArray[np.int32] | NDArray[np.int64]
-
-
-ACROSS = "bending across"
-"""Coupling of the two opposite vertices of a hinge."""
 
 
 class Bent(NamedTuple):
@@ -123,7 +119,7 @@ class Bending(Elastic):
 
     @property
     def couplings(self) -> Couplings:
-        return {self.name: self._triangles.corners, ACROSS: Across(self.stencil[:, 2:])}
+        return {self.name: self._triangles.corners, f"{self.name} across": Across(self.stencil[:, 2:])}
 
     def add_hessian(
         self,
@@ -136,7 +132,7 @@ class Bending(Elastic):
         before: Array | None = None,
     ) -> None:
         corners, sides, hinges = self._triangles
-        within, across, bent = offsets[self.name], offsets[ACROSS], self._bent(x)
+        within, across, bent = offsets[self.name], offsets[f"{self.name} across"], self._bent(x)
         factors = np.empty((self.n_elements + 1, 2))
         law = self._k, self._rest, self._limit, weight
         add_across(x, self.stencil, sides, *bent, blend, *law, within, across, values, factors)
@@ -159,7 +155,7 @@ def edge_in_material(
     triangle: NDArray[np.int64],
     tail: NDArray[np.int64],
     head: NDArray[np.int64],
-    models: Sequence[str] = ("hinge",),
+    model: str = "hinge",
 ) -> tuple[Array, Array]:
     """An edge (tail → head) of each triangle in its material plane.
 
@@ -182,9 +178,9 @@ def edge_in_material(
     stiffness = np.zeros(len(triangle))
     for number, shell in enumerate(rest.shells):
         mine = rest.shell_of[triangle] == number
-        if shell.model not in models or not shell.bends_by(shell.model):
+        if not shell.bends_by(model):
             continue
-        if shell.model == "hinge":
+        if model == "hinge":
             stiffness[mine] = np.interp(direction[mine], [0.0, 45.0, 90.0], shell.bending)
         else:
             along = edge[mine] / np.linalg.norm(edge[mine], axis=1, keepdims=True)
@@ -246,15 +242,15 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
     return half
 
 
-def elements(rest: RestShape, models: Sequence[str] = ("hinge",)) -> Elements:
-    """All interior edges of materials of these bending models, with their constants (rank 0).
+def elements(rest: RestShape, model: str = "hinge") -> Elements:
+    """All interior edges of materials of a bending model, with their constants (rank 0).
 
     Between two materials the smaller B counts, as in the original; rest lengths are means over the
     two faces where a seam makes them differ.
     """
     quad, faces = rest.hinges.vertices, rest.hinges.triangles
     edges, stiffnesses = zip(
-        *(edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], models) for side in range(2)),
+        *(edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], model) for side in range(2)),
         strict=True,
     )
     length = 0.5 * (np.linalg.norm(edges[0], axis=1) + np.linalg.norm(edges[1], axis=1))

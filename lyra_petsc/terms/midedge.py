@@ -178,13 +178,6 @@ class MidEdge(Elastic):
         numbers = self.stencil, self.of_edges.of_triangles, self.edges
         midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *self._constants, data["length"], out)
 
-    def hessians(self, x: Array, frozen: Frames, lo: int, hi: int, blend: float, out: Array) -> None:
-        data, shape = self.elements.data, self._shape(x, frozen)
-        numbers = self.of_edges.of_triangles, data["sign"], shape
-        midedge_energy.hessians(
-            x, self.stencil, lo, hi, blend, *numbers, *self._constants, data["length"], out
-        )
-
     def add_hessian(
         self,
         x: Array,
@@ -361,6 +354,13 @@ def _check(tangent: Array, number: Ints, edges: Ints, rest: RestShape, what: str
             file=rest.scene.source,
             key="mesh",
         )
+
+
+def coarse_elements(rest: RestShape) -> Elements:
+    """Hinges between the same triangles."""
+    from lyra_petsc.terms import bending  # where all bending is by edges nothing else needs it
+
+    return bending.elements(rest, "midedge")
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> MidEdge:

@@ -126,7 +126,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):  # type: ignore[no-untyped-def]
+def triangle_hessian(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):  # type: ignore[no-untyped-def]
     """The Hessian of triangle e into h (12, 12), of edges what is above the diagonal; whether it is not 0.
 
     g (3, 12) becomes the ∇α_i; beyond the vertices' part it must be 0 off the diagonal. w (3, 9) is scratch.
@@ -274,21 +274,6 @@ def _fade_hessian(corners, normal, square, limit, energy, exact, pulls, g, h):  
 
 
 @kernel()
-def hessians(  # type: ignore[no-untyped-def]
-    x, stencil, lo, hi, blend, edges, sign, shape, stiffness, rest, limit, length, out
-):
-    """Hessians [N/m] of triangles lo..hi into out (hi − lo, 12, 12)."""
-    g, w = np.zeros((3, 12)), np.empty((3, 9))
-    for e in range(lo, hi):
-        h = out[e - lo]
-        if not _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):
-            h[:] = 0.0
-        for a in range(12):
-            for b in range(a):
-                h[a, b] = h[b, a]
-
-
-@kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
     x, stencil, blend, edges, sign, shape, stiffness, rest, limit, length, places, weight, offsets, values
 ):
@@ -300,7 +285,9 @@ def add_hessian(  # type: ignore[no-untyped-def]
     blocks = values.reshape(-1, 9)
     for e in range(stencil.shape[0]):
         fetch_ahead(e, offsets, values, 21)
-        if not _fill(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):
+        if not triangle_hessian(
+            x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h
+        ):
             continue
         factor, pair = weight[e], 0
         for a in range(3):

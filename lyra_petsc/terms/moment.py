@@ -9,6 +9,8 @@ direction of the edge, with which κ grows.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import unit
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Load
+from lyra_petsc.terms.term import Load, Term
 
 Array = NDArray[np.float64]
 
@@ -41,10 +43,9 @@ class Moment(Load):
         self._load = elements.data["load"].astype(np.int64)
         self._windows = windows
 
-    def act_on(self, term: MidEdge) -> None:
-        """Turn the directors of this term; before anything else is asked."""
+    def connect(self, terms: Iterable[Term]) -> None:
         assert self.edges is not None
-        self._term = term
+        self._term = term = next(term for term in terms if isinstance(term, MidEdge))
         self._places = self.edges[:, 0]
         self._numbers = np.searchsorted(term.of_edges.places, self._places)
 

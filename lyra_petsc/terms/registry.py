@@ -12,9 +12,17 @@ from dataclasses import dataclass, field
 from enum import Enum
 from importlib import import_module
 from types import ModuleType
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import Scene
+
+if TYPE_CHECKING:
+    from lyra_petsc.mesh.elements import Elements
+    from lyra_petsc.terms.term import Term
 
 Need = Callable[[Scene, Sequence[ShellMaterial]], bool]
 
@@ -57,6 +65,9 @@ class Registration:
         It limits how far a Newton iteration may go.
     state, edge_state : tuple of str
         Names of the arrays that a checkpoint must hold for it, of vertices and of edges with an unknown.
+    coarse : str
+        The term that stands for it on coarse levels of multigrid, which have no unknowns of edges. Its module
+        offers ``coarse_elements(rest)``, of that term.
     home : str
         Full name of its module, where that is elsewhere.
     """
@@ -73,6 +84,7 @@ class Registration:
     limits_step: bool = False
     state: tuple[str, ...] = ()
     edge_state: tuple[str, ...] = ()
+    coarse: str = ""
     home: str = ""
 
     def module(self) -> ModuleType:
@@ -100,6 +112,7 @@ REGISTRY: list[Registration] = [
         bends=True,
         limits_step=True,
         edge_state=("frame",),
+        coarse="bending",
     ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(
@@ -138,3 +151,10 @@ def active(scene: Scene, shells: Sequence[ShellMaterial]) -> list[Registration]:
 def registered(name: str) -> Registration:
     """The entry of a term."""
     return next(entry for entry in REGISTRY if entry.name == name)
+
+
+def made(entry: Registration, elements: Elements | None, scene: Scene, mass: NDArray[np.float64]) -> Term:
+    """A term on one rank, of its elements there and the mass (n_vertices,) [kg] of the vertices."""
+    term: Term = entry.module().make(elements, scene, mass)
+    term.registration = entry
+    return term

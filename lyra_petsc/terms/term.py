@@ -12,7 +12,7 @@ given back with every call, so that no result depends on the order of calls.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -267,6 +267,9 @@ class Load(Term):
 
     follows: ClassVar[bool] = False
     """Whether it depends on the positions at the start of the step."""
+
+    def connect(self, terms: Iterable[Term]) -> None:
+        """Know the scene's terms, which it may act through; before anything else is asked."""
 
     @abstractmethod
     def add_force(self, x: Array, t0: float, t1: float, out: Array) -> None:
