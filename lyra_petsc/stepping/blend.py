@@ -43,6 +43,7 @@ class Blend:
         self.value = 1.0 if mode == "regularised" else 0.0
         # what was too little lately, and what was enough: the least lies between them
         self._too_little, self._enough = 0.0, 1.0
+        self._lower = LOWER
 
     def after(self, taken: float) -> float:
         """The fraction for the next iteration, when the line search took ``taken`` of the last step."""
@@ -50,7 +51,8 @@ class Blend:
             self.raise_()
         elif self._adaptive:
             self._enough = self.value
-            lowered = LOWER * self.value
+            lowered = self._lower * self.value
+            self._lower *= self._lower
             if lowered <= self._too_little < self.value:
                 lowered = self._between(self._too_little, self.value)
             self.value = lowered if lowered > SMALLEST else 0.0
@@ -61,7 +63,7 @@ class Blend:
         """Take more, after negative curvature was met; False if there is no more."""
         if not self._adaptive or self.value >= 1.0:
             return False
-        self._too_little = self.value
+        self._too_little, self._lower = self.value, LOWER
         raised = max(FIRST, RAISE * self.value)
         if self.value < self._enough < raised:
             raised = self._between(self.value, self._enough)

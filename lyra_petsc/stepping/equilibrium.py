@@ -47,6 +47,9 @@ EASY, FAIR = 6, 15
 
 GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
 
+LEAP, LEAP_ITERATIONS = 1e3, 20
+"""Further growth of Δτ, until such a solve has taken more iterations; so it is with what sufficed before."""
+
 LONGEST = 1e7
 """Largest Δτ over the first one: beyond it the last term is round-off."""
 
@@ -95,8 +98,9 @@ class Equilibrium:
         assert isinstance(system.integrator, Static)
         self._system, self._stepper, self._integrator = system, stepper, system.integrator
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
-        self._longest = LONGEST
+        self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
+        self._sufficed = 0.0
         self._follows = bool(system.viscous) or any(load.follows for load in system.loads)
         system.load_factor = 0.0
         system.begin_step(0.0, 0.0)
@@ -111,7 +115,7 @@ class Equilibrium:
         x = system.x[:n].copy()
         system.load_factor = factor
         newton = linear = solves = 0
-        anchored, last, arrived = 0.0, np.inf, False
+        anchored, last, arrived, leaps = 0.0, np.inf, False, not self._follows
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
@@ -122,7 +126,7 @@ class Equilibrium:
             history.append(_row(force, attempt if solves else None))
             if arrived and force <= self._allowed():
                 system.moving_energy_before = anchored
-                self._in_vain = 0
+                self._in_vain, self._sufficed = 0, self._integrator.pseudo
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
@@ -132,7 +136,8 @@ class Equilibrium:
                 self._integrator.pseudo *= SHRINK
             last = force
             system.given_loads = relaxation.following(system.loads_now.copy()) if self._follows else None
-            attempt = self._stepper.attempt(before, factor)
+            leap = leaps and self._integrator.pseudo > self._careful
+            attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             system.given_loads = None
             solves += 1
             newton += attempt.newton_iterations
@@ -140,13 +145,14 @@ class Equilibrium:
             if attempt.converged:
                 arrived = True
                 system.carry_frames()  # edges may turn far until they are in equilibrium
-                self._integrator.pseudo = min(
-                    self._integrator.pseudo * growth(attempt.newton_iterations), self._longest
-                )
+                self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
+                self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
-                self._integrator.pseudo *= SHRINK
+                self._integrator.pseudo = self._careful if leap else SHRINK * self._integrator.pseudo
+                leaps = False
+        self._sufficed = 0.0
         self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
@@ -160,6 +166,15 @@ class Equilibrium:
             words=attempt.words or words,
             stuck=stuck,
         )
+
+    def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
+        """A proximal step, given up after ``most`` Newton iterations; collective."""
+        snes = self._stepper.snes
+        allowed = snes.getTolerances()[3]
+        snes.setTolerances(max_it=min(allowed, most or allowed))
+        attempt = self._stepper.attempt(before, factor)
+        self._stepper.snes.setTolerances(max_it=allowed)
+        return attempt
 
     def settle(self, before: float, factor: float) -> Settled:
         """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
@@ -190,6 +205,7 @@ class Equilibrium:
             finally:
                 examination.destroy()
             x = system.x[:n].copy()
+            self._sufficed = 0.0
             system.state.set(x + way, np.zeros_like(x))
             attempt = self.attempt(before, factor)
             newton += attempt.newton_iterations
@@ -206,12 +222,13 @@ class Equilibrium:
 
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold to go on alike."""
-        return {"scale": self._scale, "in_vain": self._in_vain}
+        return {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
 
     def restore(self, memory: Mapping[str, float]) -> None:
         """Go on with a memory; an older one is empty."""
         self._scale = float(memory.get("scale", self._scale))
         self._in_vain = int(memory.get("in_vain", self._in_vain))
+        self._sufficed = float(memory.get("sufficed", self._sufficed))
 
     @property
     def in_vain(self) -> bool:
@@ -267,8 +284,10 @@ class Equilibrium:
                 mass = system.points.summed(float(system.mass.sum()))[0] / system.points.n_vertices_global
                 fastest = max(fastest, float(np.abs(force[n:]).max(initial=0.0)) / mass)
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
-            self._integrator.pseudo = float(np.sqrt(self._spacing / fastest))
-            self._longest = LONGEST * self._integrator.pseudo
+            self._careful = float(np.sqrt(self._spacing / fastest))
+            self._longest = LONGEST * self._careful
+            sufficed = 0.0 if self._follows else self._sufficed
+            self._integrator.pseudo = min(max(self._careful, sufficed), self._longest)
         return norm
 
     def _allowed(self) -> float:

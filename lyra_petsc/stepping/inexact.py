@@ -11,6 +11,9 @@ from petsc4py import PETSc
 LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
+STATIC = 1e-4
+"""In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
+
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
 

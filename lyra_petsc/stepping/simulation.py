@@ -176,7 +176,8 @@ class SteppedScene:
         smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
         smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
         if time.analysis == "static":
-            return LoadControl(largest, end, None, events(self.scene), smallest)
+            most = petsc_number("ts_adapt_dt_max", end)
+            return LoadControl(largest, end, events(self.scene), smallest, most)
         if time.adaptive:
             return ToleranceControl(step, largest, end, every, events(self.scene), smallest)
         return StepControl(largest, end, every, events(self.scene), smallest)

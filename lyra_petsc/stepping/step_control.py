@@ -184,11 +184,18 @@ class ToleranceControl(StepControl):
 class LoadControl(StepControl):
     """Increments of the load factor: larger after an easy step, halved after a failure.
 
-    ``step`` is the first increment; ``factor`` may grow beyond 1.
+    ``step`` is the first increment, ``largest`` the largest; ``factor`` may grow beyond 1.
     """
 
     EASY = 12
     """Newton iterations of a load step after which the next is twice as large."""
 
+    def __init__(
+        self, step: float, end: float, events: Iterable[float], smallest: float, largest: float
+    ) -> None:
+        super().__init__(step, end, None, events, smallest)
+        self._largest = largest
+
     def succeeded(self, iterations: int) -> None:
-        self.factor *= 2.0 if iterations <= self.EASY else 1.0
+        larger = 2.0 * self.factor if iterations <= self.EASY else self.factor
+        self.factor = min(larger, self._largest / self.step)

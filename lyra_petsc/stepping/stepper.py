@@ -23,7 +23,7 @@ from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.extrapolation import Extrapolation
-from lyra_petsc.stepping.inexact import LOOSEST
+from lyra_petsc.stepping.inexact import LOOSEST, STATIC
 from lyra_petsc.stepping.initial_guess import first_guess
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
@@ -158,7 +158,7 @@ class Stepper:
             snes.setLineSearchPreCheck(newton.direction)
             # a Hessian that is not positive definite costs an iteration, not the step
             snes.setMaxKSPFailures(scene.solver.max_iterations)
-            ksp.setTolerances(rtol=LOOSEST, max_it=5000)
+            ksp.setTolerances(rtol=LOOSEST if equations.integrator.moves else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
             ksp.setTolerances(rtol=1e-6, max_it=5000)

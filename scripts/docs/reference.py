@@ -31,7 +31,7 @@ OPTIONS = {
     "ts_max_time": "End [s] instead of `time.end`.",
     "ts_max_steps": "Steps after which the run ends.",
     "ts_adapt_dt_min": "Smallest Δt [s], of steps of automatic length and of repeated ones.",
-    "ts_adapt_dt_max": "Largest Δt [s] of steps of automatic length.",
+    "ts_adapt_dt_max": "Largest Δt [s] of steps of automatic length; static: largest increment.",
     "ts_alpha_radius": "Spectral radius of `alpha2` instead of `time.spectral_radius`.",
     "ts_type": "Integrator instead of `time.integrator`: `beuler`, `theta`, `bdf`, `alpha2`.",
     "ts_theta_theta": "With `-ts_type theta`: 0.5 is `midpoint`, 1 is `beuler`.",

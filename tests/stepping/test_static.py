@@ -145,6 +145,15 @@ def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
     assert len(factors) < 20
 
 
+def test_the_largest_increment_is_petscs_option(comm: MPI.Comm) -> None:
+    time, petsc = {"analysis": "static", "step": 0.05}, {"ts_adapt_dt_max": 0.2}
+    with motion(comm, time=time, petsc=petsc) as simulation:
+        factors = [0.0]
+        while not simulation.finished:
+            factors.append(simulation.step().time)
+    np.testing.assert_allclose(np.diff(factors).max(), 0.2)
+
+
 NOWHERE: dict[str, tuple[dict[str, Any], str]] = {
     "nothing holds it": ({"handles": []}, "m of the start, as if nothing held the sheet"),
     "held along x": (

@@ -13,7 +13,7 @@ from lyra_petsc.experiments.verification.cases import CASES
 SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
-LONG = ("plate",)
+LONG = ("plate", "slit-annulus", "sze-end-moment", "pinched-cylinder")
 """Cases whose finest resolutions take minutes."""
 
 

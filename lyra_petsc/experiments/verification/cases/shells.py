@@ -1,0 +1,294 @@
+"""Shells that bend far, and curved ones, by one unknown on every edge: published benchmarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.verification.answers import Converges, Measured, at_finest, case, data
+from lyra_petsc.experiments.verification.rods import cantilever
+
+Array = NDArray[np.float64]
+
+TABLES = data("shells")
+LINEAR = TABLES["linear"]
+
+# -- large rotations -----------------------------------------------------------------------------------
+
+INCREMENT = 0.05
+"""Of the load factor; the tables have its multiples."""
+
+LENGTHS = {"shear": 10.0, "moment": 12.0}
+STRIP = {"young": 1.2e6, "poisson": 0.0, "thickness": 0.1, "density": 1.0}
+STIFFNESS = 1.2e6 * 0.1**3 / 12.0
+"""B [N·m]"""
+
+
+def increments(bench: Bench, scene: dict[str, Any], fraction: float) -> Iterator[tuple[float, Trial]]:
+    """Every load factor of a static scene, with these increments, and the equilibrium there; collective."""
+    scene = scene | {
+        "gravity": [0, 0, 0],
+        "time": {"analysis": "static", "step": fraction},
+        "petsc": {"ts_adapt_dt_max": fraction, "ksp_rtol": 1e-6},
+        "solver": {"force_tolerance": 1e-6},
+    }
+    with bench.simulation(scene) as trial:
+        while not trial.simulation.finished:
+            yield trial.step().time, trial
+
+
+def sze_strip(kind: str, n: float, loads: list[dict[str, Any]]) -> dict[str, Any]:
+    """A strip of Sze et al., of width 1 m, with n square cells along it."""
+    length = LENGTHS[kind]
+    size = {"width": length, "height": 1.0, "nx": round(n), "ny": round(n / length)}
+    grid = size | {"pattern": "alternating"}
+    held = [{"group": "left", "clamp": True}]
+    return {"mesh": {"grid": grid}, "material": STRIP, "handles": held, "loads": loads}
+
+
+def _tips(
+    bench: Bench, n: float, kind: str, loads: list[dict[str, Any]], rows: Sequence[Sequence[float]]
+) -> tuple[list[Measured], Array]:
+    """The load of a table at which the tip's way errs most, and the tip (−U, W) at full load."""
+    length, worst, tip = LENGTHS[kind], (0.0, 0.0), np.zeros(2)
+    table = {round(row[0], 6): np.array(row[1:]) for row in rows}
+    for factor, trial in increments(bench, sze_strip(kind, n, loads), INCREMENT):
+        end = trial.x[np.isclose(trial.start[:, 0], length)].mean(axis=0)
+        tip = np.array([length - end[0], end[2]])
+        exact = table.get(round(factor, 6))
+        if exact is not None:
+            way = float(np.linalg.norm(exact))
+            worst = max(worst, (float(np.linalg.norm(tip - exact)) / way, way))
+    error, way = worst
+    return [Measured("way of the tip, worst load of the table", way * (1.0 + error), way)], tip
+
+
+@case(
+    "Cantilever under a shear force at its end, bending_model: midedge: way of the tip at 20 loads against "
+    "the table, and at full load against the elastica with the strip's stretch",
+    source=f"{TABLES['cantilever_end_shear']['source']}; elastica by collocation",
+    resolutions=(10, 20, 40, 80),
+    claim=at_finest(2e-3),
+    claims={"way of the tip at full load": Converges(2.0, 1e-3, slack=0.5)},
+    counts="cells along the strip",
+)
+def sze_end_shear(bench: Bench, n: float) -> Sequence[Measured]:
+    loads = [{"group": "right", "force": [0.0, 0.0, 4.0]}]
+    found, tip = _tips(bench, n, "shear", loads, TABLES["cantilever_end_shear"]["rows"])
+    length, membrane = LENGTHS["shear"], 1.2e6 * 0.1
+    exact = cantilever(0.0, 4.0 * length**2 / STIFFNESS, STIFFNESS / (membrane * length**2))
+    way = np.array([1.0 - exact.reach, exact.drop]) * length
+    size, error = float(np.linalg.norm(way)), float(np.linalg.norm(tip - way))
+    return [*found, Measured("way of the tip at full load", size + error, size, "m")]
+
+
+@case(
+    "Cantilever that a moment at its end rolls up into a full circle, bending_model: midedge: way of the tip "
+    "at 20 loads against the table, and at full load against the circle",
+    source=f"{TABLES['cantilever_end_moment']['source']}; closed form",
+    resolutions=(12, 24, 48, 96),
+    claim=at_finest(1e-2),
+    claims={"−U at full load": Converges(2.0, 5e-3, slack=0.5)},
+    counts="cells along the strip",
+)
+def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
+    length = LENGTHS["moment"]
+    loads = [{"group": "right", "moment": 2.0 * math.pi * STIFFNESS / length}]
+    found, tip = _tips(bench, n, "moment", loads, TABLES["cantilever_end_moment"]["rows"])
+    return [*found, Measured("−U at full load", float(tip[0]), length, "m")]
+
+
+def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int, int]]:
+    """The plate with n cells across, and the vertices A, B of its loaded edge; collective."""
+    around = round(20 * n / 3)
+    flat, faces = rectangle(around, n, 2.0 * math.pi, 1.0)
+    radius = 6.0 + 4.0 * flat[:, 1]
+    vertices = np.column_stack([radius * np.cos(flat[:, 0]), radius * np.sin(flat[:, 0]), 0.0 * radius])
+    edge = [j * (around + 1) for j in range(n + 1)]
+    loads = [  # 0.8 N/m on 4 m
+        {"nodes": edge[1:-1], "force": [0.0, 0.0, 3.2 * (n - 1) / n]},
+        {"nodes": [edge[0], edge[-1]], "force": [0.0, 0.0, 3.2 / n]},
+    ]
+    scene = {
+        "mesh": bench.mesh(vertices, faces[:, ::-1]),
+        "material": {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0},
+        "handles": [{"nodes": [each + around for each in edge], "clamp": True}],
+        "loads": loads,
+    }
+    return scene, (edge[0], edge[-1])
+
+
+@case(
+    "Slit annular plate under a lifting line force, bending_model: midedge: height of the free slit's ends A "
+    "(inner) and B at 20 loads against the table, and at full load against Kirchhoff-Love shells",
+    source=TABLES["slit_annulus"]["source"],
+    resolutions=(6, 12, 24),
+    claim=Converges(1.8, 5e-3, slack=0.6),
+    claims={f"height of {end}, worst load of the table": at_finest(1e-2) for end in "AB"},
+    counts="cells across, 6.7 n around",
+    quick=1,
+)
+def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
+    content = TABLES["slit_annulus"]
+    table = {round(row[0], 6): row[1:] for row in content["rows"]}
+    scene, ends = slit_annulus_scene(bench, round(n))
+    worst: list[Measured] = []
+    height = np.zeros(2)
+    for factor, trial in increments(bench, scene, INCREMENT):
+        height = trial.x[list(ends), 2]
+        exact = table.get(round(factor, 6))
+        if exact is not None:
+            here = [
+                Measured(f"height of {end}, worst load of the table", float(z), of, "m")
+                for end, z, of in zip("AB", height, exact, strict=True)
+            ]
+            worst = [max(pair, key=lambda each: each.error) for pair in zip(here, worst or here, strict=True)]
+    return worst + [
+        Measured(f"height of {end} at full load", float(z), of, "m")
+        for end, z, of in zip("AB", height, content["kirchhoff_love"], strict=True)
+    ]
+
+
+# -- curved shells, linear -----------------------------------------------------------------------------
+
+PATTERNS = ("diagonal", "alternating")
+FAR = 1e4
+BESIDE = 1e-6
+"""Of a coordinate at which vertices count as on a plane, over the shell's radius."""
+
+
+def _on(axis: str, at: float, size: float) -> list[list[float]]:
+    """Opposite corners of a box about the vertices on a plane."""
+    return [
+        [at - BESIDE * size if each == axis else -FAR for each in "xyz"],
+        [at + BESIDE * size if each == axis else FAR for each in "xyz"],
+    ]
+
+
+def _symmetric(axes: str, size: float) -> list[dict[str, Any]]:
+    return [{"box": _on(axis, 0.0, size), "symmetry": axis} for axis in axes]
+
+
+def _curved(
+    bench: Bench,
+    n: int,
+    pattern: str,
+    surface: Callable[[Array, Array], tuple[Array, Array, Array]],
+    scene: dict[str, Any],
+) -> tuple[Array, Array]:
+    """Places (V, 3) [m] of n × n cells on a surface, and how far they move; collective."""
+    flat, faces = rectangle(n, n, 1.0, 1.0, alternating=pattern == "alternating")
+    vertices = np.column_stack(surface(flat[:, 0], flat[:, 1]))
+    scene = {
+        "mesh": bench.mesh(vertices, faces),
+        "gravity": [0, 0, 0],
+        "time": {"analysis": "static", "step": 1.0},
+        "solver": {"force_tolerance": 1e-8},
+        "petsc": {"ksp_rtol": 1e-8},
+    } | scene
+    with bench.simulation(scene) as trial:
+        return vertices, trial.run().x - vertices
+
+
+def _cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Array], Any]:
+    """From the crown on, with its axis along y."""
+
+    def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
+        return radius * np.sin(angle * s), length * t, radius * np.cos(angle * s)
+
+    return surface
+
+
+@case(
+    "Scordelis-Lo roof under its weight, a quarter of it, bending_model: midedge: deflection in the middle "
+    "of the free edge",
+    source=LINEAR["source"],
+    resolutions=(8, 16, 32, 64),
+    claim=at_finest(1e-2),
+    claims={f"deflection, {pattern}, deep shell": Converges(1.7, 5e-3, slack=0.4) for pattern in PATTERNS},
+)
+def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
+    part, half = 1e-3, 25.0  # of the load, so small that the roof is linear to 1e-5
+    for pattern in PATTERNS:
+        scene = {
+            "material": {"young": 4.32e8, "poisson": 0.0, "thickness": 0.25, "density": 1.0},
+            "gravity": [0.0, 0.0, -90.0 * part],
+            "handles": [*_symmetric("xy", 25.0), {"box": _on("y", half, 25.0), "axes": ["x", "z"]}],
+        }
+        surface = _cylinder(25.0, math.radians(40.0), half)
+        _, way = _curved(bench, round(n), pattern, surface, scene)
+        found = float(-way[round(n), 2]) / part
+        yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
+        yield Measured(f"deflection, {pattern}, deep shell", found, LINEAR["deep_roof"], "m")
+
+
+ORDER = 1.5
+"""Of the deflection under a point load, where curvatures are unbounded."""
+
+
+@case(
+    "Pinched cylinder between rigid diaphragms, an eighth of it, bending_model: midedge: deflection under "
+    "the load, and what it is extrapolated to from half as many cells",
+    source=LINEAR["source"],
+    resolutions=(32, 64, 128),
+    claim=Converges(ORDER, 3e-2, slack=0.3),
+    claims={f"deflection, {pattern}, extrapolated": at_finest(1e-2) for pattern in PATTERNS},
+    quick=1,
+)
+def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
+    force = 100.0
+    for pattern in PATTERNS:
+        scene = {
+            "material": {"young": 3e6, "poisson": 0.3, "thickness": 3.0, "density": 1.0},
+            "loads": [{"nodes": [0], "force": [0.0, 0.0, -force / 4.0]}],
+            "handles": [
+                {"box": _on("y", 300.0, 300.0), "axes": ["x", "z"]},
+                *_symmetric("xyz", 300.0),
+            ],
+        }
+        surface = _cylinder(300.0, 0.5 * math.pi, 300.0)
+        coarse, fine = (
+            float(-_curved(bench, cells, pattern, surface, scene)[1][0, 2]) / force
+            for cells in (round(n) // 2, round(n))
+        )
+        last = fine + (fine - coarse) / (2.0**ORDER - 1.0)
+        yield Measured(f"deflection, {pattern}", fine, LINEAR["cylinder"], "m/N")
+        yield Measured(f"deflection, {pattern}, extrapolated", last, LINEAR["cylinder"], "m/N")
+
+
+@case(
+    "Hemisphere with a hole of 18°, pulled and pressed at its equator, a quarter of it, bending_model: "
+    "midedge: mean way of the loads",
+    source=LINEAR["source"],
+    resolutions=(8, 16, 32, 64),
+    claim=at_finest(1e-2),
+)
+def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
+    part, cells = 0.02, round(n)  # out and in, what is quadratic in the load cancels
+    for pattern in PATTERNS:
+        scene = {
+            "material": {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0},
+            "loads": [
+                {"nodes": [0], "force": [part, 0.0, 0.0]},
+                {"nodes": [cells], "force": [0.0, -part, 0.0]},
+            ],
+            "handles": [*_symmetric("xy", 10.0), {"nodes": [cells // 2], "axes": ["z"]}],
+        }
+
+        def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
+            around, up = 0.5 * math.pi * s, math.radians(72.0) * t
+            return (
+                10.0 * np.cos(up) * np.cos(around),
+                10.0 * np.cos(up) * np.sin(around),
+                10.0 * np.sin(up),
+            )
+
+        _, way = _curved(bench, cells, pattern, surface, scene)
+        mean = 0.5 * float(way[0, 0] - way[cells, 1]) / part
+        yield Measured(f"way of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
