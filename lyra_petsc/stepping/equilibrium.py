@@ -124,7 +124,7 @@ class Equilibrium:
             if not solves:
                 anchored, frozen = system.moving_energy_before, system.frozen
             history.append(_row(force, attempt if solves else None))
-            if arrived and force <= self._allowed():
+            if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed = 0, self._integrator.pseudo
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
@@ -290,8 +290,14 @@ class Equilibrium:
             self._integrator.pseudo = min(max(self._careful, sufficed), self._longest)
         return norm
 
-    def _allowed(self) -> float:
-        return max(self._tolerances.force_tolerance * self._scale, self._floor)
+    def _balanced(self, force: float, last: float) -> bool:
+        """Whether a force of this norm [N] counts as none; ``last`` is that before the last proximal step.
+
+        The floor is the most that round-off may leave: below it forces are lessened as long as they can be.
+        """
+        if force <= self._tolerances.force_tolerance * self._scale:
+            return True
+        return LESS * last <= force <= self._floor
 
     def _norm(self, vector: Array) -> float:
         return float(np.sqrt(self._system.points.comm.allreduce(float(np.vdot(vector, vector)))))
