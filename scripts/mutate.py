@@ -62,8 +62,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "stage_equations.py",
-        "step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)\n        self.frozen |= {",
-        "step = Step(self.t0, self.t1, self.t0, self.x, self.reference.at)\n        self.frozen |= {",
+        "before = self.active.moving_energy(self.x)\n        self.active.turn_targets(Step(self.t0, self.t1, self.t1,",
+        "before = self.active.moving_energy(self.x)\n        self.active.turn_targets(Step(self.t0, self.t1, self.t0,",
         (BOOKS + "test_a_turning_clamp_stores_energy_where_it_stands[midpoint]",),
     ),
     Change(
@@ -184,8 +184,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "equilibrium.py",
-        "system.unbalanced = -force",
-        "system.unbalanced = force",
+        "system.applied.unbalanced = -force",
+        "system.applied.unbalanced = force",
         (BOOKS + "test_a_static_analysis_begins_in_balance",),
     ),
     Change(
@@ -214,7 +214,7 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "stage_equations.py",
-        "blocks = self.load_factor * following_stiffness",
+        "blocks = self.applied.factor * following_stiffness",
         "blocks = following_stiffness",
         (STABLE + "test_the_hessian_is_the_slope_of_all_forces[pressure]",),
     ),

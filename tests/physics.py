@@ -178,7 +178,9 @@ class Simulation:
         """Energy [J] of an elastic term, over all ranks."""
         term = self.problem.terms[name]
         assert isinstance(term, Elastic)
-        return float(self.comm.allreduce(float(term.energies(self.system.x, self.system.frozen[term]).sum())))
+        return float(
+            self.comm.allreduce(float(term.energies(self.system.x, self.system.active.frozen[term]).sum()))
+        )
 
     # -- steps -----------------------------------------------------------------------------------------
 

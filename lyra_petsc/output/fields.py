@@ -70,7 +70,7 @@ def _on_vertices(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangle
         out += _per_area(problem, hinges.stencil[:, :2].ravel(), halves)
     if "midedge" in problem.terms:
         midedge = cast("MidEdge", problem.terms["midedge"])
-        thirds = np.repeat(of_triangles(midedge, x, problem.system.frozen[midedge]) / 3.0, 3)
+        thirds = np.repeat(of_triangles(midedge, x, problem.system.active.frozen[midedge]) / 3.0, 3)
         out += _per_area(problem, midedge.stencil.ravel(), thirds)
     return out
 
@@ -96,7 +96,7 @@ def _curvature(problem: Problem) -> Array:
 
 def _curvature_tensor(problem: Problem) -> Array:
     midedge = cast("MidEdge", problem.terms["midedge"])
-    found = midedge.curvatures(problem.system.x, problem.system.frozen[midedge])[: midedge.n_owned]
+    found = midedge.curvatures(problem.system.x, problem.system.active.frozen[midedge])[: midedge.n_owned]
     out = np.zeros((problem.membrane.n_owned, 3))  # of triangles that do not bend
     numbers = problem.membrane.elements.index[: len(out)]
     order = np.argsort(numbers)

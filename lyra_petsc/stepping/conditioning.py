@@ -15,7 +15,7 @@ def vertex_scales(system: StageEquations, size: float) -> Array:
     """Force [N] at each owned row (n_owned,) if all coordinates changed by ``size`` [m] at random."""
     points = system.points
     scale = np.zeros(points.n_local)
-    for term in system.elastic:
+    for term in system.active.elastic:
         amount = np.repeat(term.force_scale(size), term.stencil.shape[1])
         scale += np.bincount(term.stencil.ravel(), amount, points.n_local)
         if term.edges is not None:

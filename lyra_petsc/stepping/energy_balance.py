@@ -87,7 +87,7 @@ class Ledger:
 
     def __init__(self, system: StageEquations) -> None:
         self._system = system
-        named = dict.fromkeys(term.registration.energy for term in system.elastic)
+        named = dict.fromkeys(term.registration.energy for term in system.active.elastic)
         self._more = [name for name in named if name not in (*ENERGIES, "")]
         self.budget = Budget()
         self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
@@ -112,13 +112,13 @@ class Ledger:
         local = np.zeros(len(columns) + 1)
         local[-1] = 0.5 * float(np.sum(system.mass[:, None] * system.v[:n] ** 2))
         self._moving = 0.0
-        for term in system.elastic:
+        for term in system.active.elastic:
             entry = term.registration
             if entry.energy:
-                energy = float(term.energies(system.x, system.frozen[term]).sum())
+                energy = float(term.energies(system.x, system.active.frozen[term]).sum())
                 local[columns.index(entry.energy)] += energy
                 self._moving += energy if entry.moving else 0.0
-        for load in system.loads:
+        for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)
         budget, sums = self.budget, [float(value) for value in system.points.summed(*local)]
@@ -165,11 +165,11 @@ class Ledger:
         self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
         external = -parts["loads"]
         system.prescribed.put(external, external.take(self._at) + self._reactions)
-        for load in system.loads:
+        for load in system.active.loads:
             if load.registration.energy:  # it has a potential, and does no work from outside
                 weight = np.zeros((system.points.n_local, 3))
                 load.add_force(system.x, 0.0, 0.0, weight)
-                external -= system.load_factor * weight[: len(external)]
+                external -= system.applied.factor * weight[: len(external)]
         for name in ("wind", "springs"):
             if name in parts:
                 external -= parts[name]
@@ -191,18 +191,18 @@ class Ledger:
     @property
     def column_names(self) -> list[str]:
         """Columns of history.csv that terms add, in the order of the terms."""
-        of_terms = [name for term in self._system.elastic for name in term.registration.columns]
+        of_terms = [name for term in self._system.active.elastic for name in term.registration.columns]
         return [*self._more, *of_terms]
 
     def columns(self) -> dict[str, float]:
         """Further columns of history.csv that terms add, by name; collective."""
         system = self._system
         found: dict[str, float] = dict(self.budget.more)
-        for term in system.elastic:
+        for term in system.active.elastic:
             reductions = term.registration.columns
             if not reductions:
                 continue
-            mine = term.history(system.x, system.frozen[term])
+            mine = term.history(system.x, system.active.frozen[term])
             for name, how in reductions.items():
                 found[name] = float(system.points.comm.allreduce(float(mine[name]), REDUCTIONS[how]))
         return found
@@ -213,9 +213,9 @@ class Ledger:
         local, reaction = np.zeros((count, 3)), self.reaction
         for number in system.held.active(system.t0, system.t1):
             local[number] = reaction[system.held.vertices(number)].sum(axis=0)
-        for term in system.elastic:
+        for term in system.active.elastic:
             if isinstance(term, Pulling):
-                local += term.handle_forces(system.x, system.frozen[term], count)
+                local += term.handle_forces(system.x, system.active.frozen[term], count)
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)
         return list(total)
@@ -226,7 +226,7 @@ class Ledger:
         edges, numbers = system.held.edges, system.held.with_slopes
         if edges is None:
             return {}
-        frames, active = system.frozen[edges.term], system.held.active(system.t0, system.t1)
+        frames, active = system.active.frozen[edges.term], system.held.active(system.t0, system.t1)
         local = np.zeros((len(numbers), 10))  # moment about the origin, force, positions, count
         for row, number in zip(local, numbers, strict=True):
             mine = system.held.vertices(number)

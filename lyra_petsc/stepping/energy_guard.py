@@ -136,13 +136,13 @@ class EnergyGuard:
 
     def __init__(self, system: StageEquations) -> None:
         self._system = system
-        elastic = system.elastic
+        elastic = system.active.elastic
         self._targets = [
             t for t in elastic if t.registration.moving or t.registration.role is Role.CONSTRAINT
         ]
         self._plain = [term for term in elastic if term not in self._targets]
-        self._weights = [load for load in system.loads if load.registration.energy]
-        self._forces = [load for load in system.loads if not load.registration.energy]
+        self._weights = [load for load in system.active.loads if load.registration.energy]
+        self._forces = [load for load in system.active.loads if not load.registration.energy]
         self._pull: tuple[float, Array] | None = None
         self._next_pull: tuple[float, Array] | None = None
         self._stiffness: float | None = None
@@ -217,7 +217,7 @@ class EnergyGuard:
         """Work [J] of loads without a potential and of wind on this rank's free coordinates, by the mean of
         their forces over both ends of the step."""
         system = self._system
-        if not (self._forces or system.viscous):
+        if not (self._forces or system.active.viscous):
             return 0.0
         t0, t1 = system.t0, system.t1
         force = np.zeros_like(x1)
@@ -228,7 +228,7 @@ class EnergyGuard:
                     if not load.follows:
                         load.add_force(x, t0, t1, force)
             wind = np.zeros_like(force)
-            for term in system.viscous:
+            for term in system.active.viscous:
                 term.add_gradient(v, term.freeze(Step(t0, t1, t0, x, system.reference.at)), wind)
             force -= wind
         free = np.where(system.prescribed.free, moved, 0.0)

@@ -101,19 +101,19 @@ class Equilibrium:
         self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
         self._sufficed = 0.0
-        self._follows = bool(system.viscous) or any(load.follows for load in system.loads)
-        system.load_factor = 0.0
+        self._follows = bool(system.active.viscous) or any(load.follows for load in system.active.loads)
+        system.applied.factor = 0.0
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
         self._scale = self._norm(force)
         if self._scale > floor:
-            system.unbalanced = -force
+            system.applied.unbalanced = -force
 
     def attempt(self, before: float, factor: float) -> Attempt:
         """Seek the equilibrium at load factor ``factor``; on failure the state is the one before."""
         system, n = self._system, self._system.points.n_owned
         x = system.x[:n].copy()
-        system.load_factor = factor
+        system.applied.factor = factor
         newton = linear = solves = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not self._follows
         history: list[Iteration] = []
@@ -122,7 +122,7 @@ class Equilibrium:
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
             if not solves:
-                anchored, frozen = system.moving_energy_before, system.frozen
+                anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
@@ -135,16 +135,16 @@ class Equilibrium:
             if force > WORSE * last:
                 self._integrator.pseudo *= SHRINK
             last = force
-            system.given_loads = relaxation.following(system.loads_now.copy()) if self._follows else None
+            system.applied.given = relaxation.following(system.applied.now.copy()) if self._follows else None
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
-            system.given_loads = None
+            system.applied.given = None
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if attempt.converged:
                 arrived = True
-                system.carry_frames()  # edges may turn far until they are in equilibrium
+                system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
                 self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
                 self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
@@ -157,7 +157,7 @@ class Equilibrium:
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
         system.points.update_ghosts(system.x)
-        system.carry_frames(frozen)
+        system.active.carry_frames(system.x, frozen)
         return dataclasses.replace(
             attempt,
             converged=False,
@@ -262,7 +262,7 @@ class Equilibrium:
             velocity=np.zeros_like(x),
             position=system.x[:n].copy(),
             residual=-force,
-            forces={"loads": -system.loads_now, "internal": system.loads_now - force},
+            forces={"loads": -system.applied.now, "internal": system.applied.now - force},
             prescribed=system.prescribed.mask[:n].copy(),
             goal=goal,
             snes_reason=0,

@@ -95,7 +95,7 @@ class LinearSystem:
         if discretisation.changes:
             self._interpolations = found
         below = None
-        if self._equations.coarse and not discretisation.changes:
+        if self._equations.active.coarse and not discretisation.changes:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)

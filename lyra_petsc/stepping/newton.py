@@ -120,7 +120,7 @@ class Newton:
             self.more_linear += self._ksp.getIterationNumber()
             changed = True
             useless = self._useless(residual, y)
-        if self._equations.limits_step:
+        if self._equations.active.limiting:
             fraction = self._equations.largest_step(self._array(x), -self._array(y))
             y.scale(fraction)
             changed |= fraction < 1.0

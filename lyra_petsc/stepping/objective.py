@@ -58,23 +58,23 @@ class Objective:
         x, vs = of.evaluate_at(v)
         change = v - of.history
         parts, square = [0.5 * sigma * float(np.sum(of.mass[:, None] * change * change))], 0.0
-        for term in of.elastic:
-            each = term.energies(x, of.frozen[term])
+        for term in of.active.elastic:
+            each = term.energies(x, of.active.frozen[term])
             parts.append(rate * float(each.sum()))
             stiffness = self.stiffnesses.get(term)
             if stiffness is None:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
             square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
-        parts.append(-rate * float(np.vdot(of.loads_now, x[:n] - of.x[:n])))
+        parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
         if of.damping.acts:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))
         if not of.integrator.lagged_loads:
-            parts += [float(wind.potentials(vs, of.frozen[wind]).sum()) for wind in of.viscous]
+            parts += [float(wind.potentials(vs, of.active.frozen[wind]).sum()) for wind in of.active.viscous]
         value, size, square = of.points.summed(sum(parts), sum(abs(part) for part in parts), square)
         return float(value), float(size) + float(np.sqrt(square))
 
     @cached_property
     def stiffnesses(self) -> dict[Term, Array]:
         """Force over displacement [N/m] of the owned elements of each term whose stencils stay."""
-        fixed = [term for term in self._equations.elastic if not term.registration.neighbours]
+        fixed = [term for term in self._equations.active.elastic if not term.registration.neighbours]
         return {term: term.force_scale(1.0)[: term.n_owned] for term in fixed}

@@ -279,12 +279,12 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         starts=[Window.of(handle).start for handle in scene.handles],
         events=events(scene),
     )
-    for term in system.elastic:
+    for term in system.active.elastic:
         if term.registration.coarse:
             entry, name = registered(term.registration.coarse), f"coarse {term.name}"
             coarse = cast("Elastic", made(entry, part.elements[name], scene, on_vertices))
             coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
-            system.coarse[term] = coarse
+            system.active.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     system.x[rows] = data["position"]
     layout.update_ghosts(system.x)
@@ -294,7 +294,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
-    for term in system.elastic:
+    for term in system.active.elastic:
         term.begin(system.x)
     system.rest_at(0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}

@@ -282,9 +282,9 @@ class SteppedScene:
                 f"step {self.step_number} ({self._now()}): {self.stepper.stopped_by} stopped Newton's "
                 f"method at a residual of {attempt.residual:.2g} N, short of solver.force_tolerance"
             )
-        for term in system.elastic:
+        for term in system.active.elastic:
             if term.registration.state or term.registration.edge_state:
-                term.accept(system.x, system.frozen[term])
+                term.accept(system.x, system.active.frozen[term])
         system.begin(self.time)
         self.stepper.monitor()
         seconds = clock.perf_counter() - COMPILATION.seconds - started
@@ -296,7 +296,7 @@ class SteppedScene:
 
     def _tell_of_roundoff(self, residual: float) -> None:
         """Say once that a residual [N] cannot be made as small as the scene asks; collective."""
-        loads = float(np.sum(self.problem.system.loads_now**2))
+        loads = float(np.sum(self.problem.system.applied.now**2))
         driving = math.sqrt(self.comm.allreduce(loads))
         if residual > self.scene.solver.force_tolerance * driving > 0.0:
             self._told.add("roundoff")
@@ -474,14 +474,14 @@ class SteppedScene:
         """Vertex arrays (n_vertices, 3) that terms with a state keep in a checkpoint, by ``term.name``."""
         return {
             f"{term.name}.{name}": values
-            for term in self.problem.system.elastic
+            for term in self.problem.system.active.elastic
             for name, values in term.state().items()
         }
 
     def edge_states(self) -> dict[str, Array]:
         """The same of edges with an unknown, (n_edges,)."""
         layout, found = self.problem.points, {}
-        for term in self.problem.system.elastic:
+        for term in self.problem.system.active.elastic:
             for name, values in term.edge_state().items():
                 rows = np.zeros(3 * layout.n_local)
                 rows[term.edge_places] = values
@@ -507,7 +507,7 @@ class SteppedScene:
         """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
         system = self.problem.system
         system.state.update_ghosts()
-        for term in system.elastic:
+        for term in system.active.elastic:
             if term.registration.edge_state:
                 self._restore_edges(term, edges)
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
@@ -525,7 +525,7 @@ class SteppedScene:
             self.guard.restore(memory["energy"], same=same)
         if self.local_error is not None:
             self.local_error.restore(arrays, memory["integrator"])
-        for term in system.elastic:
+        for term in system.active.elastic:
             names = term.registration.state
             if names:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})

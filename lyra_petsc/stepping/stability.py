@@ -110,7 +110,7 @@ class Examination:
         """Whether a mode is mostly where nothing resists bending."""
         system = self._system
         bent = np.zeros(system.points.n_local, dtype=bool)
-        for term in system.elastic:
+        for term in system.active.elastic:
             if term.registration.bends:
                 bent[term.stencil] = True
         n = system.points.n_vertices
@@ -143,7 +143,7 @@ class Examination:
         if best == 0.0:
             return None
         way = best * mode
-        if self._system.limits_step:
+        if self._system.active.limiting:
             system = self._system
             way *= system.largest_step(np.zeros_like(mode), way / system.stage.reach)
         return way
@@ -154,8 +154,10 @@ class Examination:
         x = system.x.copy()
         x[: len(way)] += way
         system.points.update_ghosts(x)
-        stored = sum(float(term.energies(x, system.frozen[term]).sum()) for term in system.elastic)
-        return float(system.points.summed(stored - float(np.vdot(system.loads_now, way)))[0])
+        stored = sum(
+            float(term.energies(x, system.active.frozen[term]).sum()) for term in system.active.elastic
+        )
+        return float(system.points.summed(stored - float(np.vdot(system.applied.now, way)))[0])
 
     def destroy(self) -> None:
         """Free the factors; collective."""

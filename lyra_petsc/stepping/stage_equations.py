@@ -17,9 +17,8 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property, partial, reduce
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -28,6 +27,8 @@ from numpy.typing import NDArray
 from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
+from lyra_petsc.stepping.active_terms import ActiveTerms
+from lyra_petsc.stepping.applied_loads import AppliedLoads
 from lyra_petsc.stepping.damping import Damping
 from lyra_petsc.stepping.integrators.integrator import Follower, Integrator, Stage
 from lyra_petsc.stepping.objective import Objective
@@ -35,7 +36,6 @@ from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
-from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
 
@@ -75,13 +75,8 @@ class StageEquations:
         The function whose gradient F is.
     followers : list of Follower
         Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
-    load_factor : float
-        Factor on all loads (1 in a motion).
-    unbalanced, given_loads : (n_owned, 3) or None
-        Static: force [N] that holds the start shape, reduced as the load factor grows; loads in place of the
-        present ones.
-    coarse : dict of Elastic → Elastic
-        Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
+    active : ActiveTerms
+    applied : AppliedLoads
     """
 
     def __init__(
@@ -96,36 +91,28 @@ class StageEquations:
         events: list[float],
     ) -> None:
         self.discretisation, self.mass, self.integrator = discretisation, mass, integrator
-        self.elastic = [term for term in terms if isinstance(term, Elastic)]
-        self.viscous = [term for term in terms if isinstance(term, Viscous)]
-        self.loads = [term for term in terms if isinstance(term, Load)]
+        self.active = active = ActiveTerms(terms)
         self.held, self._events = held, events
         rows = np.concatenate([held.reference_rows, *(term.reference_rows for term in terms)])
         self.reference = ReferencePositions(self.points, rows, starts)
         self.prescribed = Prescribed(discretisation, held, self.reference)
-        pulling = [term for term in self.elastic if term.registration.role is Role.CONSTRAINT]
-        sheet = [term for term in self.elastic if term.registration.role is Role.ELASTIC]
-        self._constraints, self._moving = pulling, [t for t in sheet if t.registration.moving]
-        self._limiting = [term for term in self.elastic if term.registration.limits_step]
-        internal = partial(self._sum, sheet)  # moving targets change the forces at one and the same place
-        self._internal = internal if self._moving else Remembered(internal)
+        self.applied = AppliedLoads(active.loads, self.points)
+        internal = partial(
+            self._sum, active.sheet
+        )  # moving targets change the forces at one and the same place
+        self._internal = internal if active.moving else Remembered(internal)
         once = integrator.lagged_loads
-        self.damping = Damping(discretisation, self.elastic, moves=integrator.moves, once=once)
+        self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
         last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
         self.state = State(discretisation)
         n_local = self.points.n_local
-        self._xs, self._vs, self._gradient, self._force = (np.zeros((n_local, 3)) for _ in range(4))
+        self._xs, self._vs = np.zeros((n_local, 3)), np.zeros((n_local, 3))
         self._xh, self.history = self.x, self.v[: self.points.n_owned]
         self.stage = Stage(1.0, 1.0, 1.0)
-        self.frozen: dict[Term, Any] = dict.fromkeys(terms)
         self.objective = Objective(self)
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
         self.followers: list[Follower] = [integrator]
-        self.load_factor = 1.0
-        self.unbalanced: Array | None = None
-        self.given_loads: Array | None = None
-        self.coarse: dict[Elastic, Elastic] = {}
         self._iterates: tuple[Array | None, Array | None] = (None, None)
         self._last_parts: dict[str, Array] = {}
 
@@ -152,7 +139,7 @@ class StageEquations:
         """Let moving targets stand where they are at ``time`` [s], between two steps."""
         self.t0 = self.t1 = time
         step = Step(time, time, time, self.x, self.reference.at)
-        self.frozen |= {term: term.freeze(step) for term in self.elastic}
+        self.active.freeze(step)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -176,7 +163,7 @@ class StageEquations:
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
-        self.moving_energy_before = self.moving_energy()
+        self.moving_energy_before = self.active.moving_energy(self.x)
 
     def _accelerations(self) -> Array:
         v = self.v.copy()
@@ -188,21 +175,17 @@ class StageEquations:
 
     def _freeze(self, at: float) -> None:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
-        n = self.points.n_owned
         x = self._frozen_positions(at)
-        self.frozen = {}  # there is no room for both
-        self.frozen = self._frozen_at(at, x)
+        self.active.freeze(Step(self.t0, self.t1, at, x, self.reference.at))
         self.objective.begin_step()
-        if self.integrator.moves or self.given_loads is None:
-            self._load(x)
+        if self.integrator.moves or self.applied.given is None:
+            lagged = self.active.viscous and self.integrator.lagged_loads
+            wind = self._sum(self.active.viscous, self.v) if lagged else None
+            self.applied.freeze(self.t0, self.t1, x, wind)
         else:
-            self._force[:n] = self.given_loads
+            self.applied.now = self.applied.given
         if self.damping.acts:
-            self.damping.freeze(x, self.frozen)
-
-    def _frozen_at(self, at: float, x: Array) -> dict[Term, Any]:
-        step = Step(self.t0, self.t1, at, x, self.reference.at)
-        return {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
+            self.damping.freeze(x, self.active.frozen)
 
     def _frozen_positions(self, at: float) -> Array:
         """Positions (n_local, 3) whose geometry stays as it is during the step."""
@@ -219,19 +202,6 @@ class StageEquations:
         """Which local rows (n_local,) are vertices; ghosts that contact adds are."""
         return self.points.are_vertices(self.points.global_number)
 
-    def _load(self, x: Array) -> None:
-        """Loads that stay as they are during the step."""
-        n, t0, t1 = self.points.n_owned, self.t0, self.t1
-        self._force[:] = 0.0
-        for load in self.loads:
-            load.add_force(x, t0, t1, self._force)
-        if self.viscous and self.integrator.lagged_loads:
-            self._force[:n] -= self._sum(self.viscous, self.v)
-        self._force[n:] = 0.0
-        self._force *= self.load_factor
-        if self.unbalanced is not None:
-            self._force[:n] += (1.0 - self.load_factor) * self.unbalanced
-
     def _set_history(self, stage: Stage, at: float) -> None:
         """x_h with its ghosts, and the velocities of the prescribed unknowns."""
         n = self.points.n_owned
@@ -247,11 +217,6 @@ class StageEquations:
         else:
             self.prescribed.solve(self._xh[:n], stage.reach)
         self.points.update_ghosts(self._xh)
-
-    @property
-    def loads_now(self) -> Array:
-        """The loads in force (n_owned, 3) [N]; overwritten by the next step."""
-        return self._force[: self.points.n_owned]
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
@@ -304,12 +269,6 @@ class StageEquations:
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
 
-    def carry_frames(self, frozen: Mapping[Term, Any] | None = None) -> None:
-        """Let the frames of directors follow to the present shape, from those in use or ``frozen``."""
-        for term in self.elastic:
-            if term.registration.edge_state:
-                term.accept(self.x, (frozen or self.frozen)[term])
-
     @property
     def edges_lag(self) -> bool:
         """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
@@ -323,16 +282,14 @@ class StageEquations:
         there, too, after `begin_at_rest`.
         """
         n, dt = self.points.n_owned, self.dt or 1.0
-        self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.frozen
+        self._kept = self.stage, self.history, self._xh, self.stage_velocity.copy(), self.active.frozen
         self.new_iterate(None)
         self.objective.forget()
         self.stage = Stage(1.0 / dt, dt, dt)
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
-        step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)
-        targets = (*self._moving, *self._constraints)
-        self.frozen = self.frozen | {term: term.freeze(step) for term in targets}
+        self.active.turn_targets(Step(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
         self.prescribed.solve(self._xh[:n], dt)
 
@@ -340,7 +297,7 @@ class StageEquations:
         """Take what their rates v (n_owned, 3) lead to, if any, and go back to the stage; collective."""
         n = self.points.n_owned
         moved = None if v is None else self._xh[:n] + self.stage.reach * v
-        self.stage, self.history, self._xh, stage_velocity, self.frozen = self._kept
+        self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._kept
         self.prescribed.release_vertices()
         self.objective.forget()
         self.new_iterate(None)
@@ -357,34 +314,24 @@ class StageEquations:
         self.prescribed.overwrite_with_rates(velocity := self.v[: self.points.n_owned].copy())
         return velocity
 
-    def moving_energy(self) -> float:
-        """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
-        return sum(float(term.energies(self.x, self.frozen[term]).sum()) for term in self._moving)
-
     def pull_of(self, terms: Sequence[Elastic], x: Array) -> Array:
         """Gradient (n_owned, 3) [N] of the energy of ``terms``, all without targets, at x (n_local, 3)."""
-        return self._sum(terms, x) if self._moving else self._internal(x)
+        return self._sum(terms, x) if self.active.moving else self._internal(x)
 
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""
-        if self.stage.after == self.dt or not (self._moving or self._constraints):
+        if self.stage.after == self.dt or not (self.active.moving or self.active.constraints):
             return 0.0
-        before = self.moving_energy()
-        step = Step(self.t0, self.t1, self.t1, self.x, self.reference.at)
-        self.frozen |= {term: term.freeze(step) for term in (*self._moving, *self._constraints)}
-        return self.moving_energy() - before
-
-    @property
-    def limits_step(self) -> bool:
-        """Whether terms limit how far a Newton iteration may go."""
-        return bool(self._limiting)
+        before = self.active.moving_energy(self.x)
+        self.active.turn_targets(Step(self.t0, self.t1, self.t1, self.x, self.reference.at))
+        return self.active.moving_energy(self.x) - before
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
         x = self.evaluate_at(v)[0]
         ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
         self.points.update_ghosts(ahead)
-        fraction = min(term.largest_step(x, ahead, self.frozen[term]) for term in self._limiting)
+        fraction = min(t.largest_step(x, ahead, self.active.frozen[t]) for t in self.active.limiting)
         return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
 
     # -- what Newton asks for ----------------------------------------------------------------------
@@ -401,7 +348,6 @@ class StageEquations:
         self._xs, self._vs = fitted(self._xs, n, n_local), fitted(self._vs, n, n_local)
         for values in (self._xh, self._xs, self._vs):
             layout.update_ghosts(values)
-        self._gradient, self._force = np.zeros((n_local, 3)), fitted(self._force, n, n_local)
         self.__dict__.pop("_vertex_rows", None)
         self.prescribed.fit()
 
@@ -426,23 +372,20 @@ class StageEquations:
         return parts
 
     def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
-        n, self._last_parts = self.points.n_owned, {}  # there is no room for both
+        self._last_parts = {}  # there is no room for both
         parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
-        if self._constraints:
-            parts["springs"] = self._sum(self._constraints, x)
-        parts["loads"] = -self._force[:n]
+        if self.active.constraints:
+            parts["springs"] = self._sum(self.active.constraints, x)
+        parts["loads"] = -self.applied.now
         if self.damping.acts:
             parts["damping"] = self.damping.product(vs)
-        if self.viscous and not self.integrator.lagged_loads:
-            parts["wind"] = self._sum(self.viscous, vs)
+        if self.active.viscous and not self.integrator.lagged_loads:
+            parts["wind"] = self._sum(self.active.viscous, vs)
         self._last_parts = parts
         return parts
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
-        self._gradient[:] = 0.0
-        for term in terms:
-            term.add_gradient(at, self.frozen[term], self._gradient)
-        return self._gradient[: self.points.n_owned].copy()
+        return self.active.gradient(terms, at, self.points)
 
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
@@ -487,11 +430,11 @@ class StageEquations:
         blocks = self.prescribed.blocks
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
             self.damping.into(values, inertia)
-            for term in self.elastic:
-                rows.add_stiffness(term, x, self.frozen[term], blend, reach, values, before)
+            for term in self.active.elastic:
+                rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, before)
         if not lagged:
-            for wind in self.viscous:
-                wind.add_hessian(vs, self.frozen[wind], rows.pattern.offsets, values)
+            for wind in self.active.viscous:
+                wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
         if len(self.prescribed.rows):
             rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
 
@@ -503,11 +446,11 @@ class StageEquations:
         from lyra_petsc.terms.load_stiffness import following_stiffness  # of no use in motions
 
         rows = self.discretisation.rows
-        for term in self.elastic:
-            rows.add_stiffness(term, self.x, self.frozen[term], 0.0, 1.0, values)
-        following: list[Load | Viscous] = [load for load in self.loads if load.follows]
-        for load in [*following, *self.viscous]:
-            blocks = self.load_factor * following_stiffness(load, self.x, self._force_of)
+        for term in self.active.elastic:
+            rows.add_stiffness(term, self.x, self.active.frozen[term], 0.0, 1.0, values)
+        following: list[Load | Viscous] = [load for load in self.active.loads if load.follows]
+        for load in [*following, *self.active.viscous]:
+            blocks = self.applied.factor * following_stiffness(load, self.x, self._force_of)
             offsets = rows.pattern.offsets_of(load.stencil, self.points.n_local)
             add_elements(np.ones(load.n_elements), blocks, offsets, values)
         if len(self.prescribed.rows):

@@ -38,9 +38,11 @@ class VertexEquations:
 
     def __init__(self, equations: StageEquations) -> None:
         self._equations, layout = equations, equations.points
-        self._bent = next(term for term in equations.elastic if isinstance(term, MidEdge))
-        self._elastic: list[Elastic] = [equations.coarse.get(term, term) for term in equations.elastic]
-        self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.viscous
+        self._bent = next(term for term in equations.active.elastic if isinstance(term, MidEdge))
+        self._elastic: list[Elastic] = [
+            equations.active.coarse.get(term, term) for term in equations.active.elastic
+        ]
+        self._viscous: list[Viscous] = [] if equations.integrator.lagged_loads else equations.active.viscous
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
@@ -59,9 +61,9 @@ class VertexEquations:
             weight: Array | float = stage.reach
             if damped and term.registration.damped:
                 weight = weight + term.elements.data["damping"]
-            rows.add_stiffness(term, x, equations.frozen.get(term), 1.0, weight, values)
+            rows.add_stiffness(term, x, equations.active.frozen.get(term), 1.0, weight, values)
         for wind in self._viscous:
-            wind.add_hessian(vs, equations.frozen[wind], self.pattern.offsets, values)
+            wind.add_hessian(vs, equations.active.frozen[wind], self.pattern.offsets, values)
         if held.any():
             self._add_clamps(x, held, values)
             rows.constrain(values, held, rows.beside(held)[0])

@@ -183,8 +183,8 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
         bent_state(simulation)
         system = simulation.system
         rows, x, n = system.discretisation.rows, system.x, simulation.problem.points.n_owned
-        for term in system.elastic:
-            weight, frozen = 1.0 + np.arange(term.n_elements), system.frozen[term]
+        for term in system.active.elastic:
+            weight, frozen = 1.0 + np.arange(term.n_elements), system.active.frozen[term]
             iterates: list[Array | None] = [None]
             if isinstance(term, Membrane):  # whose stress may be predicted from another iterate
                 iterates.append(x + 0.01 * np.cos(9.0 * x[:, ::-1]))
@@ -196,9 +196,9 @@ def test_block_rows_are_sums_of_element_hessians(comm: MPI.Comm, blend: float) -
                 np.testing.assert_allclose(
                     expanded(rows.pattern, values, len(x)), expected, rtol=0.0, atol=atol
                 )
-        assert {term.name for term in system.elastic} == {"membrane", "bending", "clamp", "spring"}
-        for term in system.viscous:
-            frozen, v = system.frozen[term], np.cos(5.0 * x)
+        assert {term.name for term in system.active.elastic} == {"membrane", "bending", "clamp", "spring"}
+        for term in system.active.viscous:
+            frozen, v = system.active.frozen[term], np.cos(5.0 * x)
             term.add_hessian(v, frozen, rows.pattern.offsets, values := rows.zeros())
             expected = summed(term.stencil, blocks := blocks_of(term, v, frozen), len(x))[:n]
             np.testing.assert_allclose(

@@ -80,8 +80,8 @@ def test_a_scene_without_wind_handles_and_damping_allocates_nothing_for_them(com
         assert list(simulation.problem.terms) == ["membrane"]
         system = simulation.system
         assert not system.held
-        assert not system.viscous
-        assert not system.loads
+        assert not system.active.viscous
+        assert not system.active.loads
         assert not system.damping.acts
         assert system.damping._values is None
         assert len(system.prescribed.goal) == len(system.prescribed.rows) == 0

@@ -104,7 +104,7 @@ def test_a_static_analysis_begins_in_balance(comm: MPI.Comm) -> None:
     simulation = SteppedScene(comm, scene_of(SHEET | still | {"time": STATIC}))
     system, left = simulation.problem.system, []
     for factor in (0.0, 0.5, 1.0):
-        system.load_factor = factor
+        system.applied.factor = factor
         system.begin_step(0.0, factor)
         left.append(comm.allreduce(np.abs(system.out_of_balance()[0]).max(initial=0.0), MPI.MAX))
     assert left[0] < 1e-12 * left[2]

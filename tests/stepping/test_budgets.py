@@ -63,9 +63,9 @@ def bracket(simulation: Simulation, before: Array) -> float:
     n = system.points.n_owned
     change = 0.0
     gradient = np.zeros_like(system.x)
-    for term in system.elastic:
+    for term in system.active.elastic:
         if term.name != "spring":
-            frozen = system.frozen[term]
+            frozen = system.active.frozen[term]
             change += float(term.energies(system.x, frozen).sum() - term.energies(before, frozen).sum())
             term.add_gradient(system.x, frozen, gradient)
     change -= float(np.vdot(gradient[:n], system.x[:n] - before[:n]))

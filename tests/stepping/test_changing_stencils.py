@@ -123,7 +123,7 @@ def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None
 
     def watch(simulation: SteppedScene) -> None:
         nearest.append(simulation.ledger.columns()["nearest"])
-        assert simulation.problem.system.limits_step
+        assert simulation.problem.system.active.limiting
 
     flown(comm, {"time": {"end": 0.06, "step": 0.02}}, watch)
     assert 0.0 < min(nearest) < DISTANCE

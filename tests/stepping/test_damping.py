@@ -21,11 +21,11 @@ def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: 
         system = simulation.problem.system
         damping, blocks = system.damping, system.discretisation.rows
         x = system.x + 0.02 * np.sin(10.0 * system.x[:, ::-1])
-        damping.freeze(x, system.frozen)
+        damping.freeze(x, system.active.frozen)
         expected, found = blocks.zeros(), blocks.zeros()
         damping.into(expected, diagonal := 1.0 + np.arange(len(system.mass)))
-        for term in system.elastic:
-            blocks.add_stiffness(term, x, system.frozen[term], 1.0, 0.3, expected)
+        for term in system.active.elastic:
+            blocks.add_stiffness(term, x, system.active.frozen[term], 1.0, 0.3, expected)
         none = np.empty(0, dtype=np.int64)
         if damping.with_stiffness_into(x, 0.3, diagonal, found, none):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
@@ -42,7 +42,7 @@ def test_two_factors_are_no_multiple() -> None:
     }
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
-        system.damping.freeze(system.x, system.frozen)
+        system.damping.freeze(system.x, system.active.frozen)
         values = system.discretisation.rows.zeros()
         none = np.empty(0, dtype=np.int64)
         assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
@@ -52,12 +52,12 @@ def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> 
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
         v = np.cos(5.0 * system.x)
-        system.damping.freeze(system.x, system.frozen)
+        system.damping.freeze(system.x, system.active.frozen)
         once = system.damping.product(v)
         np.testing.assert_array_equal(system.damping.product(v), once)
         assert not system.damping.product(0.0 * v).any()
         np.testing.assert_allclose(system.damping.product(2.0 * v), 2.0 * once, rtol=1e-12, atol=1e-15)
-        system.damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.frozen)
+        system.damping.freeze(system.x + 0.05 * np.sin(9.0 * system.x[:, ::-1]), system.active.frozen)
         assert np.abs(system.damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
 
 
@@ -98,7 +98,7 @@ def test_rows_that_become_another_matrix_are_let_go() -> None:
     with Simulation(scene, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
         damping, rows, none = system.damping, system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
-        damping.freeze(system.x, system.frozen)
+        damping.freeze(system.x, system.active.frozen)
         assert damping.with_stiffness_into(system.x, 0.3, system.mass, rows, none)
         once = damping.product(v := np.cos(3.0 * system.x))
         damping.into(rows, system.mass)  # of another iterate, which no scene asks for but -snes_type may

@@ -35,16 +35,16 @@ def paper_step(system: StageEquations, dt: float) -> Array:
     system.begin_step(0.0, dt)
     mass = np.repeat(system.mass, 3)
     a, force = np.diag(mass), np.zeros_like(x)
-    for term in system.elastic:
-        frozen = system.frozen[term]
+    for term in system.active.elastic:
+        frozen = system.active.frozen[term]
         force -= gradient(term, x, frozen)
         damping = GAMMA if term.name != "spring" else 0.0
         stiffness = summed(term.stencil, blocks_of(term, x, frozen, 1.0), len(x))
         a += dt * (dt + damping) * stiffness.reshape(len(a), len(a))
-    for load in system.loads:
+    for load in system.active.loads:
         load.add_force(x, 0.0, dt, force)
-    for wind in system.viscous:
-        force -= gradient(wind, v_old, system.frozen[wind])
+    for wind in system.active.viscous:
+        force -= gradient(wind, v_old, system.active.frozen[wind])
     b = mass * v_old.ravel() + dt * force.ravel()
     free = ~system.prescribed.mask.ravel()
     v = np.zeros(len(b))

@@ -149,7 +149,7 @@ def test_the_hessian_is_the_slope_of_all_forces(name: str) -> None:
     scene = PRESSED | {"material": CLOTH | {"bending": 0.1}, "initial": {"noise": 0.02}} | FOLLOWING[name]
     simulation = SteppedScene(MPI.COMM_SELF, scene_of(scene))
     system = simulation.problem.system
-    system.load_factor, system.unbalanced = 0.7, None
+    system.applied.factor, system.applied.unbalanced = 0.7, None
     system.x[:, 0] *= 0.95
     system.begin_step(0.3, 0.7)
     free = np.flatnonzero(system.prescribed.free)

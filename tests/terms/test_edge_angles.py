@@ -111,17 +111,17 @@ def test_energy_identity_of_backward_euler(comm: MPI.Comm, on_edges: None) -> No
     """Δ(kinetic + potential) = −½‖Δv‖² + E(x₁) − E(x₀) − ∇E(x₁)·Δx, of vertices and edges."""
     simulation = SteppedScene(comm, scene_of(SCENE | {"time": STEPS, "solver": TIGHT}))
     system = simulation.problem.system
-    n, elastic = system.points.n_owned, system.elastic
+    n, elastic = system.points.n_owned, system.active.elastic
 
     def energy(x: Array) -> float:
-        return sum(float(term.energies(x, system.frozen[term]).sum()) for term in elastic)
+        return sum(float(term.energies(x, system.active.frozen[term]).sum()) for term in elastic)
 
     for _ in range(4):
         x0, v0, before = system.x.copy(), system.v.copy(), simulation.budget.total
         simulation.step()
         gradient = np.zeros_like(system.x)
         for term in elastic:
-            term.add_gradient(system.x, system.frozen[term], gradient)
+            term.add_gradient(system.x, system.active.frozen[term], gradient)
         lost = 0.5 * np.sum(system.mass[:, None] * (system.v[:n] - v0[:n]) ** 2)
         bracket = energy(system.x) - energy(x0) - np.vdot(gradient[:n], (system.x - x0)[:n])
         expected = comm.allreduce(float(bracket - lost))

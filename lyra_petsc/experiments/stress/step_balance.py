@@ -206,19 +206,19 @@ class Accountant:
     def __init__(self, simulation: SteppedScene) -> None:
         self._simulation = simulation
         self._system = simulation.problem.system
-        pulls = [term for term in self._system.elastic if term.registration.role is Role.CONSTRAINT]
-        self._pulling, self._elastic = pulls, [t for t in self._system.elastic if t not in pulls]
+        pulls = [term for term in self._system.active.elastic if term.registration.role is Role.CONSTRAINT]
+        self._pulling, self._elastic = pulls, [t for t in self._system.active.elastic if t not in pulls]
         self.look()
 
     @property
     def _shell(self) -> Terms:
         """The sheet's own terms, with targets where they stand now."""
-        return {term: self._system.frozen[term] for term in self._elastic}
+        return {term: self._system.active.frozen[term] for term in self._elastic}
 
     @property
     def _springs(self) -> Terms:
         """The terms by which handles pull."""
-        return {term: self._system.frozen[term] for term in self._pulling}
+        return {term: self._system.active.frozen[term] for term in self._pulling}
 
     def look(self) -> None:
         """Note the state, and the energy with which its clamps end the step before."""
@@ -253,8 +253,8 @@ class Accountant:
             0.5 * float(np.sum(mass * v1[:n] ** 2)),
             energy_now - energy_then,
             turned,
-            sum(load.potential(x0) for load in system.loads),
-            sum(load.potential(x1) for load in system.loads),
+            sum(load.potential(x0) for load in system.active.loads),
+            sum(load.potential(x1) for load in system.active.loads),
             0.5 * float(np.sum(mass * dv**2)),
             float(np.vdot(parts["damping"], moved)),
             float(np.vdot(parts["internal"], moved)),
@@ -318,10 +318,10 @@ class Accountant:
         system = self._system
         n, x1, v1 = system.points.n_owned, system.x, system.v
         force = np.zeros((system.points.n_local, 3))
-        for load in system.loads:
+        for load in system.active.loads:
             load.add_force(self._x, report.time - report.dt, report.time, force)
         wind = np.zeros_like(force)
-        for term in system.viscous:
+        for term in system.active.viscous:
             step = Step(system.t0, system.t1, system.t0, self._x, system.reference.at)
             term.add_gradient(v1, term.freeze(step), wind)
         return {
@@ -347,7 +347,7 @@ class Accountant:
     def _gravity(self, report: StepReport) -> Array:
         """The weight (n_owned, 3) [N], whose work is in the potential."""
         out = np.zeros((self._system.points.n_local, 3))
-        for load in self._system.loads:
+        for load in self._system.active.loads:
             if load.registration.energy:
                 load.add_force(self._x, report.time - report.dt, report.time, out)
         return out[: self._system.points.n_owned]
@@ -441,7 +441,7 @@ class StageAccountant(Accountant):
         """Let moving targets stand where they are at time ``at`` [s] of the step."""
         system = self._system
         step = Step(system.t0, system.t1, at, system.x, system.reference.at)
-        system.frozen |= {term: term.freeze(step) for term in system.elastic}
+        system.active.frozen |= {term: term.freeze(step) for term in system.active.elastic}
 
 
 @dataclass

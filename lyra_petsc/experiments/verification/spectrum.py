@@ -51,7 +51,7 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     values = rows.zeros()
     for term in problem.terms.values():
         if isinstance(term, Elastic):
-            rows.add_stiffness(term, system.x, system.frozen[term], 0.0, 1.0, values)
+            rows.add_stiffness(term, system.x, system.active.frozen[term], 0.0, 1.0, values)
     held = np.zeros((points.n_local, 3))
     held[:n] = system.held.mask(trial.simulation.time, trial.simulation.time, n)
     points.update_ghosts(held)

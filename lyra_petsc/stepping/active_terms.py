@@ -1,0 +1,74 @@
+"""The terms of a problem, what each has frozen for the present step, and sums over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.terms.registry import Role
+from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
+
+Array = NDArray[np.float64]
+
+
+class ActiveTerms:
+    """All terms that a scene needs.
+
+    Parameters
+    ----------
+    terms : sequence of Term
+
+    Attributes
+    ----------
+    elastic, viscous, loads : list of Term
+        By kind.
+    sheet, constraints, moving, limiting : list of Elastic
+        Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move
+        and those that limit the length of Newton's steps.
+    coarse : dict of Elastic → Elastic
+        Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
+    frozen : dict of Term
+        What each has frozen for the step.
+    """
+
+    def __init__(self, terms: Sequence[Term]) -> None:
+        self.elastic = [term for term in terms if isinstance(term, Elastic)]
+        self.viscous = [term for term in terms if isinstance(term, Viscous)]
+        self.loads = [term for term in terms if isinstance(term, Load)]
+        roles = {term: term.registration.role for term in self.elastic}
+        self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
+        self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
+        self.moving = [term for term in self.sheet if term.registration.moving]
+        self.limiting = [term for term in self.elastic if term.registration.limits_step]
+        self.coarse: dict[Elastic, Elastic] = {}
+        self.frozen: dict[Term, Any] = dict.fromkeys(terms)
+
+    def freeze(self, step: Step) -> None:
+        """Let every term that acts through positions or velocities freeze what it does."""
+        self.frozen = {}  # there is no room for both
+        self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
+
+    def turn_targets(self, step: Step) -> None:
+        """Let targets that move with handles stand where they do at ``step.at``."""
+        self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
+
+    def gradient(self, terms: Sequence[Elastic | Viscous], at: Array, layout: Layout) -> Array:
+        """Gradient (n_owned, 3) [N] of the sum of ``terms`` at positions or velocities (n_local, 3)."""
+        out = np.zeros((layout.n_local, 3))
+        for term in terms:
+            term.add_gradient(at, self.frozen[term], out)
+        return out[: layout.n_owned]
+
+    def moving_energy(self, x: Array) -> float:
+        """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
+        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in self.moving)
+
+    def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
+        """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
+        for term in self.elastic:
+            if term.registration.edge_state:
+                term.accept(x, (frozen or self.frozen)[term])

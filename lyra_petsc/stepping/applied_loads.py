@@ -1,0 +1,54 @@
+"""The forces that do not change within a step, and the factor on them while an equilibrium is sought."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.points import Layout
+from lyra_petsc.terms.term import Load
+
+Array = NDArray[np.float64]
+
+
+class AppliedLoads:
+    """The loads in force.
+
+    Parameters
+    ----------
+    terms : sequence of Load
+
+    Attributes
+    ----------
+    now : (n_owned, 3)
+        Force [N] of the present step.
+    factor : float
+        On all loads (1 in a motion).
+    unbalanced, given : (n_owned, 3) or None
+        Static: force [N] that holds the start shape, reduced as the factor grows; loads in place of the
+        present ones.
+    """
+
+    def __init__(self, terms: Sequence[Load], layout: Layout) -> None:
+        self._terms = terms
+        self.now: Array = np.zeros((layout.n_owned, 3))
+        self.factor = 1.0
+        self.unbalanced: Array | None = None
+        self.given: Array | None = None
+
+    def freeze(self, t0: float, t1: float, x: Array, wind: Array | None) -> None:
+        """Take the loads of a step from t0 to t1 [s] at positions x (n_local, 3).
+
+        ``wind`` (n_owned, 3) is the gradient of velocity potentials where these are loads, too.
+        """
+        force = np.zeros_like(x)
+        for load in self._terms:
+            load.add_force(x, t0, t1, force)
+        self.now = force[: len(self.now)]
+        if wind is not None:
+            self.now -= wind
+        self.now *= self.factor
+        if self.unbalanced is not None:
+            self.now += (1.0 - self.factor) * self.unbalanced
