@@ -64,6 +64,7 @@ class LinearSystem:
 
     def _create(self) -> None:
         discretisation = self._equations.discretisation
+        discretisation.renew_pattern()  # stencils may have changed since the last matrix
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
         kind = presets.matrix_type(self._preset)

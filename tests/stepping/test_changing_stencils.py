@@ -118,6 +118,24 @@ def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
     assert speed > (0.3 if integrator in ("beuler", "semi-implicit") else 0.6) * SPEED
 
 
+def test_another_linear_solver_while_stencils_change(comm: MPI.Comm) -> None:
+    """Points that were near when the last matrix was made no longer are."""
+    simulation = thrown(comm, {})
+    simulation.step()
+    system = simulation.problem.system
+    n, n_local = system.points.n_owned, system.points.n_local
+    v = np.zeros((n, 3))
+    v[:, 2] = np.where(system.x[:n, 2] > 0.5 * GAP, 0.0, 0.8 * GAP / system.stage.reach)
+    system.evaluate_at(v)
+    assert comm.size == 1 or comm.allreduce(system.points.n_local > n_local, MPI.LOR)
+    assert simulation.stepper.linear.renew()
+    system.stay()
+    simulation.stepper.presets = ["multigrid", "direct"]
+    assert simulation.stepper.next_preset() == "direct"
+    simulation.step()
+    simulation.destroy()
+
+
 def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None:
     nearest: list[float] = []
 
