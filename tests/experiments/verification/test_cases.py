@@ -10,10 +10,15 @@ from mpi4py import MPI
 from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import CASES
 
-SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
+SOME = (
+    "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip",
+)  # fmt: skip
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
-LONG = ("plate",)
+LONG = (
+    "plate",
+   
+)  # fmt: skip
 """Cases whose finest resolutions take minutes."""
 
 

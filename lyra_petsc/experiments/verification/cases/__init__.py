@@ -28,6 +28,7 @@ CASES: Registry[VerificationCase] = Registry(
         "hinge-sheet": "hinges",
         "hinge-plate": "hinges",
         "plate": "plates",
+        "plate-curvature": "plates",
         "tip-load": "cantilevers",
         "roll-up": "cantilevers",
         "heavy-cantilever": "cantilevers",
