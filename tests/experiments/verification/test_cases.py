@@ -16,7 +16,7 @@ SOME = (
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
 LONG = (
-    "plate", "elastica-tip",
+    "plate", "plate-vibration", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""

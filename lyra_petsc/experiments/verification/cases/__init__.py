@@ -29,6 +29,7 @@ CASES: Registry[VerificationCase] = Registry(
         "hinge-plate": "hinges",
         "plate": "plates",
         "plate-curvature": "plates",
+        "plate-vibration": "vibrations",
         "elastica-tip": "elasticas",
         "elastica-weight": "elasticas",
         "elastica-roll-up": "elasticas",
