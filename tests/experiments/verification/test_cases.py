@@ -11,12 +11,12 @@ from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import CASES
 
 SOME = (
-    "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip",
+    "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip", "column",
 )  # fmt: skip
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
 LONG = (
-    "plate", "plate-vibration", "elastica-tip",
+    "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""
