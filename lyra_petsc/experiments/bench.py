@@ -213,6 +213,25 @@ class Bench:
 
         return {"file": on_root(self.comm, write)}
 
+    def grouped(self, vertices: Array, triangles: Ints, curves: Mapping[str, Ints]) -> dict[str, Any]:
+        """The mesh block of a scene for a surface with curve groups, name → edges (n, 2); collective."""
+
+        def write() -> str:
+            # gmsh's format 2.2; physical groups by number: curves from 2 on
+            elements = [f"2 2 1 1 {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
+            for number, edges in enumerate(curves.values(), 2):
+                elements += [f"1 2 {number} {number} {a} {b}" for a, b in (edges + 1).tolist()]
+            names = ['2 1 "sheet"', *(f'1 {k} "{name}"' for k, name in enumerate(curves, 2))]
+            nodes = [f"{k} {x!r} {y!r} {z!r}" for k, (x, y, z) in enumerate(vertices.tolist(), 1)]
+            lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat"]
+            lines += ["$PhysicalNames", f"{len(names)}", *names, "$EndPhysicalNames"]
+            lines += ["$Nodes", f"{len(nodes)}", *nodes, "$EndNodes"]
+            numbered = [f"{k} {words}" for k, words in enumerate(elements, 1)]
+            lines += ["$Elements", f"{len(numbered)}", *numbered, "$EndElements", ""]
+            return self._written(".msh", "\n".join(lines))
+
+        return {"file": on_root(self.comm, write)}
+
     def script(self, text: str) -> dict[str, Any]:
         """The mesh block of a scene whose mesh gmsh makes from a script; collective."""
         return {"file": on_root(self.comm, lambda: self._written(".geo", text))}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,30 +21,45 @@ def rectangle(
     return vertices, _halved(nx, column, row, alternating & ((column + row) % 2 == 1))
 
 
-def irregular_rectangle(n: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
-    """A rectangle of n × n cells in the xy plane: inner vertices displaced, diagonals at random.
+def irregular_rectangle(nx: int, ny: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
+    """A rectangle of nx × ny cells in the xy plane: vertices displaced, diagonals at random.
 
-    Inner vertices move by up to 0.3 of a cell in each direction.
+    Vertices move by up to 0.3 of a cell in each direction, those of a side along it; corners stay.
     """
     random = np.random.default_rng(seed)
-    vertices, _ = rectangle(n, n, width, height)
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
-    shift = random.uniform(-0.3, 0.3, (len(i), 2)) * [width / n, height / n]
-    shift[(i == 0) | (i == n) | (j == 0) | (j == n)] = 0.0
+    vertices, _ = rectangle(nx, ny, width, height)
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(nx + 1), np.arange(ny + 1)))
+    shift = random.uniform(-0.3, 0.3, (len(i), 2)) * [width / nx, height / ny]
+    shift[(i == 0) | (i == nx), 0] = 0.0
+    shift[(j == 0) | (j == ny), 1] = 0.0
     vertices[:, :2] += shift
-    column, row = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n)))
-    return vertices, _halved(n, column, row, random.integers(0, 2, n * n) == 1)
+    column, row = (k.ravel() for k in np.meshgrid(np.arange(nx), np.arange(ny)))
+    return vertices, _halved(nx, column, row, random.integers(0, 2, nx * ny) == 1)
 
 
-def square_script(size: float) -> str:
-    """For gmsh: the unit square in the xy plane with edges of about ``size`` [m] and one in the middle."""
-    corners = ((0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0.5))
-    points = [f"Point({k}) = {{{x}, {y}, 0, {size:.9g}}};" for k, (x, y) in enumerate(corners, 1)]
-    lines = [f"Line({k}) = {{{k}, {k % 4 + 1}}};" for k in range(1, 5)]
-    face = ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};", "Point{5} In Surface{1};"]
-    return "\n".join(
-        ['SetFactory("Built-in");', *points, *lines, *face, 'Physical Surface("sheet") = {1};', ""]
-    )
+SIDES = ("left", "right", "bottom", "top")
+
+
+def sides(nx: int, ny: int) -> dict[str, Ints]:
+    """The edges (n, 2) on each side of a rectangle of nx × ny cells that is numbered as a grid."""
+    across, up = np.arange(nx + 1), np.arange(ny + 1) * (nx + 1)
+    chains = (up, up + nx, across, across + ny * (nx + 1))
+    return {name: np.column_stack([chain[:-1], chain[1:]]) for name, chain in zip(SIDES, chains, strict=True)}
+
+
+def rectangle_script(width: float, height: float, size: float, inside: Sequence[float] = ()) -> str:
+    """For gmsh: a rectangle in the xy plane with edges of about ``size`` [m], its sides named as a grid's.
+
+    ``inside`` (x, y) [m] is where a vertex must be.
+    """
+    corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
+    points = corners + ([(inside[0], inside[1])] if inside else [])
+    lines = [f"Point({k}) = {{{x!r}, {y!r}, 0, {size:.9g}}};" for k, (x, y) in enumerate(points, 1)]
+    lines += [f"Line({k}) = {{{k}, {k % 4 + 1}}};" for k in range(1, 5)]
+    lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};"]
+    lines += ["Point{5} In Surface{1};"] if inside else []
+    lines += [f'Physical Curve("{name}") = {{{k}}};' for name, k in zip(SIDES, (4, 2, 1, 3), strict=True)]
+    return "\n".join(['SetFactory("Built-in");', *lines, 'Physical Surface("sheet") = {1};', ""])
 
 
 def _halved(nx: int, column: Ints, row: Ints, flipped: NDArray[np.bool_]) -> Ints:

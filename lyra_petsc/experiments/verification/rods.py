@@ -22,6 +22,8 @@ Frame d1 (along), d2 (across), d3 (normal), rotation rate ω = (τ, −κ, 0) in
 
 M · d3 is what keeps the strip from bending in its plane. Source: Kirchhoff rods, e.g. S. S. Antman, Nonlinear
 Problems of Elasticity, 2nd ed., chapter 8.
+
+Columns and tall cantilevers buckle: `column_shape`, `tall_cantilever`.
 """
 
 from __future__ import annotations
@@ -262,3 +264,57 @@ def _rates(state: Array, part: float, force: Array, stretch: float) -> Array:
         [-x * twist + y * bend, w * twist + z * bend, -w * bend + z * twist, -x * bend - y * twist], axis=1
     )
     return np.concatenate([turning, -length[:, None] * np.cross(one, force)], axis=1)
+
+
+# -- buckling --------------------------------------------------------------------------------------------
+
+
+def elliptic(k: float) -> tuple[float, float]:
+    """Complete elliptic integrals K and E of modulus 0 ≤ k < 1, by the arithmetic-geometric mean."""
+    a, b, total, power = 1.0, math.sqrt(1.0 - k * k), 0.5 * k * k, 0.5
+    while a - b > 1e-15 * a:
+        c = 0.5 * (a - b)
+        a, b = 0.5 * (a + b), math.sqrt(a * b)
+        power *= 2.0
+        total += power * c * c
+    whole = 0.5 * math.pi / a
+    return whole, whole * (1.0 - total)
+
+
+def column_shape(*, shortening: float | None = None, load: float | None = None) -> tuple[float, float]:
+    """P L²/B and height over length of a buckled inextensible column with pinned ends.
+
+    One is given: the way of the ends towards each other over the length, or P L²/B > π². With k the sine of
+    half the angle at the ends, P L²/B = 4 K², distance of the ends 2 E/K − 1 and height k/K. Clamped, each
+    half of the column is the same curve at half the size: four times the load, the same height.
+    """
+    low, high = 0.0, 1.0 - 1e-15
+    for _ in range(200):
+        k = 0.5 * (low + high)
+        whole, second = elliptic(k)
+        if load is None:
+            assert shortening is not None
+            less = 2.0 - 2.0 * second / whole < shortening
+        else:
+            less = 4.0 * whole**2 < load
+        low, high = (k, high) if less else (low, k)
+    return 4.0 * whole**2, k / whole
+
+
+def tall_cantilever(stiffer: float) -> tuple[float, float]:
+    """P L²/√(EI GJ) at which a cantilever tips over, EI/GJ = ``stiffer``, and the turn over the deflection.
+
+    The tip's turn about the axis, over its deflection over L. With s from the clamp over the length::
+
+        θ'' + κ² (1 − s)² θ = 0,   θ(0) = θ'(1) = 0,   EI w'' = P L³ (1 − s) θ,   w(0) = w'(0) = 0
+    """
+    s, derivative, integral = chebyshev(COUPLED_NODES)
+    lever = 1.0 - s
+    inside = derivative @ derivative
+    inside[0], inside[-1] = np.eye(len(s))[0], derivative[-1]
+    weight = np.diag(np.where((s == s[0]) | (s == s[-1]), 0.0, lever**2))
+    values, vectors = np.linalg.eig(np.linalg.solve(inside, -weight))
+    lowest = int(np.argmax(values.real))
+    factor, turn = 1.0 / math.sqrt(values[lowest].real), vectors[:, lowest].real
+    deflection = factor / math.sqrt(stiffer) * float(integral @ (lever**2 * turn))
+    return factor, abs(float(turn[-1]) / deflection)

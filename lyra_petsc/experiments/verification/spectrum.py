@@ -1,4 +1,8 @@
-"""Natural frequencies from the assembled stiffness and the lumped masses, by subspace iteration."""
+"""Natural frequencies from the assembled stiffness and the lumped masses, by subspace iteration.
+
+Unknowns of edges have no mass: the iteration, which solves with the stiffness for forces of inertia, lets
+them balance by themselves.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,39 @@ MORE_VECTORS = 8
 """Vectors beside those asked for: the more, the fewer iterations."""
 
 MAX_ITERATIONS = 200
-TOLERANCE = 1e-13
+TOLERANCE = 1e-11
 """Relative change of the squared frequencies at which the iteration ends."""
 
+ROUND_OFF = 1e-6
+"""Square over the shift below which a frequency is called zero."""
 
-def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
+
+def lowest_modes(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, Array]:
     """Lowest natural frequencies and their shapes about the present state; collective.
+
+    As `lowest_squares`.
+
+    Returns
+    -------
+    frequencies : (count,) float64
+        ω [rad/s], ascending; 0 for squares within round-off of 0.
+    shapes : (count, V, 3) float64
+        In mesh order, φᵀMφ = 1.
+
+    Raises
+    ------
+    SolverError
+        If the iteration does not converge, or the state is unstable.
+    """
+    squares, shapes = lowest_squares(trial, count, shift)
+    squares[np.abs(squares) < ROUND_OFF * shift] = 0.0
+    if squares[0] < 0.0:
+        raise SolverError("no stable equilibrium: a squared frequency is not positive", collective=True)
+    return np.sqrt(squares), shapes
+
+
+def lowest_squares(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array, Array]:
+    """Lowest squared natural frequencies and their shapes about the present state; collective.
 
     Handles hold what they prescribe at the present time. The state is taken to be an equilibrium.
 
@@ -32,18 +63,20 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
     trial : Trial
     count : int
         How many.
+    shift : float [1/s²]
+        K + shift · M is factored, which must be positive definite: for what moves without a force.
 
     Returns
     -------
-    frequencies : (count,) float64
-        ω [rad/s], ascending.
+    squares : (count,) float64
+        ω² [1/s²], ascending; negative where the state is unstable.
     shapes : (count, V, 3) float64
         In mesh order, φᵀMφ = 1.
 
     Raises
     ------
     SolverError
-        If the iteration does not converge, as where the state is unstable.
+        If the iteration does not converge, or K + shift · M is not positive definite.
     """
     problem = trial.simulation.problem
     system, points = problem.system, problem.points
@@ -54,29 +87,37 @@ def lowest_modes(trial: Trial, count: int) -> tuple[Array, Array]:
             rows.add_stiffness(term, system.x, system.active.frozen[term], 0.0, 1.0, values)
     held = np.zeros((points.n_local, 3))
     held[:n] = system.held.mask(trial.simulation.time, trial.simulation.time, n)
+    held.ravel()[points.padding] = 1.0
     points.update_ghosts(held)
     mask = held > 0.5
+    values[problem.pattern.indptr[:-1]] += shift * system.mass[:, None, None] * np.eye(3)
     rows.constrain(values, mask, rows.beside(mask)[0])
     matrix = AssembledMatrix(points, problem.pattern, "aij")
     matrix.set(values)
     solver = direct_solver(points.comm, matrix.mat, "verify_modes_")
     mass = np.where(mask[:n], 0.0, system.mass[:, None]).ravel()
     try:
-        squares, vectors = _subspace_iteration(solver, mass, _first_vectors(trial, mask[:n], count), count)
+        first = _first_vectors(trial, mask[: points.n_vertices], count)
+        squares, vectors = _subspace_iteration(solver, mass, first, count)
     finally:
         solver.destroy()
         matrix.destroy()
     shapes = [trial.gather(np.ascontiguousarray(vector).reshape(n, 3)) for vector in vectors.T]
-    return np.sqrt(squares), np.array(shapes)
+    return squares - shift, np.array(shapes)
 
 
 def _first_vectors(trial: Trial, held: NDArray[np.bool_], count: int) -> Array:
-    """Random vectors (3 n_owned, m), the same on any number of ranks; zero where held."""
+    """Random vectors (3 n_owned, m), the same on any number of ranks; zero where held, and on edges.
+
+    ``held`` is of the vertices (n_vertices, 3).
+    """
     points = trial.simulation.problem.points
     n_free = points.comm.allreduce(int(np.sum(~held)))
     m = min(2 * count + MORE_VECTORS, n_free)
-    random = np.random.default_rng(0).standard_normal((points.n_global, 3, m))[points.original]
-    return np.asarray(np.where(held[:, :, None], 0.0, random).reshape(-1, m))
+    random = np.random.default_rng(0).standard_normal((points.n_vertices_global, 3, m))[points.original]
+    first = np.zeros((points.n_owned, 3, m))
+    first[: points.n_vertices] = np.where(held[:, :, None], 0.0, random)
+    return first.reshape(-1, m)
 
 
 def _subspace_iteration(solver: PETSc.KSP, mass: Array, x: Array, count: int) -> tuple[Array, Array]:
@@ -108,7 +149,7 @@ def _subspace_iteration(solver: PETSc.KSP, mass: Array, x: Array, count: int) ->
     right.destroy()
     left.destroy()
     if not squares[0] > 0.0:
-        raise SolverError("no stable equilibrium: a squared frequency is not positive", collective=True)
+        raise SolverError("the stiffness of the state is not positive definite", collective=True)
     return squares[:count], x[:, :count]
 
 

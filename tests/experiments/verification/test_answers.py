@@ -63,7 +63,7 @@ def areas(vertices: Array, triangles: Ints) -> Array:
 
 MESHES: list[tuple[Callable[..., tuple[Array, Ints]], tuple[Any, ...]]] = [
     (rectangle, (4, 3, 1.0, 0.7)),
-    (irregular_rectangle, (6, 1.0, 0.7)),
+    (irregular_rectangle, (6, 6, 1.0, 0.7)),
 ]
 
 
@@ -77,9 +77,9 @@ def test_rectangles_are_covered_once(
 
 
 def test_an_irregular_rectangle_is_irregular_and_always_the_same() -> None:
-    vertices, triangles = irregular_rectangle(6, 1.0, 0.7)
+    vertices, triangles = irregular_rectangle(6, 6, 1.0, 0.7)
     assert areas(vertices, triangles).std() > 0.1 * areas(vertices, triangles).mean()
-    again = irregular_rectangle(6, 1.0, 0.7)
+    again = irregular_rectangle(6, 6, 1.0, 0.7)
     assert np.array_equal(vertices, again[0])
     assert np.array_equal(triangles, again[1])
 

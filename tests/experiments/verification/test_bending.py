@@ -14,7 +14,14 @@ from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import hinges
 from lyra_petsc.experiments.verification.cases.hinges import expected
 from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness, strip_stiffness
-from lyra_petsc.experiments.verification.rods import cantilever, heavy_coupled_strip, overhang_weight
+from lyra_petsc.experiments.verification.rods import (
+    cantilever,
+    column_shape,
+    elliptic,
+    heavy_coupled_strip,
+    overhang_weight,
+    tall_cantilever,
+)
 from lyra_petsc.experiments.verification.strips import strip
 
 PUBLISHED = reference("cantilevers")
@@ -62,6 +69,27 @@ def test_far_bent_the_coupled_strip_is_stiffer_than_four_fifths() -> None:
     _, sideways, drop = heavy_coupled_strip(8.0)
     assert sideways > 0.05
     assert drop < cantilever(10.0).drop - 0.005
+
+
+def test_elliptic_integrals() -> None:
+    """Of k² = 0 and ½: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, table 17.1."""
+    assert elliptic(0.0) == pytest.approx((0.5 * math.pi, 0.5 * math.pi), rel=1e-15)
+    assert elliptic(math.sqrt(0.5)) == pytest.approx((1.854074677301372, 1.350643881047675), rel=1e-14)
+
+
+def test_buckled_columns() -> None:
+    """Just above the critical load P/P_c = 1 + a²/16, height 2 a/π, a the angle at the ends."""
+    load, height = column_shape(shortening=1e-4)
+    angle = 2.0 * math.sqrt(1e-4)  # a²/4 for a sine
+    assert load / math.pi**2 - 1.0 == pytest.approx(angle**2 / 8.0, rel=1e-3)
+    assert height == pytest.approx(angle / math.pi, rel=1e-3)
+    assert column_shape(load=load)[1] == pytest.approx(height, rel=1e-9)
+
+
+def test_a_tall_cantilever_tips_at_the_published_load() -> None:
+    factor, turn = tall_cantilever(0.5)
+    assert factor == pytest.approx(4.013, abs=5e-4)
+    assert turn == pytest.approx(math.sqrt(0.5) * tall_cantilever(1.0)[1], rel=1e-12)
 
 
 @pytest.mark.parallel

@@ -10,10 +10,16 @@ from mpi4py import MPI
 from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import CASES
 
-SOME = ("free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip")
+SOME = (
+    "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip", "column",
+)  # fmt: skip
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
-LONG = ("plate", "slit-annulus", "sze-end-moment", "pinched-cylinder")
+LONG = (
+    "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
+    "elastica-weight", "elastica-roll-up", "elastica-overhang", "slit-annulus", "sze-end-moment",
+    "pinched-cylinder",
+)  # fmt: skip
 """Cases whose finest resolutions take minutes."""
 
 

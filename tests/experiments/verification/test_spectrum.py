@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from oracle import blocks_of, summed
+from oracle import blocks_of, expanded, summed
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.spectrum import lowest_modes
+from lyra_petsc.experiments.verification.spectrum import lowest_modes, lowest_squares
 from lyra_petsc.terms.term import Elastic
 
 pytestmark = pytest.mark.parallel
@@ -58,3 +58,37 @@ def test_an_unstable_state_is_refused(comm: MPI.Comm) -> None:
         trial.set_state(x=trial.start * [0.95, 1.0, 1.0])
         with pytest.raises(SolverError):
             lowest_modes(trial, 3)
+
+
+def test_edges_without_mass_balance_by_themselves(comm: MPI.Comm) -> None:
+    """As from a dense solver that has condensed them; a free sheet, whose rigid motions need a shift."""
+    material = SHEET["material"] | {"bending_model": "midedge"}
+    content = SHEET | {"material": material, "handles": [{"group": "sheet", "axes": ["x", "y"]}]}
+    with Bench(MPI.COMM_SELF) as bench, bench.simulation(content) as trial:
+        problem = trial.simulation.problem
+        n, layout = problem.points.n_owned, problem.points
+        values = problem.discretisation.rows.zeros()
+        problem.system.exact_hessian(values)
+        matrix = expanded(problem.pattern, values, n).reshape(3 * n, 3 * n)
+        heights, edges = 3 * np.arange(layout.n_vertices) + 2, layout.edge_places
+        across = matrix[np.ix_(heights, edges)]
+        condensed = matrix[np.ix_(heights, heights)] - across @ np.linalg.solve(
+            matrix[np.ix_(edges, edges)], across.T
+        )
+        root = np.sqrt(problem.system.mass[: layout.n_vertices])
+        exact = np.linalg.eigvalsh(condensed / np.outer(root, root))[:6]
+    with Bench(comm) as bench, bench.simulation(content) as trial:
+        squares, _ = lowest_squares(trial, 6, shift=10.0)
+        frequencies, shapes = lowest_modes(trial, 6, shift=10.0)
+    np.testing.assert_allclose(squares, exact, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(frequencies[:3], 0.0, rtol=0.0, atol=0.0)
+    assert np.abs(shapes[:, :, :2]).max() == 0.0
+
+
+def test_below_zero_beyond_the_critical_load(comm: MPI.Comm) -> None:
+    with Bench(comm) as bench, bench.simulation(SHEET) as trial:
+        trial.set_state(x=trial.start * [0.95, 1.0, 1.0])
+        squares, _ = lowest_squares(trial, 1, shift=1e4)
+        assert squares[0] < 0.0
+        with pytest.raises(SolverError, match="no stable equilibrium"):
+            lowest_modes(trial, 1, shift=1e4)

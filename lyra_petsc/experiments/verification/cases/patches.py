@@ -38,7 +38,7 @@ def _scene(mesh: dict[str, Any], material: str, **more: Any) -> dict[str, Any]:
     claim=Exact(1e-10),
 )
 def patch_states(bench: Bench, n: float) -> Sequence[Measured]:
-    vertices, triangles = irregular_rectangle(int(n), WIDTH, HEIGHT)
+    vertices, triangles = irregular_rectangle(int(n), int(n), WIDTH, HEIGHT)
     mesh = bench.mesh(vertices, triangles)
     found: list[list[Measured]] = []
     for material in DATA["materials"]:
@@ -85,7 +85,7 @@ def _of_state(trial: Trial, state: dict[str, Any]) -> list[Measured]:
     claim=Exact(1e-10),
 )
 def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
-    vertices, triangles = irregular_rectangle(int(n), WIDTH, HEIGHT)
+    vertices, triangles = irregular_rectangle(int(n), int(n), WIDTH, HEIGHT)
     mesh = bench.mesh(vertices, triangles)
     handles = [
         {"box": [[-NEAR, -1, -1], [NEAR, 1, 1]], "axes": ["x"]},

@@ -2,50 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.meshes import irregular_rectangle, square_script
-from lyra_petsc.experiments.verification.answers import Converges, Measured, case, data
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.meshes import SIDES
+from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data, farthest
+from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, plate_material
+from lyra_petsc.terms.midedge import MidEdge
+
+Array = NDArray[np.float64]
 
 EXACT = data("linear_plate")
 HELD = {
-    "CCCC": ("clamp", ("left", "right", "bottom", "top")),
-    "SSSS": ("pin", ("left", "right", "bottom", "top")),
+    "CCCC": ("clamp", SIDES),
+    "SSSS": ("pin", SIDES),
     "CFFF": ("clamp", ("left",)),
-}
-SIDES: dict[str, list[list[float | None]]] = {
-    "left": [[None, None, None], [0.0, None, None]],
-    "right": [[1.0, None, None], [None, None, None]],
-    "bottom": [[None, None, None], [None, 0.0, None]],
-    "top": [[None, 1.0, None], [None, None, None]],
 }
 LARGEST = 1e-3
 """Deflection over the side: so small that the plate is linear to 1e-5."""
-
-MESHES = ("diagonal", "alternating", "criss-cross", "irregular", "gmsh")
-
-
-def unit_square(bench: Bench, kind: str, n: int) -> dict[str, Any]:
-    """The mesh block of a unit square with n edges along each side; collective."""
-    if kind == "irregular":
-        return bench.mesh(*irregular_rectangle(n, 1.0, 1.0))
-    if kind == "gmsh":
-        return bench.script(square_script(1.0 / n))
-    return {"grid": {"width": 1.0, "height": 1.0, "nx": n, "ny": n, "pattern": kind}}
-
-
-def _beside(side: str) -> list[list[float]]:
-    """Opposite corners of a box about one side of the unit square."""
-    low, high = SIDES[side]
-    grown = 1e-6
-    return [
-        [-1.0 if value is None else value - grown for value in low],
-        [2.0 if value is None else value + grown for value in high],
-    ]
 
 
 @case(
@@ -55,33 +33,82 @@ def _beside(side: str) -> list[list[float]]:
     resolutions=(8, 16, 32, 64, 128),
     claim=Converges(2.0, 2e-3, slack=0.4),
 )
-def plate(bench: Bench, n: float) -> Sequence[Measured]:
-    found = []
+def plate(bench: Bench, n: float) -> Iterator[Measured]:
     for words, exact in EXACT["deflection"].items():
         edges, poisson = words.split()
         how, sides = HELD[edges]
         load = LARGEST / exact["at"]
-        for kind in MESHES:
+        for kind in KINDS:
             scene = {
-                "mesh": unit_square(bench, kind, round(n)),
-                "material": {
-                    "density": 1.0,
-                    "membrane": {"c11": 1.0, "c22": 1.0, "c12": 0.0, "c33": 0.5},
-                    "bending_model": "midedge",
-                    "bending": {
-                        "d11": 1.0,
-                        "d22": 1.0,
-                        "d12": float(poisson),
-                        "d33": 0.5 * (1.0 - float(poisson)),
-                    },
-                },
+                "mesh": flat_mesh(bench, kind, round(n), round(n)),
+                "material": plate_material(1.0, poisson=float(poisson)),
                 "gravity": [0.0, 0.0, load],
-                "handles": [{"box": _beside(side), "clamp": how == "clamp"} for side in sides],
-                "time": {"analysis": "static"},
+                "handles": [{"group": side, "clamp": how == "clamp"} for side in sides],
+                "time": {"analysis": "static", "step": 1.0},
             }
             with bench.simulation(scene) as trial:
                 height, start = trial.run().x[:, 2], trial.start[:, :2]
             at = int(np.argmin(np.linalg.norm(start - exact["place"], axis=1)))
             value = float(height[at]) / LARGEST
-            found.append(Measured(f"deflection, {edges}, ν = {poisson}, {kind}", value, 1.0))
-    return found
+            yield Measured(f"deflection, {edges}, ν = {poisson}, {kind}", value, 1.0)
+
+
+# -- constant curvature ----------------------------------------------------------------------------------
+
+SMALL = 1e-5
+"""Curvature times the side"""
+
+RATIOS = (0.0, 0.3)
+
+CORNERS: list[tuple[float, float, list[str]]] = [
+    (0.0, 0.0, ["x", "y", "z"]), (1.0, 0.0, ["y", "z"]), (0.0, 1.0, ["z"]),
+]  # fmt: skip
+"""What holds a square as a rigid body is held: in equilibrium without it there are no reactions."""
+
+
+def _at(x: float, y: float) -> dict[str, Any]:
+    return {"box": [[x - 1e-6, y - 1e-6, -1.0], [x + 1e-6, y + 1e-6, 1.0]]}
+
+
+@case(
+    "Free plates bent by moments along two sides, and twisted by forces at the corners, bending_model: "
+    "midedge: curvatures of the triangle farthest off over the largest; across they are −ν, hinges give "
+    "+0.2 to +0.5 (alternating, criss-cross), and on single diagonals twist what is bent",
+    source=(
+        "Kirchhoff's plate, closed form: κ11 = M/(D (1 − ν²)), κ22 = −ν κ11, κ12 = 0; under forces F at the "
+        "corners κ12 = F/(2 D (1 − ν)) alone"
+    ),
+    resolutions=(2, 4, 8, 16),
+    claim=Exact(1e-7),
+)
+def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
+    for poisson in RATIOS:
+        moment = SMALL * (1.0 - poisson**2)
+        loads: dict[str, tuple[list[dict[str, Any]], tuple[float, float, float]]] = {
+            "bent": (
+                [{"group": side, "moment": moment} for side in ("left", "right")],
+                (1.0, -poisson, 0.0),
+            ),
+            "twisted": ([_at(1.0, 1.0) | {"force": [0, 0, 2.0 * SMALL * (1.0 - poisson)]}], (0.0, 0.0, 1.0)),
+        }
+        for words, (load, exact) in loads.items():
+            for kind in KINDS:
+                scene = {
+                    "mesh": flat_mesh(bench, kind, round(n), round(n)),
+                    "material": plate_material(1.0, poisson=poisson),
+                    "loads": load,
+                    "handles": [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS],
+                    "time": {"analysis": "static", "step": 1.0},
+                }
+                with bench.simulation(scene) as trial:
+                    found = _curvatures(bench, trial.run()) / SMALL
+                for k, name in enumerate(("κ11", "κ22", "κ12")):
+                    value = farthest(found[:, k], exact[k])
+                    yield Measured(f"{name}, {words}, ν = {poisson:g}, {kind}", value, exact[k], scale=1.0)
+
+
+def _curvatures(bench: Bench, trial: Trial) -> Array:
+    """κ11, κ22, κ12 [1/m] of all triangles (F, 3); collective."""
+    term, x = trial.simulation.problem.terms["midedge"], trial.simulation.problem.system.x
+    assert isinstance(term, MidEdge)
+    return np.concatenate(bench.comm.allgather(term.curvatures(x, term.frames)[: term.n_owned]))
