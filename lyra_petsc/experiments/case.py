@@ -13,9 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, cast
 
-from pydantic import TypeAdapter
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainValidator, TypeAdapter
 
 from lyra_petsc.api.mpirun import run_launched
 from lyra_petsc.errors import InputError, nearest
@@ -91,10 +93,18 @@ def passed_of(outcomes: Sequence[Outcome[C]]) -> str:
 
 T = TypeVar("T")
 
+StoredArray = Annotated[NDArray[Any], PlainValidator(np.asarray)]
+"""An array in a record."""
+
 
 def save_record(path: Path, record: DataclassInstance) -> None:
     """Write a record; the file is the old or the new one, never half. Call on one rank."""
-    replace_text(path, json.dumps(asdict(record), indent=2, ensure_ascii=False) + "\n")
+
+    def of_numpy(value: NDArray[Any]) -> Any:
+        return value.tolist()
+
+    text = json.dumps(asdict(record), indent=2, ensure_ascii=False, default=of_numpy)
+    replace_text(path, text + "\n")
 
 
 def load_record(path: Path, kind: type[T]) -> T:

@@ -92,6 +92,23 @@ class _Script:
     path: Path
     tokens: list[_Token]
     names: set[str] = field(default_factory=set)
+    partners: dict[int, int] = field(default_factory=dict)
+    """Numbers of the brackets that open and close the same, of both kinds."""
+
+    def __post_init__(self) -> None:
+        opened: list[int] = []
+        for number, token in enumerate(self.tokens):
+            if token.kind == "sign" and token.text in _CLOSING:
+                opened.append(number)
+            elif token.kind == "sign" and token.text in _CLOSING.values() and opened:
+                begin = opened.pop()
+                self.partners |= {begin: number, number: begin}
+
+    def closing(self, opening: int) -> int:
+        """Number of the token that closes a bracket within its statement; that of the last if none does."""
+        end, last = self.partners.get(opening, len(self.tokens)), len(self.tokens) - 1
+        within = self.tokens[opening].text == "{" or not any(t.text == ";" for t in self.tokens[opening:end])
+        return end if within and end <= last else last
 
 
 @dataclass(frozen=True)
@@ -325,55 +342,41 @@ def _collect_names(script: _Script) -> None:
     for number, token in enumerate(tokens):
         if token.kind != "word":
             continue
-        if _assigned(tokens, number):
+        if _assigned(script, number):
             names.add(token.text)
         after = tokens[number + 1] if number + 1 < len(tokens) else None
         if token.text in ("For", "Macro", "Function", "Call") and after and after.kind == "word":
             names.add(after.text)
         if token.text in ("DefineConstant", "DefineNumber", "DefineString", "UndefineConstant"):
-            names |= set(_listed(tokens, number + 1))
+            names |= set(_listed(script, number + 1))
     names -= REFUSED.keys()
     names -= RESERVED
 
 
-def _listed(tokens: list[_Token], opening: int) -> Iterator[str]:
+def _listed(script: _Script, opening: int) -> Iterator[str]:
     """The names in the brackets of a DefineConstant."""
-    depth = 0
-    for number in range(opening, len(tokens)):
-        text = tokens[number].text
-        if tokens[number].kind == "sign":
-            depth += (text in _CLOSING) - (text in ")]}")
-            if depth <= 0:
-                return
+    tokens = script.tokens
+    opening = next((n for n in range(opening, len(tokens)) if tokens[n].kind == "sign"), opening)
+    depth = 1 if opening < len(tokens) and tokens[opening].text in _CLOSING else 0
+    for number in range(opening + 1, script.partners.get(opening, len(tokens))):
+        if depth and tokens[number].kind == "sign":
+            depth += (tokens[number].text in _CLOSING) - (tokens[number].text in _CLOSING.values())
         elif depth == 1 and tokens[number].kind == "word" and tokens[number - 1].text in ("[", "(", ",", "{"):
-            yield text
+            yield tokens[number].text
 
 
-def _assigned(tokens: list[_Token], number: int) -> bool:
+def _assigned(script: _Script, number: int) -> bool:
     """Whether a name, with its indices, is followed by a sign that gives it a value."""
-    at = number + 1
+    tokens, at = script.tokens, number + 1
     while at < len(tokens) and tokens[at].kind == "sign":
         text = tokens[at].text
         if text == "~":
             at += 1
         elif text in _CLOSING:
-            at = _closed(tokens, at) + 1
+            at = script.closing(at) + 1
         else:
             return text in _ASSIGNS
     return False
-
-
-def _closed(tokens: list[_Token], opening: int) -> int:
-    """Number of the token that closes the bracket at ``opening``; that of the last if none does."""
-    depth = 0
-    for number in range(opening, len(tokens)):
-        if tokens[number].kind == "sign":
-            depth += (tokens[number].text in _CLOSING) - (tokens[number].text in ")]}")
-            if depth == 0:
-                return number
-            if tokens[number].text == ";" and tokens[opening].text != "{":
-                return len(tokens) - 1
-    return len(tokens) - 1
 
 
 def _check_word(script: _Script, number: int, names: set[str]) -> None:
@@ -391,7 +394,7 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
     if word.endswith("FileName") and word != "CurrentFileName":
         raise refuse("reads what the scene does not name")
     if before is not None and before.text == ".":
-        if not _is_option(tokens, number):
+        if not _is_option(script, number):
             raise refuse("is no option that is known here")
         return
     if word in RESERVED:
@@ -403,8 +406,8 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
     if word in ("Macro", "Function") and not (after and after.kind == "word" and after.text in names):
         raise refuse("must be followed by a name")
     known = word in STATEMENTS or word in OPERANDS
-    if _begins_statement(tokens, number):
-        if word not in STATEMENTS and not _assigned(tokens, number):
+    if _begins_statement(script, number):
+        if word not in STATEMENTS and not _assigned(script, number):
             raise refuse()
     elif not known and word not in names and not COLOUR.fullmatch(word):
         raise refuse()
@@ -412,33 +415,22 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
         raise refuse()
 
 
-def _begins_statement(tokens: list[_Token], number: int) -> bool:
+def _begins_statement(script: _Script, number: int) -> bool:
+    tokens = script.tokens
     if number == 0 or tokens[number - 1].text in _BEFORE_STATEMENT:
         return True
     if tokens[number - 1].text == ")":  # of an If (…) or For (…)
-        depth = 0
-        for at in range(number - 1, -1, -1):
-            if tokens[at].kind == "sign":
-                depth += (tokens[at].text in ")]}") - (tokens[at].text in _CLOSING)
-                if depth == 0:
-                    return at > 0 and tokens[at - 1].text in ("If", "ElseIf", "For")
-        return False
+        opening = script.partners.get(number - 1, 0)
+        return opening > 0 and tokens[opening - 1].text in ("If", "ElseIf", "For")
     return number > 1 and tokens[number - 2].text in ("Macro", "Function")
 
 
-def _is_option(tokens: list[_Token], number: int) -> bool:
+def _is_option(script: _Script, number: int) -> bool:
     """Whether the word after a dot is an option of the group before it."""
-    at = number - 2
+    tokens, at = script.tokens, number - 2
     if at >= 0 and tokens[at].text in ("]", ")"):
-        depth = 0
-        while at >= 0:
-            if tokens[at].kind == "sign":
-                depth += (tokens[at].text in ")]}") - (tokens[at].text in _CLOSING)
-                if depth == 0:
-                    break
-            at -= 1
-        at -= 1
-        return at >= 0 and tokens[at].text == "Field" and tokens[number].text in OPTIONS["Field"]
+        opening = script.partners.get(at, 0)
+        return opening > 0 and tokens[opening - 1].text == "Field" and tokens[number].text in OPTIONS["Field"]
     if at >= 0 and tokens[at].text == "Color":
         return (
             at > 0
@@ -453,7 +445,7 @@ def _check_printf(script: _Script, number: int) -> None:
     """Refuse a ``Printf`` that goes to a file, or might where gmsh jumps."""
     tokens = script.tokens
     line = tokens[number].line
-    closing = _closed(tokens, number + 1) if number + 1 < len(tokens) else number
+    closing = script.closing(number + 1) if number + 1 < len(tokens) else number
     inside = tokens[number + 1 : closing]
     ends = closing + 1 < len(tokens) and tokens[closing + 1].text == ";"
     if (

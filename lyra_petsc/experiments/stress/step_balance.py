@@ -33,7 +33,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.case import StoredArray, Verdict
 from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.roundoff import residual_roundoff
@@ -494,8 +494,8 @@ class Record:
     integrator: str = "beuler"
     balance: dict[str, Any] = field(default_factory=dict)
     busy: list[float] = field(default_factory=list)
-    last: NDArray[np.float64] | None = None
-    triangles: NDArray[np.int64] | None = None
+    last: StoredArray | None = None
+    triangles: StoredArray | None = None
 
     @property
     def newton(self) -> list[int]:

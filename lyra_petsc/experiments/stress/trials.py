@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import pickle
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, problem_of
-from lyra_petsc.experiments.case import Launcher, Outcome, Watch
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, load_record, save_record
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
     LITTLE_LOST,
@@ -229,7 +228,19 @@ def _energy(trial: Trial) -> float:
     return budget.kinetic + budget.membrane + budget.bending + budget.potential
 
 
-OUTCOME_FILE = "outcome.pickle"
+OUTCOME_FILE = "outcome.json"
+
+
+@dataclass
+class Told:
+    """A `StressOutcome` without its case, for the process that has launched this one."""
+
+    verdicts: dict[str, Verdict]
+    seconds: float
+    left_out: str
+    record: Record
+    ratio: float
+    busy_ratio: float
 
 
 def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: Watch) -> StressOutcome:
@@ -261,16 +272,16 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
 
 
 def save(outcome: StressOutcome, folder: Path) -> None:
-    """Write an outcome, but for its case, for the process that has launched this one. On one rank."""
+    """Write an outcome, but for its case. On one rank."""
     content = {name: value for name, value in vars(outcome).items() if name != "case"}
-    (folder / OUTCOME_FILE).write_bytes(pickle.dumps(content))
+    save_record(folder / OUTCOME_FILE, Told(**content))
 
 
 def restore(folder: Path, case: StressCase) -> StressOutcome | None:
     """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
     try:
-        return StressOutcome(case, **pickle.loads((folder / OUTCOME_FILE).read_bytes()))
-    except (OSError, EOFError, pickle.UnpicklingError):
+        return StressOutcome(case, **vars(load_record(folder / OUTCOME_FILE, Told)))
+    except (OSError, ValueError):
         return None
 
 
