@@ -55,15 +55,18 @@ def hanging_square(
     }
 
 
-MESHES = ("diagonal", "alternating", "criss-cross", "gmsh", "gmsh 1:20")
-"""Kinds of triangles that the square is cut into; the first is that of all other measurements."""
+GRADED_MESH = "gmsh 1:20"
+
+MESHES = ("diagonal", "alternating", "criss-cross", "gmsh", GRADED_MESH, "diagonal, midedge", "gmsh, midedge")
+"""Kinds of triangles that the square is cut into, the first that of all other measurements; bending model."""
 
 GRADED = 20.0
-"""Largest over smallest edge of the last of them."""
+"""Largest over smallest edge of graded meshes."""
 
 
 def on_mesh(kind: str, vertices: int, folder: Path) -> dict[str, Any]:
     """`hanging_square` on another kind of mesh, which gmsh makes from a file in ``folder``."""
+    kind, _, model = kind.partition(", ")
     scene = hanging_square(vertices)
     if kind in ("diagonal", "alternating"):
         scene["mesh"]["grid"]["pattern"] = kind
@@ -73,8 +76,10 @@ def on_mesh(kind: str, vertices: int, folder: Path) -> dict[str, Any]:
         scene["mesh"]["grid"]["pattern"] = kind
     else:
         file = folder / f"{kind.replace(':', '-').replace(' ', '-')}-{vertices}.geo"
-        file.write_text(square_script(vertices, GRADED if kind == MESHES[-1] else 1.0), encoding="ascii")
+        file.write_text(square_script(vertices, GRADED if kind == GRADED_MESH else 1.0), encoding="ascii")
         scene |= {"mesh": {"file": str(file)}, "handles": [{"group": "held"}]}
+    if model:
+        scene["material"]["bending_model"] = model
     return scene
 
 

@@ -281,7 +281,7 @@ def document(results: Result) -> str:
     if results["rows"]:
         lines += [*main_table(results["rows"]), ""]
     if results.get("meshes"):
-        lines += ["## Other meshes", "", *meshes_table(results["meshes"]), ""]
+        lines += ["## Other meshes, and directors on edges", "", *meshes_table(results["meshes"]), ""]
     if "growth" in results:
         lines += [*growth_words(results["growth"]), ""]
     if results.get("weak"):
