@@ -62,8 +62,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "stage_equations.py",
-        "energy(self.x)\n        self.active.turn_targets(Step(self.t0, self.t1, self.t1",
-        "energy(self.x)\n        self.active.turn_targets(Step(self.t0, self.t1, self.t0",
+        "energy(self.x)\n        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1",
+        "energy(self.x)\n        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0",
         (BOOKS + "test_a_turning_clamp_stores_energy_where_it_stands[midpoint]",),
     ),
     Change(

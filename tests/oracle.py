@@ -16,7 +16,7 @@ from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge, mean_directors
 from lyra_petsc.terms.midedge_energy import triangle_hessian
 from lyra_petsc.terms.midedge_shape import Frames, carried, unit
-from lyra_petsc.terms.term import Elastic, Step, Viscous
+from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ Ints = NDArray[np.int64] | NDArray[np.int32]
 
 def frozen_by(term: Elastic | Viscous, system: StageEquations, x: Array | None = None) -> Any:
     """What a term freezes for a step from 0 s to 0.01 s, at positions x instead of the state's."""
-    return term.freeze(Step(0.0, 0.01, 0.01, system.x if x is None else x, system.reference.at))
+    return term.freeze(UpcomingStep(0.0, 0.01, 0.01, system.x if x is None else x, system.reference.at))
 
 
 def gradient(term: Elastic | Viscous, at: Array, frozen: Any) -> Array:

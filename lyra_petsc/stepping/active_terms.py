@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.registry import Role
-from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
+from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
@@ -47,12 +47,12 @@ class ActiveTerms:
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
-    def freeze(self, step: Step) -> None:
+    def freeze(self, step: UpcomingStep) -> None:
         """Let every term that acts through positions or velocities freeze what it does."""
         self.frozen = {}  # there is no room for both
         self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
 
-    def turn_targets(self, step: Step) -> None:
+    def turn_targets(self, step: UpcomingStep) -> None:
         """Let targets that move with handles stand where they do at ``step.at``."""
         self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}
 

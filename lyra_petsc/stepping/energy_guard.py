@@ -37,7 +37,7 @@ from lyra_petsc.stepping.energy_balance import Budget, Works
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import fitted
 from lyra_petsc.terms.registry import Role
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -196,7 +196,7 @@ class EnergyGuard:
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
         """What terms freeze with their targets where they are at time ``at`` [s] of the step."""
         system = self._system
-        step = Step(system.t0, system.t1, at, x, system.reference.at)
+        step = UpcomingStep(system.t0, system.t1, at, x, system.reference.at)
         return {term: term.freeze(step) for term in terms}
 
     def _of_targets(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
@@ -229,7 +229,7 @@ class EnergyGuard:
                         load.add_force(x, t0, t1, force)
             wind = np.zeros_like(force)
             for term in system.active.viscous:
-                term.add_gradient(v, term.freeze(Step(t0, t1, t0, x, system.reference.at)), wind)
+                term.add_gradient(v, term.freeze(UpcomingStep(t0, t1, t0, x, system.reference.at)), wind)
             force -= wind
         free = np.where(system.prescribed.free, moved, 0.0)
         return 0.5 * float(np.vdot(force[: len(free)], free))

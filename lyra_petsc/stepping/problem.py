@@ -29,7 +29,7 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
-from lyra_petsc.stepping.integrators.registry import integrator_of
+from lyra_petsc.stepping.integrators import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.motion import Window, motion_of

@@ -37,7 +37,7 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import Elastic, Load, Step, Term, Viscous
+from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ class StageEquations:
     def rest_at(self, time: float) -> None:
         """Let moving targets stand where they are at ``time`` [s], between two steps."""
         self.t0 = self.t1 = time
-        step = Step(time, time, time, self.x, self.reference.at)
+        step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
 
     # -- a step ------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ class StageEquations:
     def _freeze(self, at: float) -> None:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
         x = self._frozen_positions(at)
-        self.active.freeze(Step(self.t0, self.t1, at, x, self.reference.at))
+        self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         self.objective.begin_step()
         if self.integrator.moves or self.applied.given is None:
             lagged = self.active.viscous and self.integrator.lagged_loads
@@ -289,7 +289,7 @@ class StageEquations:
         self.history = np.zeros((n, 3))
         self._xh = fitted(x_before, n, self.points.n_local)
         self.points.update_ghosts(self._xh)
-        self.active.turn_targets(Step(self.t0, self.t1, self.t1, self.x, self.reference.at))
+        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
         self.prescribed.solve(self._xh[:n], dt)
 
@@ -323,7 +323,7 @@ class StageEquations:
         if self.stage.after == self.dt or not (self.active.moving or self.active.constraints):
             return 0.0
         before = self.active.moving_energy(self.x)
-        self.active.turn_targets(Step(self.t0, self.t1, self.t1, self.x, self.reference.at))
+        self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
 
     def largest_step(self, v: Array, way: Array) -> float:
@@ -462,6 +462,6 @@ class StageEquations:
             term.add_force(x, self.t0, self.t1, out)
         elif isinstance(term, Viscous):
             against = np.zeros_like(out)
-            frozen = term.freeze(Step(self.t0, self.t1, self.t1, x, self.reference.at))
+            frozen = term.freeze(UpcomingStep(self.t0, self.t1, self.t1, x, self.reference.at))
             term.add_gradient(np.zeros_like(x), frozen, against)
             out -= against

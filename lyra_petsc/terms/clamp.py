@@ -26,7 +26,7 @@ from lyra_petsc.terms.hinge import angle, point
 from lyra_petsc.terms.hinge_energy import fading_limit, hinge_energy, hinge_gradient, hinge_hessian
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -114,7 +114,7 @@ class Clamp(Elastic):
     def reference_rows(self) -> NDArray[np.int64]:
         return self.stencil.ravel().astype(np.int64)
 
-    def freeze(self, step: Step) -> Mirrors:
+    def freeze(self, step: UpcomingStep) -> Mirrors:
         mirror, k = np.zeros((self.n_elements, 3)), np.zeros(self.n_elements)
         for number, (motion, window) in self._handles.items():
             mine = self._handle == number

@@ -25,7 +25,7 @@ from lyra_petsc.kernels.vectors import add_triangle
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms.membrane_laws.registry import law_of
+from lyra_petsc.terms.membrane_laws import law_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
 

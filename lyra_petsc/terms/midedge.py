@@ -43,7 +43,7 @@ from lyra_petsc.terms.midedge_shape import (
 )
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, Step
+from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -117,7 +117,7 @@ class MidEdge(Elastic):
     def begin(self, x: Array) -> None:
         self.frames = self._carried(self.frames, x)
 
-    def freeze(self, step: Step) -> Frames:
+    def freeze(self, step: UpcomingStep) -> Frames:
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:

@@ -18,7 +18,7 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Pulling, Step
+from lyra_petsc.terms.term import Pulling, UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Spring(Pulling):
     def reference_rows(self) -> NDArray[np.int64]:
         return self.stencil[:, 0].astype(np.int64)
 
-    def freeze(self, step: Step) -> Springs:
+    def freeze(self, step: UpcomingStep) -> Springs:
         target, stiffness = np.zeros((self.n_elements, 3)), np.zeros((self.n_elements, 3))
         for number, (motion, window, fading_only) in self._handles.items():
             mine = self._handle == number

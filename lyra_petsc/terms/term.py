@@ -45,7 +45,7 @@ Couplings = Mapping[str, Coupling]
 
 
 @dataclass(frozen=True)
-class Step:
+class UpcomingStep:
     """What a term may know of a step before it is computed.
 
     Attributes
@@ -112,7 +112,7 @@ class Term(ABC):
         """Local rows (n,) whose positions at the start of handles ``freeze`` asks for."""
         return np.empty(0, dtype=np.int64)
 
-    def freeze(self, step: Step) -> Any:
+    def freeze(self, step: UpcomingStep) -> Any:
         """What stays as it is during the step; every call in the step gets it as ``frozen``."""
         return None
 

@@ -23,7 +23,7 @@ from lyra_petsc.kernels.vectors import add_outer
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Offsets, Step, Viscous
+from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class Wind(Viscous):
         self._area = elements.data["area"]
         self._law = (np.asarray(velocity, dtype=np.float64), float(density), float(drag))
 
-    def freeze(self, step: Step) -> Array:
+    def freeze(self, step: UpcomingStep) -> Array:
         """Unit normals (E, 3)."""
         out = np.empty((self.n_elements, 3))
         normals(step.x, self.stencil, out)

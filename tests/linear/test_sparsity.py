@@ -131,7 +131,6 @@ def imported(**more: Any) -> set[str]:
 MEMBRANE_SCENE = {
     "membrane",
     "membrane_laws",
-    "membrane_laws.registry",
     "membrane_laws.stvk",
     "motion",
     "prescribed_handles",

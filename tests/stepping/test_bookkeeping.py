@@ -14,7 +14,7 @@ from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import StepControl
-from lyra_petsc.terms.term import Step
+from lyra_petsc.terms.term import UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def test_a_turning_clamp_stores_energy_where_it_stands(integrator: str, comm: MP
     scene = {"handles": handles, "motions": motions, "time": time, "material": material}
     with done(comm, **scene) as simulation:
         system, problem = simulation.problem.system, simulation.problem
-        end = Step(0.02, simulation.time, simulation.time, system.x, system.reference.at)
+        end = UpcomingStep(0.02, simulation.time, simulation.time, system.x, system.reference.at)
         here = 0.0
         for name in ("bending", "clamp"):
             term: Any = problem.terms[name]

@@ -26,7 +26,7 @@ from physics import Simulation, rotation
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import Frames
 from lyra_petsc.terms.registry import REGISTRY, Role
-from lyra_petsc.terms.term import Elastic, Load, Pulling, Step, Term, Viscous
+from lyra_petsc.terms.term import Elastic, Load, Pulling, Term, UpcomingStep, Viscous
 
 pytestmark = pytest.mark.quick
 
@@ -237,7 +237,7 @@ def test_force_scale_bounds_the_round_off_of_the_force(term: Term, simulation: S
     x = moved(simulation, simulation.system.x, np.eye(3), [far, far, far])
     before = term.force_scale(far + 1.0)
     # springs and clamps set out from where they stand
-    frozen = term.freeze(Step(0.0, 0.01, 0.01, x, lambda start, rows: x[rows]))
+    frozen = term.freeze(UpcomingStep(0.0, 0.01, 0.01, x, lambda start, rows: x[rows]))
     np.testing.assert_array_equal(term.force_scale(far + 1.0), before)
     assert np.all(before > 0.0)
     scale = term.force_scale(far + 1.0)

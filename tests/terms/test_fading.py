@@ -18,7 +18,7 @@ from lyra_petsc.terms.clamp import Clamp
 from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
 from lyra_petsc.terms.motion import STILL, Window
 from lyra_petsc.terms.registry import registered
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def turned() -> Array:
 def frozen(term: Elastic, start: Array | None = None) -> Any:
     """What a clamp that sets out from ``start`` freezes; nothing of a hinge."""
     x = turned() if start is None else start
-    return term.freeze(Step(0.0, 1.0, 1.0, x, lambda time, rows: x[rows]))
+    return term.freeze(UpcomingStep(0.0, 1.0, 1.0, x, lambda time, rows: x[rows]))
 
 
 def total(term: Elastic, start: Array | None = None) -> Callable[[Array], float]:

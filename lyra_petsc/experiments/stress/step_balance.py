@@ -42,7 +42,7 @@ from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 Array = NDArray[np.float64]
 
@@ -322,7 +322,7 @@ class Accountant:
             load.add_force(self._x, report.time - report.dt, report.time, force)
         wind = np.zeros_like(force)
         for term in system.active.viscous:
-            step = Step(system.t0, system.t1, system.t0, self._x, system.reference.at)
+            step = UpcomingStep(system.t0, system.t1, system.t0, self._x, system.reference.at)
             term.add_gradient(v1, term.freeze(step), wind)
         return {
             "inertia": system.mass[:, None] * rate,
@@ -440,7 +440,7 @@ class StageAccountant(Accountant):
     def _prepare(self, at: float) -> None:
         """Let moving targets stand where they are at time ``at`` [s] of the step."""
         system = self._system
-        step = Step(system.t0, system.t1, at, system.x, system.reference.at)
+        step = UpcomingStep(system.t0, system.t1, at, system.x, system.reference.at)
         system.active.frozen |= {term: term.freeze(step) for term in system.active.elastic}
 
 

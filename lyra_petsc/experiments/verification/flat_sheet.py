@@ -21,7 +21,7 @@ from petsc4py import PETSc
 from lyra_petsc.experiments.bench import Trial, direct_solver
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.terms.bending import Bending
-from lyra_petsc.terms.term import Elastic, Step
+from lyra_petsc.terms.term import Elastic, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -150,7 +150,7 @@ def stiffness(trial: Trial) -> Stiffness:
     for name in BENDING_TERMS:
         term = problem.terms.get(name)
         if isinstance(term, Elastic):
-            frozen = term.freeze(Step(0.0, 1.0, 1.0, system.x, system.reference.at))
+            frozen = term.freeze(UpcomingStep(0.0, 1.0, 1.0, system.x, system.reference.at))
             rows.add_stiffness(term, system.x, frozen, 0.0, 1.0, values)
     numbers = mesh_numbers(trial)
     row, column = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
