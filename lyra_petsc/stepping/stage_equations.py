@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+LEAST = 1e-6
+"""Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
+
 
 class StageEquations:
     """One rank's part of the equations, and the state (x_n, v_n) a step starts from.
@@ -110,6 +113,7 @@ class StageEquations:
         sheet = [term for term in self.elastic if term.registration.role is Role.ELASTIC]
         self._constraints, self._moving = pulling, [t for t in sheet if t.registration.moving]
         self._limiting = [term for term in self.elastic if term.registration.limits_step]
+        self._least = self._least_stiffness()
         internal = partial(self._sum, sheet)  # moving targets change the forces at one and the same place
         self._internal = internal if self._moving else Remembered(internal)
         once = integrator.lagged_loads
@@ -128,6 +132,7 @@ class StageEquations:
         self.load_factor = 1.0
         self.unbalanced: Array | None = None
         self.given_loads: Array | None = None
+        self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
         self.hinges: Bending | None = None
         self._iterates: tuple[Array | None, Array | None] = (None, None)
         self._last_parts: dict[str, Array] = {}
@@ -146,6 +151,16 @@ class StageEquations:
     def v(self) -> Array:
         """Velocities (n_local, 3) [m/s] of the state."""
         return self.state.v
+
+    def _least_stiffness(self) -> Array:
+        """What Jacobians add to the diagonal of block rows (n_owned,) [N/m]: where edges' triangles have lost
+        their area nothing else is left.
+        """
+        least = np.zeros((self.points.n_local, 3))
+        for term in self._limiting:
+            least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
+        found: Array = least[: self.points.n_owned].max(axis=1)
+        return found
 
     def begin(self, time: float) -> None:
         """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
@@ -313,6 +328,38 @@ class StageEquations:
             if term.registration.edge_state:
                 term.accept(self.x, (frozen or self.frozen)[term])
 
+    def turn_frames(self) -> bool:
+        """Let the frames of edges that have turned far follow to where the equations were last evaluated;
+        whether any did, and the vertices' forces are others; collective.
+        """
+        found: dict[Term, Any] = {}
+        for term in () if self._at_end else self._limiting:
+            if term.registration.edge_state:
+                nearer = term.nearer(self._xs, self.frozen[term], self.prescribed.mask)
+                found |= {} if nearer is None else {term: nearer}
+        if not self.points.comm.allreduce(len(found), MPI.MAX):
+            return False
+        self.frozen = self.frozen | found
+        if isinstance(self._internal, Remembered):
+            self._internal.forget()
+        self.objective.forget()
+        return True
+
+    def open_directors(self, v: Array) -> None:
+        """Let no unknown of an edge at velocities v (n_owned, 3) make the energy infinite, where it need not;
+        collective.
+        """
+        if not self._limiting or np.isfinite(self.objective(v)[0]):
+            return
+        x, _ = self.evaluate_at(v)
+        for term in self._limiting:
+            if term.registration.edge_state:
+                places, values = term.opened(x, self.frozen[term])
+                own = places < v.size
+                own[own] = self.prescribed.free.ravel()[places[own]]
+                places = places[own]
+                v.reshape(-1)[places] = (values[own] - self._xh.ravel()[places]) / self.stage.reach
+
     @property
     def edges_lag(self) -> bool:
         """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
@@ -337,6 +384,7 @@ class StageEquations:
         targets = (*self._moving, *self._constraints)
         self.frozen = self.frozen | {term: term.freeze(step) for term in targets}
         self.prescribed.hold_vertices(self.x[:n])
+        self._at_end = True
         self.prescribed.solve(self._xh[:n], dt)
 
     def end_edges(self, v: Array | None) -> None:
@@ -345,6 +393,7 @@ class StageEquations:
         moved = None if v is None else self._xh[:n] + self.stage.reach * v
         self.stage, self.history, self._xh, stage_velocity, self.frozen = self._kept
         self.prescribed.release_vertices()
+        self._at_end = False
         self.objective.forget()
         self.new_iterate(None)
         if moved is not None:
@@ -486,7 +535,8 @@ class StageEquations:
         self._last_parts = {} if lagged else self._last_parts
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
-        inertia, reach = self.stage.sigma * self.mass, self.stage.reach
+        reach = self.stage.reach
+        inertia = self.stage.sigma * self.mass + reach * self._least
         blocks = self.prescribed.blocks
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
             self.damping.into(values, inertia)
