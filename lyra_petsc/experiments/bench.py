@@ -22,6 +22,7 @@ from lyra_petsc.phases import Phases
 from lyra_petsc.scene.messages import input_error
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+from lyra_petsc.terms.midedge import MidEdge
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -123,6 +124,12 @@ class Trial:
             if values is not None:
                 target[: problem.points.n_vertices] = values[problem.points.original]
                 problem.points.update_ghosts(target)
+        for term in problem.system.active.elastic if x is not None else ():
+            if isinstance(term, MidEdge):
+                own = term.edge_places < 3 * problem.points.n_owned
+                directors = term.anew(problem.system.x)
+                problem.system.x.reshape(-1)[term.edge_places[own]] = directors[own]
+                problem.points.update_ghosts(problem.system.x)
         self.simulation.ledger.measure()  # from which steps reckon what they did to energy
 
     def total(self, owned: Array) -> float:

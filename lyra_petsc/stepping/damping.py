@@ -61,6 +61,8 @@ class Damping:
     ----------
     acts : bool
         Whether anything is damped, on any rank; without, nothing is stored.
+    frozen : mapping of Term → any
+        What terms froze for the step, before edges turned far.
     product : Remembered
         D v, owned rows (n_owned, 3) [N], of velocities v (n_local, 3).
     """
@@ -77,7 +79,7 @@ class Damping:
         self._stored = False
         self._multiple: Multiple | None = None
         self._at: Array | None = None
-        self._frozen: Mapping[Term, Any] = {}
+        self.frozen: Mapping[Term, Any] = {}
         # residual, objective and works ask at the same velocities
         self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
@@ -92,7 +94,7 @@ class Damping:
     def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
         """Take the geometry of positions x (n_local, 3), with what terms froze for the step."""
         self.let_go()
-        self._at, self._stored, self._frozen = x.copy(), False, frozen
+        self._at, self._stored, self.frozen = x.copy(), False, frozen
         self.product.forget()
         if not self._once:
             self._own()
@@ -103,7 +105,7 @@ class Damping:
 
     def _add(self, x: Array, weight: Callable[[Elastic], Array | float], values: Array) -> None:
         for term in self._terms:
-            self._blocks.add_stiffness(term, x, self._frozen[term], 1.0, weight(term), values)
+            self._blocks.add_stiffness(term, x, self.frozen[term], 1.0, weight(term), values)
 
     def _own(self) -> Array:
         """D, stored from here on until the geometry is another."""

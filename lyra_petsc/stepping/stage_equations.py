@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property, partial, reduce
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -40,6 +41,9 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
+
+LEAST = 1e-6
+"""Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
 
 
 class StageEquations:
@@ -97,9 +101,9 @@ class StageEquations:
         self.reference = ReferencePositions(self.points, rows, starts)
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
-        internal = partial(
-            self._sum, active.sheet
-        )  # moving targets change the forces at one and the same place
+        self._least = self._least_stiffness()
+        # moving targets change the forces at one and the same place
+        internal = partial(self._sum, active.sheet)
         self._internal = internal if active.moving else Remembered(internal)
         once = integrator.lagged_loads
         self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
@@ -113,6 +117,7 @@ class StageEquations:
         self.objective = Objective(self)
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
         self.followers: list[Follower] = [integrator]
+        self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
         self._iterates: tuple[Array | None, Array | None] = (None, None)
         self._last_parts: dict[str, Array] = {}
 
@@ -130,6 +135,16 @@ class StageEquations:
     def v(self) -> Array:
         """Velocities (n_local, 3) [m/s] of the state."""
         return self.state.v
+
+    def _least_stiffness(self) -> Array:
+        """What Jacobians add to the diagonal of block rows (n_owned,) [N/m]: where edges' triangles have lost
+        their area nothing else is left.
+        """
+        least = np.zeros((self.points.n_local, 3))
+        for term in self.active.limiting:
+            least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
+        found: Array = least[: self.points.n_owned].max(axis=1)
+        return found
 
     def begin(self, time: float) -> None:
         """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
@@ -269,6 +284,38 @@ class StageEquations:
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
 
+    def turn_frames(self) -> bool:
+        """Let the frames of edges that have turned far follow to where the equations were last evaluated;
+        whether any did, and the vertices' forces are others; collective.
+        """
+        found: dict[Term, Any] = {}
+        for term in () if self._at_end else self.active.limiting:
+            if term.registration.edge_state:
+                nearer = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
+                found |= {} if nearer is None else {term: nearer}
+        if not self.points.comm.allreduce(len(found), MPI.MAX):
+            return False
+        self.active.frozen = self.active.frozen | found
+        if isinstance(self._internal, Remembered):
+            self._internal.forget()
+        self.objective.forget()
+        return True
+
+    def open_directors(self, v: Array) -> None:
+        """Let no unknown of an edge at velocities v (n_owned, 3) make the energy infinite, where it need not;
+        collective.
+        """
+        if not self.active.limiting or np.isfinite(self.objective(v)[0]):
+            return
+        x, _ = self.evaluate_at(v)
+        for term in self.active.limiting:
+            if term.registration.edge_state:
+                places, values = term.opened(x, self.active.frozen[term])
+                own = places < v.size
+                own[own] = self.prescribed.free.ravel()[places[own]]
+                places = places[own]
+                v.reshape(-1)[places] = (values[own] - self._xh.ravel()[places]) / self.stage.reach
+
     @property
     def edges_lag(self) -> bool:
         """Whether unknowns of edges are in equilibrium elsewhere than at the end of the step."""
@@ -291,6 +338,7 @@ class StageEquations:
         self.points.update_ghosts(self._xh)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         self.prescribed.hold_vertices(self.x[:n])
+        self._at_end = True
         self.prescribed.solve(self._xh[:n], dt)
 
     def end_edges(self, v: Array | None) -> None:
@@ -299,6 +347,7 @@ class StageEquations:
         moved = None if v is None else self._xh[:n] + self.stage.reach * v
         self.stage, self.history, self._xh, stage_velocity, self.active.frozen = self._kept
         self.prescribed.release_vertices()
+        self._at_end = False
         self.objective.forget()
         self.new_iterate(None)
         if moved is not None:
@@ -426,7 +475,8 @@ class StageEquations:
         self._last_parts = {} if lagged else self._last_parts
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
-        inertia, reach = self.stage.sigma * self.mass, self.stage.reach
+        reach = self.stage.reach
+        inertia = self.stage.sigma * self.mass + reach * self._least
         blocks = self.prescribed.blocks
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
             self.damping.into(values, inertia)

@@ -145,8 +145,8 @@ class Stepper:
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
-        if equations.discretisation.changes:
-            snes.setUpdate(lambda snes, iteration: self._follow_stencils())
+        if equations.discretisation.changes or (equations.active.limiting and self._iterates):
+            snes.setUpdate(self._update)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)
@@ -183,6 +183,13 @@ class Stepper:
 
     def _set_jacobian(self) -> None:
         self.ts.setIJacobian(self._ijacobian, self.linear.operator.mat, self.linear.preconditioner.mat)
+
+    def _update(self, snes: PETSc.SNES, iteration: int) -> None:
+        """Before a Newton iteration; collective."""
+        self._follow_stencils()
+        if iteration > 0 and self._equations.turn_frames():
+            snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
+            self._newton.globalisation.begin()
 
     def _follow_stencils(self) -> None:
         """Let the matrices be those of the present stencils; collective."""
@@ -237,6 +244,8 @@ class Stepper:
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.left, outcome.at_roundoff
         if velocity is not None:
+            if not self._iterates:
+                equations.open_directors(velocity)
             equations.accept(velocity)
             if before is not None:
                 assert rate_before is not None
@@ -376,7 +385,10 @@ class Stepper:
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
         first_guess(self._equations, guess)
-        if not self._iterates:
+        if self._iterates:
+            if self._equations.integrator.order == 1:  # others make energy where directors jump
+                self._equations.open_directors(guess)
+        else:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations
             ahead = self._extrapolation.to(equations.t1, equations.t0, equations.v[: len(guess)])

@@ -148,17 +148,12 @@ class ClampedEdges:
     def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
         """Moment (3,) [N·m] of a handle on its edges of this rank beside that of the forces at their ends.
 
-        ``reaction`` (n,) [N] is the force on all owned unknowns at positions x (n_local, 3) [m]. The work of
-        that on φ in a rotation, in which φ turns by ω · t − γ · (ω × e), is that of this moment.
+        ``reaction`` (n,) [N] is the force on all owned unknowns at positions x (n_local, 3) [m].
         """
         each = self._handles.get(number)
         if each is None:
             return np.zeros(3)
-        tail, head = self.term.of_edges.ends[each.edges].T
-        tangent, start = unit(x[head] - x[tail]), frames.tangent[each.edges]
-        about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
-        total: Array = (reaction[each.places] * self.term.of_edges.length[each.edges]) @ about
-        return total
+        return self.term.moment(reaction[each.places], each.edges, x, frames)
 
     def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
         rows, start = each.stencil, each.window.start

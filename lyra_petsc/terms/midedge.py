@@ -31,7 +31,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
-from lyra_petsc.terms.hinge_energy import fading_limit
+from lyra_petsc.terms.hinge_energy import GONE, fading_limit
 from lyra_petsc.terms.midedge_shape import (
     Frames,
     carried,
@@ -47,6 +47,7 @@ from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
 STEEPEST = np.radians(89.0)
@@ -59,6 +60,9 @@ CLOSER = 0.2
 """Part of the smallest cos α that a Newton iteration must leave."""
 
 HALVINGS = 20
+
+FLATTEST = np.cos(np.radians(88.0))
+"""cos α below which a director that no moments have balanced is put midway between its triangles."""
 
 
 class Edges(NamedTuple):
@@ -123,6 +127,60 @@ class MidEdge(Elastic):
     def accept(self, x: Array, frozen: Frames) -> None:
         self.frames = self._carried(frozen, x)
 
+    @property
+    def edge_stiffness(self) -> Array:
+        diagonal = self.elements.data["stiffness"][:, [0, 3, 5]] / self.elements.data["length"] ** 2
+        return np.bincount(self.of_edges.of_triangles.ravel(), diagonal.ravel()).astype(np.float64)
+
+    def nearer(self, x: Array, frozen: Frames, held: Mask) -> Frames | None:
+        tangent = self._tangents(x)
+        far = (np.sum(tangent * frozen.tangent, axis=1) < 0.0) & ~held.ravel()[self.of_edges.places]
+        if not far.any():
+            return None
+        found = Frames(frozen.tangent.copy(), frozen.across.copy())
+        found.across[far] = carried(Frames(frozen.tangent[far], frozen.across[far]), tangent[far])
+        found.tangent[far] = tangent[far]
+        return found
+
+    def opened(self, x: Array, frozen: Frames) -> tuple[Ints, Array]:
+        # midway between the triangles, where these are not folded onto each other
+        edges, n_edges = self.of_edges.of_triangles, len(self.of_edges.places)
+        a, b, c = (x[self.stencil[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        live = np.sum(normal * normal, axis=1) > GONE * self._constants[2]
+        number, normal = edges[live], unit(normal[live])
+
+        def smallest(director: Array) -> Array:
+            cosine = np.einsum("eik,ek->ei", director[number], normal)
+            least = np.full(n_edges, np.inf)
+            np.minimum.at(least, number, cosine)
+            return least
+
+        shape = self._computed(x, frozen)
+        before = smallest(shape[:, :3])
+        if not (before < FLATTEST).any():
+            return np.empty(0, dtype=np.int64), np.empty(0)
+        total = np.zeros((n_edges, 3))
+        np.add.at(total, number.ravel(), np.repeat(normal, 3, axis=0))
+        tangent = self._tangents(x)
+        middle = unit(total - np.sum(total * tangent, axis=1, keepdims=True) * tangent)
+        row = np.flatnonzero((before < FLATTEST) & (smallest(middle) > np.maximum(before, 0.0)))
+        across = carried(Frames(frozen.tangent[row], frozen.across[row]), tangent[row])
+        sine = np.sum(np.cross(tangent[row], across) * middle[row], axis=1)
+        angle = np.arctan2(sine, np.sum(across * middle[row], axis=1))
+        places, length = self.of_edges.places[row], self.of_edges.length[row]
+        turns = np.round((x.ravel()[places] / length - angle) / (2.0 * np.pi))
+        return places, length * (angle + 2.0 * np.pi * turns)
+
+    def anew(self, x: Array) -> Array:
+        """Take frames that know nothing but the shape; unknowns (n,) of directors amid their triangles."""
+        tangent = self._tangents(x)
+        base = some_perpendicular(tangent)
+        self.frames = Frames(tangent, base)
+        mean = mean_directors(x, self.stencil, self.of_edges.of_triangles, len(tangent))
+        angle = np.arctan2(np.sum(np.cross(tangent, base) * mean, axis=1), np.sum(base * mean, axis=1))
+        return np.asarray(self.of_edges.length * np.nan_to_num(angle))
+
     def _carried(self, frames: Frames, x: Array) -> Frames:
         tangent = self._tangents(x)
         return Frames(tangent, carried(frames, tangent))
@@ -146,6 +204,17 @@ class MidEdge(Elastic):
     @property
     def edge_places(self) -> Ints:
         return self.of_edges.places
+
+    def moment(self, force: Array, edges: Ints, x: Array, frozen: Frames) -> Array:
+        """Moment (3,) [N·m] of forces (n,) [N] on the unknowns of these edges, beside that at their ends.
+
+        Their work in a rotation, in which φ turns by ω · t − γ · (ω × e), is that of this moment.
+        """
+        tail, head = self.of_edges.ends[edges].T
+        tangent, start = unit(x[head] - x[tail]), frozen.tangent[edges]
+        about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
+        total: Array = (force * self.of_edges.length[edges]) @ about
+        return total
 
     # -- energy ------------------------------------------------------------------------------------
 

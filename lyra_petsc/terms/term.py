@@ -233,6 +233,21 @@ class Elastic(Term):
     def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
         """Go on with a state of edges at positions x (n_local, 3)."""
 
+    @property
+    def edge_stiffness(self) -> Array:
+        """Of their unknowns at rest, (n,) [N/m]."""
+        return np.empty(0)
+
+    def nearer(self, x: Array, frozen: Any, held: NDArray[np.bool_]) -> Any:
+        """What ``frozen`` is to be from positions x on, where edges not ``held`` (n_local, 3) turned far from
+        it; or None. Energy and unknowns stay as they are.
+        """
+        return None
+
+    def opened(self, x: Array, frozen: Any) -> tuple[Ints, Array]:
+        """Places of edges whose unknowns make the energy infinite, or nearly, and better ones, (n,)."""
+        return np.empty(0, dtype=np.int64), np.empty(0)
+
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:
         """This rank's part of each further column of history.csv that the registration names."""
         return {}

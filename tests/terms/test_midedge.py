@@ -137,6 +137,55 @@ def test_energy_is_infinite_beyond_a_right_angle() -> None:
         assert np.isfinite(term.energies(near + fraction * 0.4 * way, term.frames)).all()
 
 
+def test_frames_follow_edges_that_turn_far() -> None:
+    """Beyond 90° the frames of free edges are those of the present shape, at the same unknowns and energy."""
+    with Simulation({"mesh": grid(1.0, 1.0, 3, 3), "material": STIFF}, MPI.COMM_SELF) as simulation:
+        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
+        x = simulation.system.x.copy()
+        x.ravel()[term.of_edges.places] = 0.1 * np.random.default_rng(1).standard_normal(
+            len(term.edge_places)
+        )
+        x[:n] = x[:n] @ rotation([0.0, 1.0, 0.0], 2.0).T
+        none = np.zeros(x.shape, dtype=bool)
+        before, frames = term.energies(x, term.frames), term.frames
+        nearer = term.nearer(x, frames, none)
+        assert nearer is not None
+        assert term.nearer(x, nearer, none) is None
+        assert term.nearer(x, frames, ~none) is None
+        turned = np.flatnonzero((nearer.tangent != frames.tangent).any(axis=1))
+        assert 0 < len(turned) < len(frames.tangent)
+        np.testing.assert_allclose(term.energies(x, nearer), before, rtol=1e-9)
+
+
+def test_directors_beyond_a_right_angle_are_put_amid_their_triangles() -> None:
+    with Simulation({"mesh": grid(1.0, 1.0, 2, 2), "material": STIFF}, MPI.COMM_SELF) as simulation:
+        term, x = midedge_of(simulation), simulation.system.x.copy()
+        assert len(term.opened(x, term.frames)[0]) == 0
+        place, length = term.of_edges.places[3], term.of_edges.length[3]
+        x.ravel()[place] += 1.8 * length
+        assert not np.isfinite(term.energies(x, term.frames)).all()
+        places, values = term.opened(x, term.frames)
+        np.testing.assert_array_equal(places, [place])
+        np.testing.assert_allclose(values, 0.0, atol=1e-12)
+        x.ravel()[places] = values
+        assert np.isfinite(term.energies(x, term.frames)).all()
+
+
+@pytest.mark.parallel
+def test_one_linear_solve_a_step_unfolds_a_crumpled_sheet(comm: MPI.Comm) -> None:
+    """Where it carries directors beyond a right angle, which made energy without bounds."""
+    scene: dict[str, Any] = {
+        "mesh": grid(1.0, 1.0, 20, 20, "alternating"),
+        "material": CLOTH | {"bending": 1e-4, "bending_model": "midedge", "damping": 0.005},
+        "handles": [{"nodes": [0, 20]}],
+        "initial": {"noise": 0.2, "seed": 1},
+        "time": {"end": 0.05, "step": 0.005, "integrator": "semi-implicit"},
+        "solver": {},
+    }
+    _, energies = outcome(comm, scene)
+    assert np.isfinite(energies).all()
+
+
 @pytest.mark.parametrize("pattern", ["diagonal", "alternating", "criss-cross"])
 @pytest.mark.parametrize("clamp", [True, False])
 def test_plates_converge(pattern: str, clamp: bool) -> None:
@@ -437,7 +486,8 @@ def test_an_end_moment_rolls_a_strip_into_a_circle(pattern: str) -> None:
         assert start.sum() >= 3
         middle = np.argmax(x[:, 2])
         errors.append([x[middle, 2] / (12.0 / np.pi) - 1.0, energies[2] / ROLLED_UP - 1.0])
-        assert abs(x[middle, 1] - 0.5) <= 0.5 + 1e-6
+        # single diagonals couple bending with twist: it ends beside its start, more or less far
+        assert abs(x[middle, 1] - 0.5) <= (1.0 if pattern == "diagonal" else 0.5 + 1e-6)
         assert energies[4] == pytest.approx(energies[1] + energies[2], rel=0.02)
     assert np.abs(errors[1]).max() < 0.01
     assert np.abs(errors[1][1] / errors[0][1]) < 0.3

@@ -40,6 +40,7 @@ from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
+from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 from lyra_petsc.terms.term import Elastic, UpcomingStep
@@ -244,7 +245,11 @@ class Accountant:
         planes = {term: frozen for term, frozen in self._shell.items() if term.registration.moving}
         pushed = gradient(planes, x1)[:n]
         slowed = self._damping(planes, v1)[:n]
-        energy_now, energy_then = energy(self._shell, x1), energy(self._shell, x0)
+        at_start = {
+            term: system.damping.frozen.get(term, each) if isinstance(term, MidEdge) else each
+            for term, each in self._shell.items()
+        }
+        energy_now, energy_then = energy(self._shell, x1), energy(at_start, x0)
         turned = energy_then - self._energy
         mass = system.mass[:, None]
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
@@ -341,7 +346,8 @@ class Accountant:
         for term, frozen in terms.items():
             gamma = term.elements.data.get("damping")
             if term.registration.damped and gamma is not None and np.any(gamma):
-                rows.add_stiffness(term, self._x, frozen, 1.0, gamma, values)
+                at_start = system.damping.frozen.get(term, frozen)
+                rows.add_stiffness(term, self._x, at_start, 1.0, gamma, values)
         return rows.product(values, v)
 
     def _gravity(self, report: StepReport) -> Array:
@@ -383,7 +389,13 @@ class Accountant:
         x, mass = system.x[:n], system.mass[:, None]
         centre = comm.allreduce(np.append((mass * x).sum(axis=0), mass.sum()))
         arms = x - centre[:3] / centre[3]
-        sums = comm.allreduce(np.concatenate([gap.sum(axis=0), np.cross(arms, damped).sum(axis=0)]))
+        arms = arms[: system.points.n_vertices]
+        turned = np.cross(arms, damped[: len(arms)]).sum(axis=0)
+        for term, frozen in self._shell.items():
+            if isinstance(term, MidEdge):
+                own = np.flatnonzero(term.edge_places < 3 * n)
+                turned += term.moment(damped.ravel()[term.edge_places[own]], own, system.x, frozen)
+        sums = comm.allreduce(np.concatenate([gap[: len(arms)].sum(axis=0), turned]))
         longest = float(comm.allreduce(float(np.square(arms).sum())))
         noise = EPSILON * forces * dt
         linear = dt * left * np.sqrt(count) + noise
