@@ -24,12 +24,13 @@ def rectangle(
 def irregular_rectangle(nx: int, ny: int, width: float, height: float, seed: int = 1) -> tuple[Array, Ints]:
     """A rectangle of nx × ny cells in the xy plane: vertices displaced, diagonals at random.
 
-    Vertices move by up to 0.3 of a cell in each direction, those of a side along it; corners stay.
+    Vertices move by up to 0.2 of a cell in each direction, those of a side along it; corners stay. From 0.25
+    on triangles could turn over.
     """
     random = np.random.default_rng(seed)
     vertices, _ = rectangle(nx, ny, width, height)
     i, j = (k.ravel() for k in np.meshgrid(np.arange(nx + 1), np.arange(ny + 1)))
-    shift = random.uniform(-0.3, 0.3, (len(i), 2)) * [width / nx, height / ny]
+    shift = random.uniform(-0.2, 0.2, (len(i), 2)) * [width / nx, height / ny]
     shift[(i == 0) | (i == nx), 0] = 0.0
     shift[(j == 0) | (j == ny), 1] = 0.0
     vertices[:, :2] += shift

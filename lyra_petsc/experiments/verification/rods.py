@@ -301,20 +301,34 @@ def column_shape(*, shortening: float | None = None, load: float | None = None) 
     return 4.0 * whole**2, k / whole
 
 
-def tall_cantilever(stiffer: float) -> tuple[float, float]:
-    """P L²/√(EI GJ) at which a cantilever tips over, EI/GJ = ``stiffer``, and the turn over the deflection.
+def tall_cantilever(stiffer: float, warping: float = 0.0) -> tuple[float, float]:
+    """P L²/√(EI GJ) at which a cantilever tips over, and the turn of its tip over the deflection over L.
 
-    The tip's turn about the axis, over its deflection over L. With s from the clamp over the length::
+    With u = θ' the rate of turn, s from the clamp over the length and μ = EΓ/(GJ L²) of the warping that
+    the clamp suppresses::
 
-        θ'' + κ² (1 − s)² θ = 0,   θ(0) = θ'(1) = 0,   EI w'' = P L³ (1 − s) θ,   w(0) = w'(0) = 0
+        u − μ u'' = κ² ∫ₛ¹ (1 − t)² θ dt,   EI w'' = P L³ (1 − s) θ,   θ(0) = w(0) = w'(0) = 0
+        with μ: u(0) = u'(1) = 0
+
+    Without μ κ = 4.0126 (Prandtl and Michell 1899); of a tall strip μ counts as the depth over the length.
+
+    Parameters
+    ----------
+    stiffer, warping : float
+        EI/GJ and μ.
     """
     s, derivative, integral = chebyshev(COUPLED_NODES)
-    lever = 1.0 - s
-    inside = derivative @ derivative
-    inside[0], inside[-1] = np.eye(len(s))[0], derivative[-1]
-    weight = np.diag(np.where((s == s[0]) | (s == s[-1]), 0.0, lever**2))
-    values, vectors = np.linalg.eig(np.linalg.solve(inside, -weight))
+    lever, n = 1.0 - s, len(s)
+    from_clamp, to_end = np.zeros((n, n)), np.zeros((n, n))
+    from_clamp[1:, 1:] = np.linalg.inv(derivative[1:, 1:])
+    to_end[:-1, :-1] = -np.linalg.inv(derivative[:-1, :-1])
+    twisting = np.eye(n) - warping * derivative @ derivative
+    torque = to_end @ np.diag(lever**2) @ from_clamp
+    if warping > 0.0:
+        twisting[0], twisting[-1] = np.eye(n)[0], derivative[-1]
+        torque[[0, -1]] = 0.0
+    values, vectors = np.linalg.eig(np.linalg.solve(twisting, torque))
     lowest = int(np.argmax(values.real))
-    factor, turn = 1.0 / math.sqrt(values[lowest].real), vectors[:, lowest].real
+    factor, turn = 1.0 / math.sqrt(values[lowest].real), from_clamp @ vectors[:, lowest].real
     deflection = factor / math.sqrt(stiffer) * float(integral @ (lever**2 * turn))
     return factor, abs(float(turn[-1]) / deflection)

@@ -64,6 +64,7 @@ def areas(vertices: Array, triangles: Ints) -> Array:
 MESHES: list[tuple[Callable[..., tuple[Array, Ints]], tuple[Any, ...]]] = [
     (rectangle, (4, 3, 1.0, 0.7)),
     (irregular_rectangle, (6, 6, 1.0, 0.7)),
+    (irregular_rectangle, (200, 200, 1.0, 0.7)),
 ]
 
 

@@ -22,8 +22,8 @@ HELD = {
     "SSSS": ("pin", SIDES),
     "CFFF": ("clamp", ("left",)),
 }
-LARGEST = 1e-3
-"""Deflection over the side: so small that the plate is linear to 1e-5."""
+LARGEST = 1e-4
+"""Deflection over the side: the plate, which stretches where it bends, is softer by 220 of its squares."""
 
 
 @case(
@@ -78,7 +78,7 @@ def _at(x: float, y: float) -> dict[str, Any]:
         "Kirchhoff's plate, closed form: κ11 = M/(D (1 − ν²)), κ22 = −ν κ11, κ12 = 0; under forces F at the "
         "corners κ12 = F/(2 D (1 − ν)) alone"
     ),
-    resolutions=(2, 4, 8, 16),
+    resolutions=(2, 4, 8),
     claim=Exact(1e-7),
 )
 def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
