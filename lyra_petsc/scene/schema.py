@@ -456,6 +456,12 @@ class Selector(VertexChoice):
     rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
 
 
+def _ends_later(block: Any) -> Any:
+    if not block.start < block.until:
+        raise problem(f"must be later than from = {block.start:g}, not {block.until:g}", "until")
+    return block
+
+
 class Handle(Selector):
     """Vertices whose motion is prescribed, or pulled by springs.
 
@@ -534,15 +540,7 @@ class Handle(Selector):
             raise problem(f"must be a list of x, y, z, not {shown(value)}")
         return tuple(axis for axis in AXES if axis in value)
 
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        _check_times(self.start, self.until)
-        return self
-
-
-def _check_times(start: float, until: float) -> None:
-    if not start < until:
-        raise problem(f"must be later than from = {start:g}, not {until:g}", "until")
+    _in_order = model_validator(mode="after")(_ends_later)
 
 
 class Keyframe(Block):
@@ -614,10 +612,7 @@ class AppliedLoad(VertexChoice):
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        _check_times(self.start, self.until)
-        return self
+    _in_order = model_validator(mode="after")(_ends_later)
 
 
 class Initial(Block):
