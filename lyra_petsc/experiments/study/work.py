@@ -271,31 +271,10 @@ class Chain:
     order: int
 
 
-@dataclass
-class ReferenceRuns:
-    """All runs of a reference.
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> list[Chain]:
+    """The runs of the reference of one physical scene; the first of all is the reference.
 
-    Attributes
-    ----------
-    chains : list of Chain
-        Their finest differ from each other only where meshes are refined too.
-    """
-
-    chains: list[Chain]
-
-    @property
-    def best(self) -> ReferenceRun:
-        """The reference."""
-        return self.chains[0].levels[0]
-
-    @property
-    def levels(self) -> list[ReferenceRun]:
-        """Each run once, cheapest last."""
-        return list({level.name: level for chain in self.chains for level in chain.levels}.values())
-
-
-def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> ReferenceRuns:
-    """The runs of the reference of one physical scene.
+    The finest runs of the chains differ from each other only where meshes are refined too.
 
     Parameters
     ----------
@@ -323,14 +302,14 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
 
     if smallest is None:
         if mesh is not None:
-            return ReferenceRuns([chain(2, *((h, None) for h in meshes))])
+            return [chain(2, *((h, None) for h in meshes))]
         tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
         loose = ReferenceRun("reference-loose", "tolerances ten times larger", tolerances)
-        return ReferenceRuns([Chain((*chain(0, (None, None)).levels, loose), 0)])
+        return [Chain((*chain(0, (None, None)).levels, loose), 0)]
     finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
     order = 2 if integrator in SECOND_ORDER else 1
     in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
-    return ReferenceRuns([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
+    return [in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time]
 
 
 def refines_time(plan: Plan) -> bool:
@@ -595,7 +574,8 @@ class Work:
         if self.chosen[physics].kind != "finer":
             return 0.0
         family = self._family(physics, self._smallest([]), integrators(self.plan)[0])
-        return sum(level.weight for level in family.levels)
+        weights = {level.name: level.weight for chain in family for level in chain.levels}
+        return sum(weights.values())
 
     # -- runs --------------------------------------------------------------------------------------------
 
@@ -694,20 +674,21 @@ class Work:
         notes = []
         for integrator in integrators(self.plan) if smallest is not None else [""]:
             family = self._family(physics, smallest, integrator)
-            best = self._level(physics, family.best)
+            finest = family[0].levels[0]
+            best = self._level(physics, finest)
             if best.done:
                 break
-            notes.append(f"a reference with {family.best.label} failed: {best.problem}")
+            notes.append(f"a reference with {finest.label} failed: {best.problem}")
         else:
             return Reference("none", "no reference: every attempt at one failed", notes=notes)
-        found = Reference("finer", f"finer run: {family.best.label}", notes=notes)
+        found = Reference("finer", f"finer run: {finest.label}", notes=notes)
         found.seconds = best.timings[0].run
-        other = self._of_level(physics, family.best)
+        other = self._of_level(physics, finest)
         found.own = self._own(physics, family, found)
         self._fill(rows, found, lambda mine: against_run(self.comm, mine, other, self.plan.quantities))
         return found
 
-    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> ReferenceRuns:
+    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> list[Chain]:
         given = [*self.plan.request.settings, *LEAN, *physical_overrides(self.plan, physics)]
         return make_family(self.plan, given, smallest, integrator)
 
@@ -741,10 +722,10 @@ class Work:
     def _samples(self, folder: Path, sheets: Sequence[int] = ()) -> Samples:
         return read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every, sheets)
 
-    def _own(self, physics: Physics, family: ReferenceRuns, known: Reference) -> dict[str, Estimate]:
+    def _own(self, physics: Physics, family: list[Chain], known: Reference) -> dict[str, Estimate]:
         """Own error of the reference from its chains."""
         estimates = []
-        for chain in family.chains:
+        for chain in family:
             results = [self._level(physics, level) for level in chain.levels]
             for level, result in zip(chain.levels, results, strict=True):
                 if not result.done:
