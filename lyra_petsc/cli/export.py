@@ -9,12 +9,11 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped, results
+from lyra_petsc.cli.options import results, verb
 from lyra_petsc.cli.signals import watched
 
 
-@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc export runs/flag --to gltf"))
-@helped
+@verb("lyra-petsc export runs/flag --to gltf")
 @results
 @click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")
 @click.option(
@@ -26,7 +25,6 @@ from lyra_petsc.cli.signals import watched
     "--displacement", is_flag=True, help="Add the displacement from the start, as for Warp By Vector."
 )
 @click.option("--force", is_flag=True, help="Replace a former export in DIR.")
-@click.pass_obj
 def export(comm: Any, /, run: Path, **asked: Any) -> None:
     """Write the states of RUN for other programs."""
     from lyra_petsc.parallel import on_root

@@ -10,15 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped, trust_mesh
+from lyra_petsc.cli.options import trust_mesh, verb
 from lyra_petsc.errors import InputError
 
 if TYPE_CHECKING:
     from lyra_petsc.scene.starter import OwnMesh
 
 
-@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc new pennant --mesh pennant.geo"))
-@helped
+@verb("lyra-petsc new pennant --mesh pennant.geo")
 @click.argument("name")
 @click.option(
     "--mesh",
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     help="A .geo, .msh or .obj of yours; its groups are listed.",
 )
 @trust_mesh
-@click.pass_obj
 def new(comm: Any, name: str, mesh: Path | None, trust_mesh: bool) -> None:
     """Write the starter scene NAME.yaml."""
     from lyra_petsc.parallel import on_root

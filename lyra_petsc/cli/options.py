@@ -6,6 +6,7 @@ it is called: the declarations of all verbs are read for each.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,24 @@ helped = click.option(
 )
 
 
+SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
+
+
 def example(*lines: str) -> str:
     """What a verb's help ends with: commands to copy."""
     heading = "Examples:" if len(lines) > 1 else "Example:"
     return "\n".join(["\b", heading, *(f"  {line}" for line in lines)])
 
 
-SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}
+def verb(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
+    """Declares a verb, whose first argument is the communicator and whose help ends with the examples."""
+
+    def declare(function: Callable[..., Any]) -> click.Command:
+        command = click.command(context_settings=SETTINGS, epilog=example(*examples))
+        return command(helped(click.pass_obj(function)))
+
+    return declare
+
 
 scene = click.argument("scene", required=False, type=click.Path(path_type=Path))
 settings = click.option(

@@ -50,7 +50,7 @@ class ProgressBar:
     ) -> None:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
-        self._began = clock()
+        self._began, self._drawn = clock(), -math.inf
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
             self._bar = _bar(self._stream)
@@ -66,6 +66,16 @@ class ProgressBar:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:
                 print(text, file=self._stream, flush=True)
+
+    def _draw(self, fraction: float, state: str) -> None:
+        """Move the bar, which is seen some times a second and at the end."""
+        if self._bar is None:
+            return
+        with suppress(OSError):
+            self._bar.update(self._task, completed=fraction, state=state)
+            if fraction >= 1.0 or self._clock() - self._drawn >= REDRAW_SECONDS:
+                self._drawn = self._clock()
+                self._bar.refresh()
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -145,14 +155,10 @@ class Progress(ProgressBar):
         )
         if math.isfinite(left):
             state += f"  {duration(left)} left"
-        since = math.inf if self._last_shown is None else now - self._last_shown
         if self._bar is not None:
-            with suppress(OSError):
-                self._bar.update(self._task, completed=fraction, state=state)
-                if since >= REDRAW_SECONDS or fraction >= 1.0:
-                    self._last_shown = now
-                    self._bar.refresh()
+            self._draw(fraction, state)
             return
+        since = math.inf if self._last_shown is None else now - self._last_shown
         self._latest = f"{fraction:4.0%}  {state}"
         far = fraction - self._fraction_shown >= LINE_FRACTION - 1e-9
         if since >= LINE_SECONDS and (self._last_shown is None or far or since >= LINE_AT_LEAST_SECONDS):
@@ -186,11 +192,8 @@ class FrameProgress(ProgressBar):
         now = self._clock()
         left = (now - self._began) * (count - done) / done if done else math.nan
         text = f"{done} of {count} states drawn  {duration(left)} left"
-        if self._bar is not None:
-            with suppress(OSError):
-                self._bar.update(self._task, completed=done / count, state=text)
-                self._bar.refresh()
-        elif now - self._last_line >= self.LINE_SECONDS:
+        self._draw(done / count, text)
+        if self._bar is None and now - self._last_line >= self.LINE_SECONDS:
             self._last_line = now
             self.say(f"{done / count:4.0%}  {text}")
 
@@ -235,15 +238,10 @@ class StudyProgress(ProgressBar):
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
         fresh = (done - before) / (whole - before) if whole > before else 1.0
         left = (now - began) * (1.0 - fresh) / fresh if fresh > 0.0 else math.nan
-        state, since = f"{self._label}  {duration(left)} left", now - self._last_shown
-        if self._bar is None:
-            if since >= LINE_AT_LEAST_SECONDS:
-                self._line(f"{fraction:4.0%}  {state}")
-        elif since >= REDRAW_SECONDS or fraction >= 1.0:
-            self._last_shown = now
-            with suppress(OSError):
-                self._bar.update(self._task, completed=fraction, state=state)
-                self._bar.refresh()
+        state = f"{self._label}  {duration(left)} left"
+        self._draw(fraction, state)
+        if self._bar is None and now - self._last_shown >= LINE_AT_LEAST_SECONDS:
+            self._line(f"{fraction:4.0%}  {state}")
 
     def note(self, text: str) -> None:
         """A line for the user, above the bar."""

@@ -8,20 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped, results
+from lyra_petsc.cli.options import results, verb
 
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
 
 
-@click.command(
-    context_settings=SETTINGS,
-    epilog=example(
-        "lyra-petsc render runs/flag --film flag.mp4 --field speed",
-        "lyra-petsc render runs/flag --at 0.5,1 --handles --wind",
-    ),
+@verb(
+    "lyra-petsc render runs/flag --film flag.mp4 --field speed",
+    "lyra-petsc render runs/flag --at 0.5,1 --handles --wind",
 )
-@helped
 @results
 @click.option("--at", metavar="T,T,…", help="Pictures of the states nearest to these times [s].")
 @click.option("--film", type=click.Path(path_type=Path), metavar="FILE", help="A film: .mp4, .webm or .gif.")
@@ -43,7 +39,6 @@ if TYPE_CHECKING:
 @click.option(
     "--set", "settings", multiple=True, metavar="render.KEY=VALUE", help="Change the camera; may be repeated."
 )
-@click.pass_obj
 def render(comm: Any, /, run: Path, no_ground: bool, no_label: bool, **chosen: Any) -> None:
     """Draw pictures and films of RUN; without options a film and a contact sheet."""
     from lyra_petsc.cli.progress import FrameProgress

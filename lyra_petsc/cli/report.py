@@ -7,14 +7,12 @@ from typing import Any
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped, results
+from lyra_petsc.cli.options import results, verb
 
 
-@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc report runs/flag"))
-@helped
+@verb("lyra-petsc report runs/flag")
 @results
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="The page (RUN/report.html).")
-@click.pass_obj
 def report(comm: Any, run: Path, out: Path | None) -> None:
     """One HTML page about RUN: pictures, energy, steps, time, settings, notes, what to change."""
     from lyra_petsc.extras import require

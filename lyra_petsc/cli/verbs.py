@@ -1,7 +1,6 @@
 """The verbs and their options; the work is in the module of the same name.
 
-A module that declares its command itself (``@click.command(context_settings=SETTINGS)``) is registered at the
-end, by ``verbs.add_command(…)``.
+Modules may declare theirs themselves. All are registered at the end.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import click
 from lyra_petsc import __version__
 from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, trust_mesh
+from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, trust_mesh, verb
 from lyra_petsc.cli.render import render
 from lyra_petsc.cli.report import report
 from lyra_petsc.cli.view import Served, view, where_served
@@ -72,14 +71,10 @@ def verbs(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-@verbs.command(
-    context_settings=SETTINGS,
-    epilog=example(
-        "mpirun -n 2 lyra-petsc run configs/flag.yaml --set time.end=1 -ksp_monitor",
-        "lyra-petsc run configs/flag.yaml --resume",
-    ),
+@verb(
+    "mpirun -n 2 lyra-petsc run configs/flag.yaml --set time.end=1 -ksp_monitor",
+    "lyra-petsc run configs/flag.yaml --resume",
 )
-@helped
 @scene
 @settings
 @out
@@ -88,7 +83,6 @@ def verbs(ctx: click.Context) -> None:
 @trust_mesh
 @click.option("--live", is_flag=True, help="Show it in the browser while it goes on.")
 @where_served
-@click.pass_obj
 def run(
     comm: Any, /, live: bool, host: str | None, port: int | None, no_browser: bool, **options: Any
 ) -> None:
@@ -98,15 +92,11 @@ def run(
     run_scene(comm, served=Served.of_live(live, host, port, no_browser), **options)
 
 
-@verbs.command(
-    context_settings=SETTINGS, epilog=example("lyra-petsc check configs/flag.yaml --set mesh.size=0.02")
-)
-@helped
+@verb("lyra-petsc check configs/flag.yaml --set mesh.size=0.02")
 @scene
 @settings
 @trust_mesh
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scene files, for editors.")
-@click.pass_obj
 def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool) -> None:
     """Check SCENE and print what a run would do; runs nothing."""
     from lyra_petsc.cli.check import check as check_scene
@@ -118,16 +108,12 @@ def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: 
         check_scene(comm, scene, settings, trust_mesh=trust_mesh)
 
 
-@verbs.command(
-    context_settings=SETTINGS, epilog=example("lyra-petsc verify --quick", "lyra-petsc verify --list")
-)
-@helped
+@verb("lyra-petsc verify --quick", "lyra-petsc verify --list")
 @click.argument("names", nargs=-1, metavar="[NAME]...")
 @click.option("--quick", is_flag=True, help="Only the coarser resolutions of each case.")
 @click.option("--list", "listed", is_flag=True, help="Name the cases; runs nothing.")
 @out
 @click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
-@click.pass_obj
 def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
     """Run the cases with exact or published answers (default: all); exit code 1 if a verdict fails."""
     from lyra_petsc.cli.experiments import verify as verify_cases
@@ -135,11 +121,7 @@ def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
     return verify_cases(comm, names, **asked)
 
 
-@verbs.command(
-    context_settings=SETTINGS,
-    epilog=example("lyra-petsc study configs/swing.yaml --vary integrator=beuler,bdf2 --vary dt=0.02,0.01"),
-)
-@helped
+@verb("lyra-petsc study configs/swing.yaml --vary integrator=beuler,bdf2 --vary dt=0.02,0.01")
 @scene
 @settings
 @trust_mesh
@@ -158,7 +140,6 @@ def verify(comm: Any, /, names: tuple[str, ...], **asked: Any) -> int:
 @click.option("--force", is_flag=True, help="Replace the results in DIR.")
 @click.option("--resume", is_flag=True, help="Go on without repeating finished combinations.")
 @click.option("--job", type=click.Path(path_type=Path), hidden=True)
-@click.pass_obj
 def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     """Error against run time: run, time and compare combinations of settings of SCENE."""
     from lyra_petsc.extras import require
@@ -173,11 +154,7 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
         study_scene(comm, **asked)
 
 
-@verbs.command(
-    context_settings=SETTINGS,
-    epilog=example("lyra-petsc stress --quick", "mpirun -n 2 lyra-petsc stress configs/drape.yaml --list"),
-)
-@helped
+@verb("lyra-petsc stress --quick", "mpirun -n 2 lyra-petsc stress configs/drape.yaml --list")
 @scene
 @settings
 @trust_mesh
@@ -189,7 +166,6 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
 @click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
 @click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each case.")
 @click.option("--job", type=click.Path(path_type=Path), hidden=True)
-@click.pass_obj
 def stress(comm: Any, /, **asked: Any) -> int:
     """Run stiff and extreme cases, on a hanging sheet or on SCENE; exit code 1 if a verdict fails."""
     from lyra_petsc.cli.experiments import stress as stress_cases
@@ -197,9 +173,7 @@ def stress(comm: Any, /, **asked: Any) -> int:
     return stress_cases(comm, **asked)
 
 
-@verbs.command(context_settings=SETTINGS, epilog=example("lyra-petsc info"))
-@helped
-@click.pass_obj
+@verb("lyra-petsc info")
 def info(comm: Any) -> None:
     """Print versions and what does not fit together."""
     from lyra_petsc.cli.info import info as describe
@@ -209,8 +183,5 @@ def info(comm: Any) -> None:
         click.echo(text)
 
 
-verbs.add_command(export)
-verbs.add_command(new)
-verbs.add_command(render)
-verbs.add_command(report)
-verbs.add_command(view)
+for command in (check, export, info, new, render, report, run, stress, study, verify, view):
+    verbs.add_command(command)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import click
 
-from lyra_petsc.cli.options import SETTINGS, example, helped, results
+from lyra_petsc.cli.options import results, verb
 from lyra_petsc.errors import InputError, Interrupted, LyraError
 from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import raise_together
@@ -89,8 +89,7 @@ class Served:
             open_browser(url)
 
 
-@click.command(context_settings=SETTINGS, epilog=example("lyra-petsc view runs/flag"))
-@helped
+@verb("lyra-petsc view runs/flag")
 @results
 @click.option("--field", metavar="NAME", help="Colour by speed, strain, displacement or a written field.")
 @click.option("--range", metavar="LOW,HIGH", help="Of the colours: values, or percentiles as 2%,98%.")
@@ -98,7 +97,6 @@ class Served:
     "--set", "settings", multiple=True, metavar="render.KEY=VALUE", help="Change the camera; may be repeated."
 )
 @where_served
-@click.pass_obj
 def view(comm: Any, /, run: Path, host: str | None, port: int | None, no_browser: bool, **look: Any) -> None:
     """Play RUN, a folder of results, in the browser; follow it if it goes on."""
     problem: LyraError | None = None

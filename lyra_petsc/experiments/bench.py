@@ -7,19 +7,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from pydantic import ValidationError
 
 from lyra_petsc.errors import LyraError, SolverError
 from lyra_petsc.parallel import all_here, on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.messages import input_error
+from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.midedge import MidEdge
@@ -198,7 +196,7 @@ class Bench:
     def __enter__(self) -> Bench:
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._folder is not None:
             self._folder.cleanup()
 
@@ -263,10 +261,7 @@ class Bench:
         if self._exact:
             filled = {"solver": TIGHT} | filled
             filled["petsc"] = direct_options(self.comm) | {"ksp_rtol": 1e-12} | filled.get("petsc", {})
-        try:
-            scene = Scene.model_validate(filled)
-        except ValidationError as error:
-            raise input_error(error, filled, file="scene of the case") from None
+        scene = checked(Scene, filled, file="scene of the case")
         if self._trust_mesh:
             scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps

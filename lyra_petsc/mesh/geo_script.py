@@ -104,6 +104,10 @@ class _Script:
                 begin = opened.pop()
                 self.partners |= {begin: number, number: begin}
 
+    def refusal(self, line: int, words: str) -> InputError:
+        """What is wrong in a line."""
+        return InputError(f"line {line}: {words}", file=self.path)
+
     def closing(self, opening: int) -> int:
         """Number of the token that closes a bracket within its statement; that of the last if none does."""
         end, last = self.partners.get(opening, len(self.tokens)), len(self.tokens) - 1
@@ -218,7 +222,8 @@ class _Reading:
     def _follow(self, script: _Script, number: int, place: str) -> None:
         """Check the file that a statement includes."""
         name, command = _name(script, number), script.tokens[number]
-        shown = f"line {command.line}: '{command.text}' of {one_line(name)[:80]!r}"
+        quoted = f"{one_line(name)[:80]!r}"
+        shown = f"'{command.text}' of {quoted}"
         target = _place(place, name)
         # the bytes of the script are the bytes of the file's name
         there = script.path.parent / os.fsdecode(name.encode("latin-1"))
@@ -228,19 +233,13 @@ class _Reading:
         except (OSError, ValueError, RuntimeError):
             inside = exists = False
         if target is None or not inside:
-            raise InputError(
-                f"{shown}, which is not in the folder of the script, as what it includes must be (by a name "
-                "relative to the script)",
-                file=script.path,
-            )
+            where = "the folder of the script, as what it includes must be (by a name relative to the script)"
+            raise script.refusal(command.line, f"{shown}, which is not in {where}")
         if not exists:
-            raise InputError(
-                f"line {command.line}: includes {one_line(name)[:80]!r}, which does not exist",
-                file=script.path,
-            )
+            raise script.refusal(command.line, f"includes {quoted}, which does not exist")
         if command.text == "Include":
             if target in self.contents and target not in self._scripts:
-                raise InputError(f"{shown}, which is no script", file=script.path)
+                raise script.refusal(command.line, f"{shown}, which is no script")
             self.script(there, target)
         else:
             self._merged(there, target)
@@ -319,21 +318,15 @@ def _check_jumps(script: _Script, text: str) -> None:
     for token in script.tokens:
         if token.kind == "text" and (found := _JUMP_IN_TEXT.search(token.text)):
             line = token.line + token.text.count("\n", 0, found.start())
-            raise InputError(
-                f"line {line}: '{found[0]}' stands in a quoted text: {why} from there", file=script.path
-            )
+            raise script.refusal(line, f"'{found[0]}' stands in a quoted text: {why} from there")
         if token.kind == "text" and ("\n" in token.text or "\r" in token.text):
-            raise InputError(
-                f"line {token.line}: a quoted text of several lines: {why} within it", file=script.path
-            )
+            raise script.refusal(token.line, f"a quoted text of several lines: {why} within it")
         if token.kind == "word" and token.text not in JUMPS and _JUMP_IN_WORD.search(token.text):
-            raise InputError(f"line {token.line}: '{token.text}': {why} within it", file=script.path)
+            raise script.refusal(token.line, f"'{token.text}': {why} within it")
     for number, line_text in enumerate(text.split("\n"), 1):
         if len(line_text) > LONGEST_LINE:
-            raise InputError(
-                f"line {number}: {len(line_text)} characters; {why} within lines above {LONGEST_LINE}",
-                file=script.path,
-            )
+            words = f"{len(line_text)} characters; {why} within lines above {LONGEST_LINE}"
+            raise script.refusal(number, words)
 
 
 def _collect_names(script: _Script) -> None:
@@ -387,7 +380,7 @@ def _check_word(script: _Script, number: int, names: set[str]) -> None:
     after = tokens[number + 1] if number + 1 < len(tokens) else None
 
     def refuse(why: str = "is no statement that is known here") -> InputError:
-        return InputError(f"line {token.line}: '{word}' {why}; {REMEDY}", file=script.path)
+        return script.refusal(token.line, f"'{word}' {why}; {REMEDY}")
 
     if (why := REFUSED.get(word)) is not None:
         raise refuse(why)
@@ -454,7 +447,7 @@ def _check_printf(script: _Script, number: int) -> None:
         or not ends
         or any(t.text in JUMPS for t in inside if t.kind == "word")
     ):
-        raise InputError(f"line {line}: 'Printf' writes files; {REMEDY}", file=script.path)
+        raise script.refusal(line, f"'Printf' writes files; {REMEDY}")
 
 
 def _check_format(script: _Script, number: int) -> None:
@@ -462,39 +455,27 @@ def _check_format(script: _Script, number: int) -> None:
     token, following = script.tokens[number], script.tokens[number + 1 : number + 4]
     kinds = [(t.kind, t.text) for t in following]
     if len(kinds) < 3 or kinds[0][1] != "(" or kinds[1][0] != "text" or kinds[2][1] not in (",", ")"):
-        raise InputError(
-            f"line {token.line}: '{token.text}' must be followed by (\"text\"…)", file=script.path
-        )
+        raise script.refusal(token.line, f"'{token.text}' must be followed by (\"text\"…)")
     text = following[1].text
     if "%" not in text:
         return
     if "%" in _NUMBER_FORMAT.sub("", text):
-        raise InputError(
-            f"line {token.line}: a '%' in a text of '{token.text}' must begin the format of a number, "
-            "such as %g or %12.3f",
-            file=script.path,
-        )
+        words = f"a '%' in a text of '{token.text}' must begin the format of a number, such as %g or %12.3f"
+        raise script.refusal(token.line, words)
     if len(text) > LONGEST_FORMAT:
-        raise InputError(
-            f"line {token.line}: a format of {len(text)} characters; at most {LONGEST_FORMAT} are read",
-            file=script.path,
-        )
+        words = f"a format of {len(text)} characters; at most {LONGEST_FORMAT} are read"
+        raise script.refusal(token.line, words)
 
 
 def _name(script: _Script, number: int) -> str:
     """The file that an ``Include`` or ``Merge`` names."""
     command, rest = script.tokens[number], script.tokens[number + 1 : number + 3]
     if len(rest) < 2 or rest[0].kind != "text" or rest[1].text != ";":
-        raise InputError(
-            f"line {command.line}: '{command.text}' must be followed by the file's name in quotes",
-            file=script.path,
-        )
+        words = f"'{command.text}' must be followed by the file's name in quotes"
+        raise script.refusal(command.line, words)
     name = rest[0].text[1:-1]
     allowed = _INCLUDES[command.text]
     if Path(name).suffix.lower() not in allowed:
-        raise InputError(
-            f"line {command.line}: '{command.text}' of {one_line(name)[:80]!r}; "
-            f"{', '.join(allowed)} are read",
-            file=script.path,
-        )
+        words = f"'{command.text}' of {one_line(name)[:80]!r}; {', '.join(allowed)} are read"
+        raise script.refusal(command.line, words)
     return name

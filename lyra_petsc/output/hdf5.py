@@ -239,7 +239,7 @@ def lay_out(
         If it cannot be created.
     """
     h5py = import_h5py()
-    early, links, access, scalar = _properties()
+    early, links, access, scalar = properties()
     shapes = [(count, *slab.shape[1:]) for count, slab in zip(rows, slabs.values(), strict=True)]
     data = sum(math.prod(shape) * slab.itemsize for shape, slab in zip(shapes, slabs.values(), strict=True))
     texts = sum(len(str(value).encode()) for values in attributes.values() for value in values.values())
@@ -275,7 +275,7 @@ def lay_out(
 
 
 @cache
-def _properties() -> tuple[Any, Any, Any, Any]:
+def properties() -> tuple[Any, Any, Any, Any]:
     """How HDF5 creates datasets, the groups they are in, files, and the space of attributes."""
     h5py = import_h5py()
     early = h5py.h5p.create(h5py.h5p.DATASET_CREATE)

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
 
+REMEDY = "remove it: the run can be read without"
+
+
 def write_summary(path: str | os.PathLike[str], content: Mapping[str, Any], comm: MPI.Comm) -> None:
     """Write a summary in one instant, so that a reader finds the old or the new one.
 
@@ -65,22 +68,14 @@ def read_summary(path: str | os.PathLike[str]) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read: {reason(error)}", file=path) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"is damaged: {reason(error)}; remove it: the run can be read without", file=path
-        ) from None
+        raise InputError(f"is damaged: {reason(error)}; {REMEDY}", file=path) from None
     if not isinstance(content, dict):
         raise InputError(f"is damaged: no mapping; {REMEDY}", file=path)
     for key, kind in KINDS.items():
         if key in content and not _is(content[key], kind):
-            raise InputError(
-                "is damaged, holds what no run writes; remove it: the run can be read without",
-                file=path,
-                key=key,
-            )
+            raise InputError(f"is damaged, holds what no run writes; {REMEDY}", file=path, key=key)
     return content
 
-
-REMEDY = "remove it: the run can be read without"
 
 KINDS: dict[str, Any] = {
     "title": (str, None),

@@ -10,7 +10,8 @@ all steps share the triangles, their offsets are 0 at every step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +55,9 @@ def write_cells(folder: Path) -> None:
     OutputError
     """
     path, triangles = folder / CELLS_FILE, StoredMesh(folder).triangles
-    try:
-        with _in_memory() as file:
-            for name, array in cells(triangles).items():
-                file[name] = array
-            content = _content(file)
-    except HDF5_ERRORS as error:
-        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
-    replace_bytes(path, content)
+    with _replaced(path) as file:
+        for name, array in cells(triangles).items():
+            file[name] = array
 
 
 def write_vtkhdf(
@@ -87,34 +83,29 @@ def write_vtkhdf(
     """
     path = folder / VTKHDF_FILE
     rows = {"vertex": n_vertices, "triangle": n_triangles}
-    try:
-        with _in_memory() as file:
-            root = describe(file, [state.time for state in states], n_vertices, n_triangles)
-            lengths = {"Connectivity": 3 * n_triangles, "Offsets": n_triangles + 1, "Types": n_triangles}
-            for name, length in lengths.items():
-                kind = np.dtype(np.uint8 if name == "Types" else np.int64)
-                _virtual(root, name, (length,), kind, {0: (CELLS_FILE, name)}, length)
-            real = np.dtype(np.float64)
-            positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
-            _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
-            rest = {0: (mesh_file, "mesh/rest")}
-            _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
-            add_offsets(root, "vertex", "rest", len(states), 0)
-            for field in _fields(states):
-                places = {
-                    i: (state.file, f"{group_name(state.number)}/{field.name}")
-                    for i, state in enumerate(states)
-                    if field in state.fields
-                }
-                n = rows[field.on]
-                name = f"{GROUPS[field.on]}/{field.name}"
-                shape = (len(states) * n, *field.shape[1:])
-                _virtual(root, name, shape, np.dtype(field.dtype), places, n)
-                add_offsets(root, field.on, field.name, len(states), n)
-            content = _content(file)
-    except HDF5_ERRORS as error:
-        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
-    replace_bytes(path, content)
+    with _replaced(path) as file:
+        root = describe(file, [state.time for state in states], n_vertices, n_triangles)
+        lengths = {"Connectivity": 3 * n_triangles, "Offsets": n_triangles + 1, "Types": n_triangles}
+        for name, length in lengths.items():
+            kind = np.dtype(np.uint8 if name == "Types" else np.int64)
+            _virtual(root, name, (length,), kind, {0: (CELLS_FILE, name)}, length)
+        real = np.dtype(np.float64)
+        positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
+        _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
+        rest = {0: (mesh_file, "mesh/rest")}
+        _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
+        add_offsets(root, "vertex", "rest", len(states), 0)
+        for field in _fields(states):
+            places = {
+                i: (state.file, f"{group_name(state.number)}/{field.name}")
+                for i, state in enumerate(states)
+                if field in state.fields
+            }
+            n = rows[field.on]
+            name = f"{GROUPS[field.on]}/{field.name}"
+            shape = (len(states) * n, *field.shape[1:])
+            _virtual(root, name, shape, np.dtype(field.dtype), places, n)
+            add_offsets(root, field.on, field.name, len(states), n)
 
 
 def _fields(states: Sequence[WrittenState]) -> list[StoredField]:
@@ -198,11 +189,17 @@ def _select(space: Any, first: int, rows: int, shape: tuple[int, ...], pair: tup
         space.select_hyperslab((first, pair[0]), (rows, 2), (1, pair[1] - pair[0]))
 
 
-def _in_memory() -> Any:
-    """A file in memory: one on disk takes the process down if it cannot grow while it is closed."""
-    return import_h5py().File("unnamed", "w", driver="core", backing_store=False)
+@contextmanager
+def _replaced(path: Path) -> Iterator[Any]:
+    """A file, built in memory, that takes the place of another in one instant.
 
-
-def _content(file: Any) -> bytes:
-    file.flush()
-    return bytes(file.id.get_file_image())
+    One on disk takes the process down if it cannot grow while it is closed.
+    """
+    try:
+        with import_h5py().File("unnamed", "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            content = bytes(file.id.get_file_image())
+    except HDF5_ERRORS as error:
+        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+    replace_bytes(path, content)

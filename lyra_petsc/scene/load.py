@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.scene.messages import dotted, input_error
+from lyra_petsc.scene.messages import checked, dotted
 from lyra_petsc.scene.overrides import apply_changes, apply_overrides, plain
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
@@ -142,9 +140,7 @@ def _checked(
     meshes_needed: bool = True,
 ) -> Scene:
     try:
-        scene = Scene.model_validate(data, context={"directory": directory})
-    except ValidationError as error:
-        raise input_error(error, data, file=source, overridden=overridden) from None
+        scene = checked(Scene, data, file=source, overridden=overridden, context={"directory": directory})
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=source) from None
     for i, mesh in enumerate(scene.mesh):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.values import one_line, shown
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def dotted(path: Sequence[str | int], data: Any = None) -> str:
@@ -57,6 +59,27 @@ def input_error(
     if len(findings) > 1:
         message += f" (and {len(findings) - 1} more)"
     return InputError(message, file=file, key=key or None)
+
+
+def checked(
+    kind: type[Model],
+    data: Any,
+    *,
+    file: object | None,
+    overridden: Sequence[str] = (),
+    context: dict[str, Any] | None = None,
+) -> Model:
+    """The block of this kind that plain values describe.
+
+    Raises
+    ------
+    InputError
+        As `input_error` words it.
+    """
+    try:
+        return kind.model_validate(data, context=context)
+    except ValidationError as error:
+        raise input_error(error, data, file=file, overridden=overridden) from None
 
 
 def _words(kind: str, message: str, value: Any, context: dict[str, Any]) -> str:

@@ -12,13 +12,13 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.block import Block
 from lyra_petsc.scene.materials.library import ClothTable, entries, of_table
-from lyra_petsc.scene.messages import input_error
+from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.text import parse_json, read_text
 from lyra_petsc.scene.values import (
     Count,
@@ -261,11 +261,7 @@ def material_numbers(data: str, scene: Path, *, key: str) -> dict[str, Any]:
 
 
 def _read_material(path: Path) -> ClothTable:
-    data = parse_json(read_text(path), file=path)
-    try:
-        tables = MaterialFile.model_validate(data)
-    except ValidationError as error:
-        raise input_error(error, data, file=path) from None
+    tables = checked(MaterialFile, parse_json(read_text(path), file=path), file=path)
     c11, c12, c22, c33 = tables.stretching[0]
     at_0, at_45, at_90 = (row[0] for row in tables.bending)
     return ClothTable(tables.density, c11, c12, c22, c33, (at_0, at_45, at_90))
@@ -322,10 +318,7 @@ def import_original(data: Any, path: Path) -> dict[str, Any]:
     InputError
         Unknown keys, values out of range, files that do not exist.
     """
-    try:
-        scene = OriginalScene.model_validate(data)
-    except ValidationError as error:
-        raise input_error(error, data, file=path) from None
+    scene = checked(OriginalScene, data, file=path)
     labels = ObjLabels([_mesh_file(cloth, i, path) for i, cloth in enumerate(scene.cloths)])
     several = len(scene.cloths) > 1
     ours: dict[str, Any] = {

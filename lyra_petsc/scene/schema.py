@@ -196,13 +196,19 @@ class MembraneStiffness(Block):
 
     @model_validator(mode="after")
     def _positive_definite(self) -> Self:
-        if abs(self.c12) >= (self.c11**0.5) * (self.c22**0.5):
-            raise problem(
-                f"is not positive definite: |c12| = {abs(self.c12):g} must be below"
-                f" sqrt(c11 c22) = {(self.c11**0.5) * (self.c22**0.5):g} N/m",
-                "c12",
-            )
+        _check_coupling("c", self.c11, self.c12, self.c22, "N/m")
         return self
+
+
+def _check_coupling(letter: str, first: float, coupling: float, second: float, unit: str) -> None:
+    """Refuse a stiffness that is not positive definite."""
+    bound = first**0.5 * second**0.5
+    if abs(coupling) >= bound:
+        raise problem(
+            f"is not positive definite: |{letter}12| = {abs(coupling):g} must be below"
+            f" sqrt({letter}11 {letter}22) = {bound:g} {unit}",
+            f"{letter}12",
+        )
 
 
 class PlateStiffness(Block):
@@ -225,12 +231,7 @@ class PlateStiffness(Block):
 
     @model_validator(mode="after")
     def _positive_definite(self) -> Self:
-        if abs(self.d12) >= (self.d11**0.5) * (self.d22**0.5):
-            raise problem(
-                f"is not positive definite: |d12| = {abs(self.d12):g} must be below"
-                f" sqrt(d11 d22) = {(self.d11**0.5) * (self.d22**0.5):g} N·m",
-                "d12",
-            )
+        _check_coupling("d", self.d11, self.d12, self.d22, "N·m")
         return self
 
 
@@ -455,6 +456,12 @@ class Selector(VertexChoice):
     rules: ClassVar[tuple[Rule, ...]] = (exactly_one("group", "nodes", "box"),)
 
 
+def _ends_later(block: Any) -> Any:
+    if not block.start < block.until:
+        raise problem(f"must be later than from = {block.start:g}, not {block.until:g}", "until")
+    return block
+
+
 class Handle(Selector):
     """Vertices whose motion is prescribed, or pulled by springs.
 
@@ -533,15 +540,7 @@ class Handle(Selector):
             raise problem(f"must be a list of x, y, z, not {shown(value)}")
         return tuple(axis for axis in AXES if axis in value)
 
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        _check_times(self.start, self.until)
-        return self
-
-
-def _check_times(start: float, until: float) -> None:
-    if not start < until:
-        raise problem(f"must be later than from = {start:g}, not {until:g}", "until")
+    _in_order = model_validator(mode="after")(_ends_later)
 
 
 class Keyframe(Block):
@@ -613,10 +612,7 @@ class AppliedLoad(VertexChoice):
     start: Number = Field(default=0.0, alias="from")
     until: Until = math.inf
 
-    @model_validator(mode="after")
-    def _in_order(self) -> Self:
-        _check_times(self.start, self.until)
-        return self
+    _in_order = model_validator(mode="after")(_ends_later)
 
 
 class Initial(Block):

@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Case, Verdict
 from lyra_petsc.scene.load import dump_scene, load_scene
 from lyra_petsc.scene.materials.library import resolve
-from lyra_petsc.scene.messages import input_error
+from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.overrides import apply_overrides
 from lyra_petsc.scene.schema import Material, Scene
 from lyra_petsc.scene.text import parse_yaml
@@ -201,20 +200,17 @@ def setting_of(
     if scene is None:
         data: dict[str, Any] = sheet(CELLS[level])
         overridden = apply_overrides(data, settings)
-        try:
-            checked = Scene.model_validate(data)
-        except ValidationError as error:
-            raise input_error(error, data, file=None, overridden=overridden) from None
+        base = checked(Scene, data, file=None, overridden=overridden)
     else:
-        checked = load_scene(scene, settings)
-    if checked.time.analysis == "static":
+        base = load_scene(scene, settings)
+    if base.time.analysis == "static":
         raise InputError(
             "stress tests motions; give --set time.analysis=dynamic --set time.step=0.005",
             file=scene,
             key="time.analysis",
         )
-    content: Content = parse_yaml(dump_scene(checked), file=None)
-    if checked.time.adaptive:
+    content: Content = parse_yaml(dump_scene(base), file=None)
+    if base.time.adaptive:
         content["time"] |= {"step": STEP}
         content["time"].pop("tolerance")
     for key in ("output", "probes"):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import raise_together
-from lyra_petsc.output.read_run import Columns, read_table
+from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
 from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import open_stored
@@ -33,7 +33,6 @@ from lyra_petsc.parallel import on_root
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-FORMS = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
 SAME_TIME = 1e-6
 """Fraction of the time between samples by which a state may miss a sample time."""
 
@@ -90,6 +89,8 @@ class Samples:
         Largest change [J] of any of them since the start, over all steps.
     probes : dict of name → (T, 3) float64
         [m].
+    sheets : sequence of int
+        Vertices of each mesh source; needed between different meshes.
     """
 
     folder: Path
@@ -99,7 +100,8 @@ class Samples:
     size: float
     energies: Array
     exchanged: float
-    probes: dict[str, Array] = field(default_factory=dict)
+    probes: dict[str, Array]
+    sheets: Sequence[int] = ()
 
     def rows(self, comm: MPI.Comm, sample: int, wanted: Ints | None = None) -> Array:
         """Positions (n, 3) [m] of this rank's slab of vertices, or of the vertices ``wanted``; collective.
@@ -174,7 +176,9 @@ def read_surface(folder: Path) -> RestSurface:
     return RestSurface(rest, triangles, areas)
 
 
-def read_samples(comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float) -> Samples:
+def read_samples(
+    comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()
+) -> Samples:
     """What a run left at the sample times; collective.
 
     Parameters
@@ -184,17 +188,18 @@ def read_samples(comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: 
         [s].
     spacing : float
         Time between samples [s]; states within 1e-6 of it count.
+    sheets : sequence of int
+        Vertices of each mesh source, if it may be compared with another mesh.
 
     Raises
     ------
     InputError
         On every rank, if a state, the mesh or the history is missing.
     """
-    found = on_root(comm, lambda: read_here(folder, times, spacing))
-    return found
+    return on_root(comm, lambda: read_here(folder, times, spacing, sheets))
 
 
-def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
+def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
     """As ``read_samples``, on one rank and for it alone."""
     states = []
     if folder.is_dir():
@@ -216,7 +221,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
         files.append((states[nearest].file, f"states/{number:06d}/position"))
     surface = read_surface(folder)
     history, at_samples = _table(folder / "history.csv", times)
-    energies = np.column_stack([history[name] for name in FORMS])
+    energies = np.column_stack([history[name] for name in ENERGIES])
     probes = {}
     if (folder / "probes.csv").is_file():
         table, chosen = _table(folder / "probes.csv", times)
@@ -227,7 +232,7 @@ def read_here(folder: Path, times: Sequence[float], spacing: float) -> Samples:
     exchanged = float(np.abs(energies - energies[0]).max())
     return Samples(
         folder, tuple(times), tuple(files), len(surface.rest), surface.size, energies[at_samples], exchanged,
-        probes,
+        probes, sheets,
     )  # fmt: skip
 
 
@@ -373,24 +378,10 @@ Rows = Callable[[int], Array]
 """Positions (n, 3) [m] of this rank's points at a sample."""
 
 
-@dataclass
-class Party:
-    """A run to be compared.
-
-    Attributes
-    ----------
-    samples : Samples
-    sheets : sequence of int
-        Vertices of each mesh source.
-    """
-
-    samples: Samples
-    sheets: Sequence[int]
-
-
-def against_motion(comm: MPI.Comm, run: Party, motion: ExactMotion, quantities: Sequence[Quantity]) -> Errors:
+def against_motion(
+    comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[Quantity]
+) -> Errors:
     """Errors of a run against an exact motion; collective."""
-    samples = run.samples
     start = samples.rows(comm, 0)
     areas = _areas(comm, on_root(comm, lambda: read_surface(samples.folder), share=False))
     found: History = {}
@@ -414,23 +405,22 @@ def against_motion(comm: MPI.Comm, run: Party, motion: ExactMotion, quantities: 
     return overall(_of(quantities, found))
 
 
-def against_run(comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]) -> Errors:
+def against_run(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
     """Errors of a run against another, over all samples; collective."""
-    return overall(history_against_run(comm, run, reference, quantities))
+    return overall(history_against_run(comm, mine, other, quantities))
 
 
 def history_against_run(
-    comm: MPI.Comm, run: Party, reference: Party, quantities: Sequence[Quantity]
+    comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]
 ) -> History:
     """Errors of a run against another at each sample; collective.
 
     On different meshes the finer solution is interpolated at the rest places of the coarser one's
     vertices.
     """
-    mine, other = run.samples, reference.samples
     found: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
-        found |= _between(comm, run, reference)
+        found |= _between(comm, mine, other)
     found["energy"] = _energy(mine.energies, other.energies, other.exchanged)
     for quantity in quantities:
         name = quantity.probe
@@ -455,20 +445,17 @@ def _of(quantities: Sequence[Quantity], found: History) -> History:
     return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
 
 
-def _between(comm: MPI.Comm, run: Party, reference: Party) -> History:
-    coarse, fine = run, reference
-    if run.samples.n_vertices > reference.samples.n_vertices:
-        coarse, fine = reference, run
-    both = [party.samples.folder for party in (coarse, fine)]
-    found = on_root(comm, lambda: [read_surface(folder) for folder in both], share=False)
+def _between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
+    coarse, fine = (reference, run) if run.n_vertices > reference.n_vertices else (run, reference)
+    found = on_root(comm, lambda: [read_surface(each.folder) for each in (coarse, fine)], share=False)
     at, beyond = found or (None, None)
     same = comm.bcast(at is not None and beyond is not None and at.same_as(beyond), root=0)
-    here: Rows = lambda i: coarse.samples.rows(comm, i)  # noqa: E731
-    there: Rows = lambda i: fine.samples.rows(comm, i)  # noqa: E731
+    here: Rows = lambda i: coarse.rows(comm, i)  # noqa: E731
+    there: Rows = lambda i: fine.rows(comm, i)  # noqa: E731
     if not same:
         transfer = make_transfer(comm, at, coarse.sheets, beyond, fine.sheets)
-        there = lambda i: transfer.rows(comm, fine.samples, i)  # noqa: E731
-    return _positions(comm, coarse.samples, here, there, _areas(comm, at), reference.samples.size)
+        there = lambda i: transfer.rows(comm, fine, i)  # noqa: E731
+    return _positions(comm, coarse, here, there, _areas(comm, at), reference.size)
 
 
 def _areas(comm: MPI.Comm, surface: RestSurface | None) -> Array:

@@ -16,7 +16,15 @@ from mpi4py import MPI
 
 from lyra_petsc.experiments.results import csv_text
 from lyra_petsc.experiments.study.plan import Axis, Plan, Quantity, described
-from lyra_petsc.experiments.study.work import SAFETY, Known, Physics, StudyRow, Work, physics_of, refines_time
+from lyra_petsc.experiments.study.work import (
+    SAFETY,
+    Physics,
+    Reference,
+    StudyRow,
+    Work,
+    physics_of,
+    refines_time,
+)
 from lyra_petsc.extras import PACKAGES
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.summary import versions, write_summary
@@ -236,7 +244,7 @@ class StudyOutcome:
     ----------
     plan : Plan
     rows : list of StudyRow
-    known : dict of physics → Known
+    known : dict of physics → Reference
         References as they came out.
     orders : list of Order
     advice : dict of physics → list of Advice
@@ -246,7 +254,7 @@ class StudyOutcome:
 
     plan: Plan
     rows: list[StudyRow]
-    known: dict[Physics, Known]
+    known: dict[Physics, Reference]
     orders: list[Order]
     advice: dict[Physics, list[Advice]]
     facts: dict[str, Any]
@@ -436,7 +444,7 @@ def _scene_words(physics: Physics) -> str:
     return ", ".join(described(key, value) for key, value in physics)
 
 
-def _advise(report: Report, plan: Plan, physics: Physics, known: Known, advice: Sequence[Advice]) -> None:
+def _advise(report: Report, plan: Plan, physics: Physics, known: Reference, advice: Sequence[Advice]) -> None:
     report.heading("Recommendation" + (f" for {_scene_words(physics)}" if physics else ""))
     if not advice:
         report.paragraph(f"None can be given: {known.words or 'no errors are known'}.")
@@ -453,7 +461,7 @@ def _advise(report: Report, plan: Plan, physics: Physics, known: Known, advice: 
     report.bullets([one.words for one in advice])
 
 
-def _left_out(plan: Plan, known: Known) -> str:
+def _left_out(plan: Plan, known: Reference) -> str:
     """Which error is common to all runs and their reference, and hence not in the numbers."""
     if known.kind == "exact":
         return "The errors are whole: the reference is exact on any mesh."
@@ -549,7 +557,7 @@ def _orders(report: Report, orders: Sequence[Order]) -> None:
     )  # fmt: skip
 
 
-def _references(report: Report, known: Mapping[Physics, Known]) -> None:
+def _references(report: Report, known: Mapping[Physics, Reference]) -> None:
     report.heading("Reference")
     for physics, one in known.items():
         where = f"{_scene_words(physics)}: " if physics else ""
@@ -577,7 +585,7 @@ def main_axis(axes: Sequence[Axis]) -> Axis | None:
     return min(able, key=lambda axis: order.index(axis.path) if axis.path in order else 3, default=None)
 
 
-def drawings(plan: Plan, rows: Sequence[StudyRow], known: Known, mark: str) -> list[Drawing]:
+def drawings(plan: Plan, rows: Sequence[StudyRow], known: Reference, mark: str) -> list[Drawing]:
     """Work-precision diagrams of every quantity, then convergence along every numeric axis."""
     found = []
     axis = main_axis(plan.axes)
@@ -590,13 +598,13 @@ def drawings(plan: Plan, rows: Sequence[StudyRow], known: Known, mark: str) -> l
     return found
 
 
-def _floor(known: Known, quantity: Quantity) -> float | None:
+def _floor(known: Reference, quantity: Quantity) -> float | None:
     own = known.own.get(quantity.name)
     return None if own is None or not own.error > 0.0 else SAFETY * own.error
 
 
 def _work(
-    plan: Plan, rows: Sequence[StudyRow], known: Known, quantity: Quantity, axis: Axis | None, mark: str
+    plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
     lines = [
@@ -641,7 +649,7 @@ def _point(row: StudyRow, axis: Axis | None) -> str:
 
 
 def _convergence(
-    rows: Sequence[StudyRow], known: Known, quantity: Quantity, axis: Axis, mark: str
+    rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis, mark: str
 ) -> list[Drawing]:
     lines = [
         Series(label, [extent(row, axis) for row in group], [row.shown(quantity.name) for row in group])

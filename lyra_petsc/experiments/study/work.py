@@ -29,8 +29,8 @@ from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, e
 from lyra_petsc.experiments.study.comparison import (
     Errors,
     History,
-    Party,
     RestSurface,
+    Samples,
     against_motion,
     against_run,
     history_against_run,
@@ -66,25 +66,50 @@ NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """The reference of one physical scene.
+class Estimate:
+    """Own error of a reference in one quantity.
+
+    Attributes
+    ----------
+    error : float
+        Relative, as the errors measured against it.
+    order : float
+        Observed; NaN where two runs agree, or only two were made.
+    trusted : bool
+        Whether the runs converge.
+    """
+
+    error: float
+    order: float
+    trusted: bool
+
+
+@dataclass
+class Reference:
+    """The reference of one physical scene, as chosen and as it came out.
 
     Attributes
     ----------
     kind : str
-        ``exact``, ``run`` or ``finer``.
+        ``exact``, ``run``, ``finer``, or in the end ``none``.
     words : str
         What it is; empty for ``finer`` until it is known which run it became.
     motion : ExactMotion or None
     folder : Path or None
-    notes : tuple of str
+    notes : list of str
+    own : dict of str to Estimate
+        Own error by quantity; empty where it is unknown.
+    seconds : float
+        Wall time [s] of its steps, where it was run here.
     """
 
     kind: str
     words: str = ""
     motion: ExactMotion | None = None
     folder: Path | None = None
-    notes: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
+    own: dict[str, Estimate] = field(default_factory=dict)
+    seconds: float = math.nan
 
 
 def physics_of(combination: Combination) -> Physics:
@@ -98,7 +123,7 @@ def physical_overrides(plan: Plan, physics: Physics) -> list[str]:
     return [f"output.every={plan.every!r}", *overrides(plan.base, axes, [value for _, value in physics])]
 
 
-def choose_references(plan: Plan) -> dict[Physics, Chosen]:
+def choose_references(plan: Plan) -> dict[Physics, Reference]:
     """The reference of every physical scene of a study. For rank 0.
 
     Raises
@@ -116,7 +141,7 @@ def choose_references(plan: Plan) -> dict[Physics, Chosen]:
         found = {}
         for physics in groups:
             motion = exact_motion(name, Body(_scene(plan, physics)))
-            found[physics] = Chosen("exact", _exact_words(name), motion)
+            found[physics] = Reference("exact", _exact_words(name), motion)
         return found
     if kind == "run" and name:
         if len(groups) > 1:
@@ -136,17 +161,17 @@ def _exact_words(name: str) -> str:
     return f"exact: {name} ({SOLUTIONS[name].title})"
 
 
-def _automatic(scene: Scene) -> Chosen:
+def _automatic(scene: Scene) -> Reference:
     if scene.handles or scene.loads:
-        return Chosen("finer")  # no exact solution has any: the mesh need not be built to know
+        return Reference("finer")  # no exact solution has any: the mesh need not be built to know
     body = Body(scene)
     solution = matching(body)
     if solution is None:
-        return Chosen("finer")
-    return Chosen("exact", _exact_words(solution.name), solution.motion(body))
+        return Reference("finer")
+    return Reference("exact", _exact_words(solution.name), solution.motion(body))
 
 
-def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
+def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, key=key)
     try:
@@ -175,7 +200,7 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Chosen:
     if lacking and plan.request.quantities:
         raise InputError(f"has no probe '{lacking[0]}'", file=folder, key=key)
     notes = [f"the reference run has no probe '{name}': its error is not told" for name in lacking]
-    return Chosen("run", f"run {folder}", folder=folder, notes=(*notes, *_differences(plan, folder)))
+    return Reference("run", f"run {folder}", folder=folder, notes=[*notes, *_differences(plan, folder)])
 
 
 def _differences(plan: Plan, folder: Path) -> Sequence[str]:
@@ -246,31 +271,10 @@ class Chain:
     order: int
 
 
-@dataclass
-class ReferenceRuns:
-    """All runs of a reference.
+def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> list[Chain]:
+    """The runs of the reference of one physical scene; the first of all is the reference.
 
-    Attributes
-    ----------
-    chains : list of Chain
-        Their finest differ from each other only where meshes are refined too.
-    """
-
-    chains: list[Chain]
-
-    @property
-    def best(self) -> ReferenceRun:
-        """The reference."""
-        return self.chains[0].levels[0]
-
-    @property
-    def levels(self) -> list[ReferenceRun]:
-        """Each run once, cheapest last."""
-        return list({level.name: level for chain in self.chains for level in chain.levels}.values())
-
-
-def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> ReferenceRuns:
-    """The runs of the reference of one physical scene.
+    The finest runs of the chains differ from each other only where meshes are refined too.
 
     Parameters
     ----------
@@ -298,14 +302,14 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
 
     if smallest is None:
         if mesh is not None:
-            return ReferenceRuns([chain(2, *((h, None) for h in meshes))])
+            return [chain(2, *((h, None) for h in meshes))]
         tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
         loose = ReferenceRun("reference-loose", "tolerances ten times larger", tolerances)
-        return ReferenceRuns([Chain((*chain(0, (None, None)).levels, loose), 0)])
+        return [Chain((*chain(0, (None, None)).levels, loose), 0)]
     finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
     order = 2 if integrator in SECOND_ORDER else 1
     in_time = chain(order, *((meshes[len(meshes) // 2], factor * finest) for factor in (1.0, 2.0, 4.0)))
-    return ReferenceRuns([in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time])
+    return [in_time] if mesh is None else [chain(2, *((h, finest) for h in meshes)), in_time]
 
 
 def refines_time(plan: Plan) -> bool:
@@ -357,48 +361,6 @@ def _tolerances(plan: Plan, tighter: float) -> list[str]:
 
 
 # -- its own error -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Own error of a reference in one quantity.
-
-    Attributes
-    ----------
-    error : float
-        Relative, as the errors measured against it.
-    order : float
-        Observed; NaN where two runs agree, or only two were made.
-    trusted : bool
-        Whether the runs converge.
-    """
-
-    error: float
-    order: float
-    trusted: bool
-
-
-@dataclass
-class Known:
-    """A reference as it came out.
-
-    Attributes
-    ----------
-    kind : str
-        ``exact``, ``run``, ``finer`` or ``none``.
-    words : str
-    own : dict of str to Estimate
-        Own error by quantity; empty where it is unknown.
-    seconds : float
-        Wall time [s] of its steps, where it was run here.
-    notes : list of str
-    """
-
-    kind: str
-    words: str
-    own: dict[str, Estimate] = field(default_factory=dict)
-    seconds: float = math.nan
-    notes: list[str] = field(default_factory=list)
 
 
 def richardson(first: float, second: float, ratio: float, order: int) -> Estimate:
@@ -573,7 +535,7 @@ class Work:
     ----------
     comm : MPI.Comm
     plan : Plan
-    chosen : dict of physics → Chosen
+    chosen : dict of physics → Reference
     folder : Path
     run : callable
         How a job is run, see `Runner`.
@@ -584,7 +546,7 @@ class Work:
         self,
         comm: MPI.Comm,
         plan: Plan,
-        chosen: dict[Physics, Chosen],
+        chosen: dict[Physics, Reference],
         folder: Path,
         run: Runner,
         observer: Observer,
@@ -612,7 +574,8 @@ class Work:
         if self.chosen[physics].kind != "finer":
             return 0.0
         family = self._family(physics, self._smallest([]), integrators(self.plan)[0])
-        return sum(level.weight for level in family.levels)
+        weights = {level.name: level.weight for chain in family for level in chain.levels}
+        return sum(weights.values())
 
     # -- runs --------------------------------------------------------------------------------------------
 
@@ -680,52 +643,52 @@ class Work:
 
     # -- comparisons -------------------------------------------------------------------------------------
 
-    def compare(self, rows: Sequence[StudyRow]) -> dict[Physics, Known]:
+    def compare(self, rows: Sequence[StudyRow]) -> dict[Physics, Reference]:
         """Errors of all rows that ran; the references behind them, which are run where needed."""
-        known: dict[Physics, Known] = {}
+        known: dict[Physics, Reference] = {}
         for physics, chosen in self.chosen.items():
             group = [row for row in rows if physics_of(row.combination) == physics]
             able = [row for row in group if row.result.done]
             if not able:
-                known[physics] = Known("none", "no reference: no combination ran to its end")
+                known[physics] = Reference("none", "no reference: no combination ran to its end")
             elif chosen.kind == "finer":
                 known[physics] = self._against_finer(physics, able)
             else:
                 known[physics] = self._against_given(chosen, able)
         return known
 
-    def _against_given(self, chosen: Chosen, rows: Sequence[StudyRow]) -> Known:
-        found = Known(chosen.kind, chosen.words, notes=list(chosen.notes))
-        quantities, motion = self.plan.quantities, chosen.motion
+    def _against_given(self, found: Reference, rows: Sequence[StudyRow]) -> Reference:
+        quantities, motion = self.plan.quantities, found.motion
         if motion is not None:
             found.own = {quantity.name: Estimate(ROUND_OFF, math.nan, True) for quantity in quantities}
-            self._fill(rows, found, lambda party: against_motion(self.comm, party, motion, quantities))
+            self._fill(rows, found, lambda mine: against_motion(self.comm, mine, motion, quantities))
             return found
-        assert chosen.folder is not None
-        other = self._party(chosen.folder, [])
+        assert found.folder is not None
+        other = self._samples(found.folder)
         found.notes.append("the own error of the reference run is not known")
-        self._fill(rows, found, lambda party: against_run(self.comm, party, other, quantities))
+        self._fill(rows, found, lambda mine: against_run(self.comm, mine, other, quantities))
         return found
 
-    def _against_finer(self, physics: Physics, rows: Sequence[StudyRow]) -> Known:
+    def _against_finer(self, physics: Physics, rows: Sequence[StudyRow]) -> Reference:
         smallest = self._smallest(rows)
         notes = []
         for integrator in integrators(self.plan) if smallest is not None else [""]:
             family = self._family(physics, smallest, integrator)
-            best = self._level(physics, family.best)
+            finest = family[0].levels[0]
+            best = self._level(physics, finest)
             if best.done:
                 break
-            notes.append(f"a reference with {family.best.label} failed: {best.problem}")
+            notes.append(f"a reference with {finest.label} failed: {best.problem}")
         else:
-            return Known("none", "no reference: every attempt at one failed", notes=notes)
-        found = Known("finer", f"finer run: {family.best.label}", notes=notes)
+            return Reference("none", "no reference: every attempt at one failed", notes=notes)
+        found = Reference("finer", f"finer run: {finest.label}", notes=notes)
         found.seconds = best.timings[0].run
-        party = self._of_level(physics, family.best)
+        other = self._of_level(physics, finest)
         found.own = self._own(physics, family, found)
-        self._fill(rows, found, lambda mine: against_run(self.comm, mine, party, self.plan.quantities))
+        self._fill(rows, found, lambda mine: against_run(self.comm, mine, other, self.plan.quantities))
         return found
 
-    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> ReferenceRuns:
+    def _family(self, physics: Physics, smallest: float | None, integrator: str) -> list[Chain]:
         given = [*self.plan.request.settings, *LEAN, *physical_overrides(self.plan, physics)]
         return make_family(self.plan, given, smallest, integrator)
 
@@ -752,26 +715,26 @@ class Work:
         number = f"-{list(self.chosen).index(physics) + 1}" if len(self.chosen) > 1 else ""
         return name + number
 
-    def _of_level(self, physics: Physics, level: ReferenceRun) -> Party:
+    def _of_level(self, physics: Physics, level: ReferenceRun) -> Samples:
         name = self._level_name(level.name, physics)
-        return self._party(self.folder / CASES / name, self._levels[name].sheets)
+        return self._samples(self.folder / CASES / name, self._levels[name].sheets)
 
-    def _party(self, folder: Path, sheets: Sequence[int]) -> Party:
-        return Party(read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every), sheets)
+    def _samples(self, folder: Path, sheets: Sequence[int] = ()) -> Samples:
+        return read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every, sheets)
 
-    def _own(self, physics: Physics, family: ReferenceRuns, known: Known) -> dict[str, Estimate]:
+    def _own(self, physics: Physics, family: list[Chain], known: Reference) -> dict[str, Estimate]:
         """Own error of the reference from its chains."""
         estimates = []
-        for chain in family.chains:
+        for chain in family:
             results = [self._level(physics, level) for level in chain.levels]
             for level, result in zip(chain.levels, results, strict=True):
                 if not result.done:
                     known.notes.append(f"the own error of the reference is not known: {level.label} failed")
                     return {}
-            parties = [self._of_level(physics, level) for level in chain.levels]
+            samples = [self._of_level(physics, level) for level in chain.levels]
             differences = [
                 history_against_run(self.comm, coarse, fine, self.plan.quantities)
-                for fine, coarse in itertools.pairwise(parties)
+                for fine, coarse in itertools.pairwise(samples)
             ]
             estimates.append(of_chain(differences, chain))
         own = joined(estimates)
@@ -783,14 +746,16 @@ class Work:
             )
         return own
 
-    def _fill(self, rows: Sequence[StudyRow], known: Known, errors_of: Callable[[Party], Errors]) -> None:
+    def _fill(
+        self, rows: Sequence[StudyRow], known: Reference, errors_of: Callable[[Samples], Errors]
+    ) -> None:
         """Errors of the rows; one that misses a sample time has failed after all."""
         for row in rows:
             try:
-                party = self._party(self.folder / CASES / row.combination.name, row.result.sheets)
+                mine = self._samples(self.folder / CASES / row.combination.name, row.result.sheets)
             except InputError as error:
                 row.result.fail(" ".join(str(error).split()))
                 continue
-            row.errors = errors_of(party)
+            row.errors = errors_of(mine)
             row.own = {name: estimate.error for name, estimate in known.own.items()}
             mark_unresolved(row)

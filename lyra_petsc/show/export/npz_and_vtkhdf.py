@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.hdf5 import properties
 from lyra_petsc.output.tensors import in_vtk_order
 from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, describe
 from lyra_petsc.show.export.exported_states import ExportedStates
@@ -111,9 +112,5 @@ def _reserve(path: Path, size: int) -> None:
 def _allocate(root: Any, name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
     """Create a dataset whose place in the file is allocated at once; its values are written later."""
     h5py = import_h5py()
-    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    properties.set_layout(h5py.h5d.CONTIGUOUS)
-    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     space, stored = h5py.h5s.create_simple(shape), h5py.h5t.py_create(kind, logical=True)
-    h5py.h5d.create(root.id, name.encode(), stored, space, properties)
+    h5py.h5d.create(root.id, name.encode(), stored, space, properties()[0])

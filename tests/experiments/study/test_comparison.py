@@ -16,7 +16,6 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import Energies, ExactMotion
 from lyra_petsc.experiments.study import comparison
 from lyra_petsc.experiments.study.comparison import (
-    Party,
     RestSurface,
     against_motion,
     against_run,
@@ -85,7 +84,7 @@ def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
 
 @pytest.mark.parallel
 def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (Party(read_samples(comm, folder, TIMES, 0.1), [20]) for folder in pair)
+    one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
     errors = against_run(comm, two, one, QUANTITIES)
     assert errors["position_max"] == pytest.approx(0.05 / 0.5)
     # the corner of a diagonal grid that both triangles of its cell meet in: two thirds of 0.005 m²
@@ -109,7 +108,7 @@ class Falling(ExactMotion):
 
 @pytest.mark.parallel
 def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
-    one, two = (Party(read_samples(comm, folder, TIMES, 0.1), [20]) for folder in pair)
+    one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
     exact = against_motion(comm, one, Falling(), QUANTITIES)
     assert max(exact.values()) < 1e-15
     errors = against_motion(comm, two, Falling(), QUANTITIES)
@@ -134,7 +133,7 @@ def test_errors_across_meshes(
             write_run(shared_tmp / name, mesh, [linear(mesh.rest, t) for t in TIMES], ENERGIES, TIP)
     comm.Barrier()
     coarse, fine = (
-        Party(read_samples(comm, shared_tmp / name, TIMES, 0.1), [count])
+        read_samples(comm, shared_tmp / name, TIMES, 0.1, [count])
         for name, count in (("coarse", 12), ("fine", 143))
     )
     for errors in (

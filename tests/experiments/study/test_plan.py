@@ -154,24 +154,24 @@ def test_the_finer_run_is_finer_in_what_varies(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "dt=0.02,0.01")
     assert refines_time(plan)
     family = make_family(plan, [], 0.01, "bdf2")
-    assert "time.step=0.0025" in family.best.overrides
-    assert "time.integrator=bdf2" in family.best.overrides
-    assert "solver.force_tolerance=1e-08" in family.best.overrides
-    (chain,) = family.chains
+    assert "time.step=0.0025" in family[0].levels[0].overrides
+    assert "time.integrator=bdf2" in family[0].levels[0].overrides
+    assert "solver.force_tolerance=1e-08" in family[0].levels[0].overrides
+    (chain,) = family
     assert [level.name for level in chain.levels] == [
         "reference-bdf2-dt0.0025", "reference-bdf2-dt0.005", "reference-bdf2-dt0.01"
     ]  # fmt: skip
     # 30 ms would not divide the 20 ms between samples: the quarter of it is rounded to what does
-    assert "time.step=0.005" in make_family(plan, [], 0.03, "bdf2").best.overrides
+    assert "time.step=0.005" in make_family(plan, [], 0.03, "bdf2")[0].levels[0].overrides
 
 
 def test_meshes_alone_are_compared_at_the_scenes_own_steps(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125")
     assert not refines_time(plan)
     family = make_family(plan, [], None, "")
-    assert "mesh[0].grid.nx=16" in family.best.overrides
-    assert not any(text.startswith("time.") for text in family.best.overrides)
-    assert [level.name for level in family.chains[0].levels] == [
+    assert "mesh[0].grid.nx=16" in family[0].levels[0].overrides
+    assert not any(text.startswith("time.") for text in family[0].levels[0].overrides)
+    assert [level.name for level in family[0].levels] == [
         "reference-h0.0625", "reference-h0.125", "reference-h0.25"
     ]  # fmt: skip
 
@@ -180,15 +180,15 @@ def test_one_integrator_beside_meshes_is_the_references_too(tmp_path: Path) -> N
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "integrator=alpha2", "dt=0.005")
     assert not refines_time(plan)
     family = make_family(plan, [], None, "")
-    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(family.best.overrides)
+    assert {"time.integrator=alpha2", "time.step=0.005"} <= set(family[0].levels[0].overrides)
 
 
 def test_meshes_and_steps_are_refined_together(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, HELD + MOVING, "mesh=0.25,0.125", "dt=0.02,0.01", "ksp_rtol=1e-2,1e-4")
     family = make_family(plan, [], 0.01, "alpha2")
-    assert family.best.name == "reference-alpha2-dt0.0025-h0.0625"
-    assert len(family.levels) == 5
-    assert "petsc.ksp_rtol=1e-06" in family.best.overrides
+    assert family[0].levels[0].name == "reference-alpha2-dt0.0025-h0.0625"
+    assert len({level.name for chain in family for level in chain.levels}) == 5
+    assert "petsc.ksp_rtol=1e-06" in family[0].levels[0].overrides
 
 
 def test_requests_survive_their_file(tmp_path: Path) -> None:
