@@ -147,10 +147,12 @@ class Equilibrium:
                 system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
                 self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
                 self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
+            elif leap:  # too far, also where without inertia no preconditioner can be set up
+                self._integrator.pseudo, leaps = self._careful, False
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
-                self._integrator.pseudo = self._careful if leap else SHRINK * self._integrator.pseudo
+                self._integrator.pseudo *= SHRINK
                 leaps = False
         self._sufficed = 0.0
         self._in_vain += solves - lessened if arrived else 0

@@ -350,6 +350,7 @@ def elements(rest: RestShape) -> Elements:
         _mirror(director, rest, triangles, number, mesh.rest)
         at_rest[surface] = _tangents_of(mesh.rest, triangles[surface], director[number[surface]])
         _check(at_rest, number, edges, rest, "rest shape")
+        rest.notes += _coarse(rest, chosen, np.einsum("eki,ei->ek", curvature, at_rest), size.max(axis=1))
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
@@ -373,6 +374,29 @@ def elements(rest: RestShape) -> Elements:
         "damping": rest.per_triangle("damping")[chosen],
     }
     return Elements(triangles, data, edges=number)
+
+
+def _coarse(rest: RestShape, chosen: Ints, curvature: Array, longest: Array) -> list[str]:
+    """What to say of triangles ``chosen`` with these curvatures (n, 3) at rest and longest edges (n,) [m].
+
+    Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
+    that of a sheet of bending stiffness B and membrane stiffness C. At creases few are curved.
+    """
+    mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
+    largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
+    thickness = np.array(
+        [np.sqrt(12.0 * max(s.plate[0], s.plate[2]) / max(s.c11, s.c22)) for s in rest.shells]
+    )[rest.shell_of[chosen]]
+    bent = largest * longest > 1e-3
+    coarse = bent & (largest * longest**2 > thickness)
+    if not 2 * coarse.sum() > bent.sum():
+        return []
+    fine = float(np.median(np.sqrt(thickness[coarse] / largest[coarse])))
+    return [
+        f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
+        f"{np.median(longest[coarse]):.3g} m: flat triangles make such a shell too stiff, or too soft under "
+        f"point loads, unless their edges are well below √(t R) = {fine:.3g} m"
+    ]
 
 
 def _mirror(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: Array) -> None:

@@ -362,6 +362,20 @@ def test_a_fold_of_nearly_180_degrees_is_refused(tmp_path: Path) -> None:
         Run(MPI.COMM_SELF, content)
 
 
+@pytest.mark.parametrize("n", [8, 24])
+def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
+    """A quarter of a cylinder of radius 1 and thickness 0.01, √(t R) = 0.1."""
+    flat, faces = rectangle(n, n, 0.5 * np.pi, 1.0)
+    bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
+    material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
+    content = {"mesh": obj_file(tmp_path / "shell.obj", bent, faces), "material": material}
+    simulation = Run(MPI.COMM_SELF, scene_of(content))
+    noted = [note for note in simulation.notes if "large for the curvature" in note]
+    assert len(noted) == (1 if n == 8 else 0)
+    assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in noted)
+    simulation.destroy()
+
+
 def test_one_sheet_bends_by_one_model() -> None:
     hinge = STIFF | {"bending": 1.0}
     two = {"mesh": [grid(1, 1, 2, 2) | {"name": "a"}, grid(1, 1, 2, 2) | {"name": "b"}]}

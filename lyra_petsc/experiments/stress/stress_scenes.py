@@ -270,9 +270,19 @@ def anisotropic(content: Content, ratio: float) -> Content:
         mean = (shell.c11 * shell.c22) ** 0.5
         membrane = {"c11": mean * ratio**0.5, "c22": mean / ratio**0.5, "c12": 0.0, "c33": shell.c33}
         kept = {key: block[key] for key in KEPT if key in block}
-        bending = list(shell.bending)
-        changed.append({"density": shell.density, "membrane": membrane, "bending": bending, **kept})
+        bending: dict[str, Any] = {"bending": list(shell.bending)}
+        if shell.model == "midedge":
+            plate = dict(zip(("d11", "d12", "d22", "d33"), shell.plate, strict=True))
+            bending = {"bending": plate, "bending_model": shell.model}
+        changed.append({"density": shell.density, "membrane": membrane, **bending, **kept})
     content["material"] = changed
+    return content
+
+
+def by_directors(content: Content) -> Content:
+    """Let all that bends bend by directors on its edges."""
+    for block in materials(content):
+        block["bending_model"] = "midedge"
     return content
 
 
