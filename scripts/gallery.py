@@ -53,6 +53,9 @@ ENTRIES = {
     "spin": Entry(4.4, ("--handles", "--colors", "#7d3c74,#f0d49a"), ("time.end=7.2",)),
     "paper": Entry(0.4, ("--handles", "--colors", "#eee9dc,#c9a86a"), ("output.every=0.01",), speed=0.2),
     "plate": Entry(1.0, ("--handles", "--field", "curvature"), speed=0.5),
+    "buckle": Entry(2.0, ("--handles", "--field", "curvature")),
+    "twist": Entry(2.0, ("--handles", "--field", "curvature")),
+    "shell": Entry(1.0, ("--handles", "--field", "curvature")),
 }
 
 

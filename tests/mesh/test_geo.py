@@ -42,6 +42,11 @@ def script(tmp_path: Path) -> Path:
         ),
         ("sail", None, {"sail": 2, "luff": 1, "leech": 1, "foot": 1, "head": 0, "tack": 0, "clew": 0}),
         ("plate", (1, 0.1, 0), {"plate": 2, "clamped": 1, "tip": 1}),
+        (
+            "shell",
+            (10, 10, 10 * np.cos(np.pi / 10)),
+            {"shell": 2, "pulled": 0, "pushed": 0} | dict.fromkeys(("plane x", "plane y", "rim", "hole"), 1),
+        ),
     ],
 )
 def test_shipped_meshes(name: str, spans: tuple[float, ...] | None, groups: dict[str, int]) -> None:

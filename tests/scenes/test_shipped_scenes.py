@@ -15,7 +15,7 @@ from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SHIPPED = ("drape", "flag", "paper", "plate", "sail", "spin", "swing")
+SHIPPED = ("buckle", "drape", "flag", "paper", "plate", "sail", "shell", "spin", "swing", "twist")
 
 
 @contextmanager
@@ -120,3 +120,31 @@ def test_paper_falls_with_the_energy_it_must_have() -> None:
         moving = simulation.budget.kinetic
     assert moving == pytest.approx(0.1623, abs=5e-4)
     assert height == pytest.approx(-0.1657, abs=5e-4)
+
+
+def test_shell_opens_as_far_as_on_a_finer_mesh() -> None:
+    # mesh.size=0.3 gives 3.4046 and 5.8314 m
+    with simulated("shell", "mesh.size=1.2") as simulation:
+        pulled, pushed = (mean_of(simulation, name) for name in ("pulled", "pushed"))
+    np.testing.assert_allclose([pulled[0] - 10.0, 10.0 - pushed[1]], [3.4046, 5.8314], rtol=3e-3)
+    np.testing.assert_allclose([pulled[1], pushed[0]], 0.0, atol=1e-9)
+
+
+def test_buckled_strip_hangs_between_its_clamps() -> None:
+    settings = ("mesh.grid.nx=40", "time.step=0.02", "output.every=2")
+    with simulated("buckle", *settings) as simulation:
+        middle, (left, right) = mean_of(simulation, "middle"), simulation.ledger.handle_forces(2)
+    np.testing.assert_allclose(middle[:2], [0.25, 0.05], atol=1e-3)
+    assert -0.4 < middle[2] < -0.3
+    assert left[0] > 10.0 > -10.0 > right[0]  # what presses
+    np.testing.assert_allclose((left + right)[2], 3.925 * 0.1 * 9.81, rtol=0.02)
+
+
+def test_twisted_strip_has_turned_by_half_in_the_middle() -> None:
+    settings = ("mesh.grid.nx=50", "mesh.grid.ny=6", "time.step=0.02", "output.every=2")
+    with simulated("twist", *settings) as simulation:
+        problem, forces = simulation.problem, simulation.ledger.handle_forces(2)
+        x = problem.system.x[np.argsort(problem.points.original)].reshape(7, 51, 3)
+    assert np.linalg.norm(x[3, 25, 1:]) < 0.015
+    assert x[6, 25, 1] < -0.02 < 0.02 < x[0, 25, 1]
+    np.testing.assert_allclose(forces[0], -forces[1], atol=0.02 * abs(forces[0][0]))
