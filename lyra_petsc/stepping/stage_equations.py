@@ -476,7 +476,9 @@ class StageEquations:
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
         reach = self.stage.reach
-        inertia = self.stage.sigma * self.mass + reach * self._least
+        inertia = self.stage.sigma * self.mass
+        if self.active.limiting:
+            inertia += reach * self._least
         blocks = self.prescribed.blocks
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
             self.damping.into(values, inertia)
