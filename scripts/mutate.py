@@ -178,8 +178,8 @@ CHANGES: list[Change] = [
     # -- equilibria
     Change(
         STEPPING + "equilibrium.py",
-        "max(self._tolerances.force_tolerance * self._scale, self._floor)",
-        "max(100.0 * self._tolerances.force_tolerance * self._scale, self._floor)",
+        "if force <= self._tolerances.force_tolerance * self._scale:",
+        "if force <= 100.0 * self._tolerances.force_tolerance * self._scale:",
         (BOOKS + "test_statics_end_at_their_tolerance",),
     ),
     Change(

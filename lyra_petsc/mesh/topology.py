@@ -85,20 +85,8 @@ def side_vertices(triangles: Ints, sides: Ints) -> Ints:
 
 
 def hinges(triangles: Ints) -> Hinges:
-    """All interior edges of a manifold mesh, ordered by first triangle and its corner.
-
-    Parameters
-    ----------
-    triangles : (F, 3) int64
-
-    Raises
-    ------
-    ValueError
-        If an edge belongs to more than two triangles (``build_mesh`` refuses such meshes).
-    """
+    """All edges of exactly two of ``triangles`` (F, 3), ordered by the first of them and its corner."""
     table = edge_table(triangles)
-    if table.sizes.size and table.sizes.max() > 2:
-        raise ValueError("an edge belongs to more than two triangles")
     begin = table.first[table.sizes == 2]
     first, second = table.sides[begin], table.sides[begin + 1]
     order = np.argsort(first)
@@ -107,6 +95,13 @@ def hinges(triangles: Ints) -> Hinges:
         [side_vertices(triangles, first), side_vertices(triangles, second)[:, 2:]], axis=1
     )
     return Hinges(vertices, np.stack([first // 3, second // 3], axis=1))
+
+
+def junctions(triangles: Ints) -> list[Ints]:
+    """The triangles of each edge that more than two of ``triangles`` (F, 3) have."""
+    table = edge_table(triangles)
+    many = np.flatnonzero(table.sizes > 2)
+    return [np.sort(table.sides[table.first[e] :][: table.sizes[e]] // 3) for e in many]
 
 
 def boundary_edges(triangles: Ints) -> BoundaryEdges:

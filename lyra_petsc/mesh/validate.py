@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Sheet
 from lyra_petsc.mesh.readers import first_few
-from lyra_petsc.mesh.topology import edge_table, side_vertices
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,8 +24,8 @@ def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None)
     ------
     InputError
         No triangles, non-finite coordinates, a triangle that uses a vertex twice, duplicate triangles,
-        edges of more than two triangles, vertices in no triangle. Triangles and vertices are counted
-        from 0 in file order, after splitting quads.
+        vertices in no triangle. Triangles and vertices are counted from 0 in file order, after splitting
+        quads.
     """
 
     def refuse(message: str) -> None:
@@ -43,11 +42,6 @@ def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None)
         refuse(f"degenerate triangles (a vertex used twice): {first_few(bad.tolist())} (counted from 0)")
     if (bad := _duplicates(triangles)).size:
         refuse(f"triangles that repeat another one: {first_few(bad.tolist())} (counted from 0)")
-    table = edge_table(triangles)
-    if (crowded := np.flatnonzero(table.sizes > 2)).size:
-        named = [_edge_words(triangles, table.sides[table.first[e] :][: table.sizes[e]]) for e in crowded[:5]]
-        more = f" and {crowded.size - 5} more" if crowded.size > 5 else ""
-        refuse(f"edges of more than two triangles: {'; '.join(named)}{more} (counted from 0)")
     used = np.zeros(len(sheet.points), dtype=np.bool_)
     used[triangles] = True
     if (bad := np.flatnonzero(~used)).size:
@@ -94,9 +88,3 @@ def _duplicates(triangles: Ints) -> Ints:
     order = np.lexsort(corners.T[::-1])
     same = (corners[order][1:] == corners[order][:-1]).all(axis=1)
     return np.sort(order[1:][same])
-
-
-def _edge_words(triangles: Ints, sides: Ints) -> str:
-    start, end, _ = side_vertices(triangles, sides[:1])[0]
-    low, high = min(start, end), max(start, end)
-    return f"vertices {low}-{high} in triangles {first_few((sides // 3).tolist())}"

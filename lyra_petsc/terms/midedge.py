@@ -53,6 +53,9 @@ AnyInts = NDArray[np.int32] | NDArray[np.int64]
 STEEPEST = np.radians(89.0)
 """Angle of a director at rest or at the start from which on a scene is refused."""
 
+CREASED = np.tan(np.radians(30.0))
+"""tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
+
 LARGEST_TURN = 0.5
 """Angle [rad] by which a Newton iteration may turn a director."""
 
@@ -350,7 +353,13 @@ def elements(rest: RestShape) -> Elements:
         _mirror(director, rest, triangles, number, mesh.rest)
         at_rest[surface] = _tangents_of(mesh.rest, triangles[surface], director[number[surface]])
         _check(at_rest, number, edges, rest, "rest shape")
-        rest.notes += _coarse(rest, chosen, np.einsum("eki,ei->ek", curvature, at_rest), size.max(axis=1))
+        smooth = np.abs(at_rest).max(axis=1) < CREASED
+        rest.notes += _coarse(
+            rest,
+            chosen[smooth],
+            np.einsum("eki,ei->ek", curvature[smooth], at_rest[smooth]),
+            size[smooth].max(axis=1),
+        )
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
@@ -380,7 +389,7 @@ def _coarse(rest: RestShape, chosen: Ints, curvature: Array, longest: Array) -> 
     """What to say of triangles ``chosen`` with these curvatures (n, 3) at rest and longest edges (n,) [m].
 
     Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
-    that of a sheet of bending stiffness B and membrane stiffness C. At creases few are curved.
+    that of a sheet of bending stiffness B and membrane stiffness C.
     """
     mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
     largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
@@ -443,7 +452,8 @@ def _check(tangent: Array, number: Ints, edges: Ints, rest: RestShape, what: str
         a, b = edges[number.ravel()[steep[0]]]
         raise InputError(
             f"the {what} is folded by 178° or more at the edge of vertices {a} and {b}, where bending_model: "
-            "midedge has no moment; open the fold, or take bending_model: hinge",
+            "midedge has no moment; open the fold (or, where several sheets meet, turn one over), or take "
+            "bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
         )

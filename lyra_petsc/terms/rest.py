@@ -11,7 +11,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.measures import rest_matrices
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_triangles
-from lyra_petsc.mesh.topology import Hinges, hinges, unique_edges
+from lyra_petsc.mesh.topology import Hinges, hinges, junctions, unique_edges
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve
 from lyra_petsc.scene.schema import Scene
 
@@ -109,5 +109,25 @@ class RestShape:
 
     @cached_property
     def hinges(self) -> Hinges:
-        """The interior edges; found only if a term asks."""
+        """The edges of two triangles; found only if a term asks."""
+        self._check_junctions()
         return hinges(self.mesh.triangles)
+
+    def _check_junctions(self) -> None:
+        """Refuse hinges where more than two triangles meet, of which no two make an angle."""
+        bends, found = self.bends_by("hinge"), junctions(self.mesh.triangles)
+        wrong = [triangles for triangles in found if bends[triangles].any()]
+        if wrong:
+            words = [self._edge_words(triangles) for triangles in wrong[:5]]
+            more = f" and {len(wrong) - 5} more" if len(wrong) > 5 else ""
+            raise InputError(
+                f"edges of more than two triangles: {'; '.join(words)}{more} (counted from 0); hinges cannot "
+                "bend there: give the material bending_model: midedge",
+                file=self.scene.source,
+                key="mesh",
+            )
+
+    def _edge_words(self, triangles: NDArray[np.int64]) -> str:
+        corners = [set(corners) for corners in self.mesh.triangles[triangles].tolist()]
+        low, high = sorted(set.intersection(*corners))
+        return f"vertices {low}-{high} in triangles {', '.join(map(str, triangles))}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mesh_sources import grid_mesh
 
-from lyra_petsc.mesh.topology import boundary_edges, hinges
+from lyra_petsc.mesh.topology import boundary_edges, hinges, junctions
 
 
 def test_hinge_of_two_triangles() -> None:
@@ -46,9 +46,11 @@ def test_boundary_edges_run_with_their_triangle_and_close() -> None:
         assert {a, b, c} == set(corners)
 
 
-def test_three_triangles_on_an_edge_are_refused() -> None:
-    with pytest.raises(ValueError, match="more than two triangles"):
-        hinges(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]]))
+def test_three_triangles_on_an_edge_are_a_junction_and_no_hinge() -> None:
+    triangles = np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4], [3, 0, 5]])
+    assert hinges(triangles).triangles.tolist() == [[1, 3]]
+    assert [found.tolist() for found in junctions(triangles)] == [[0, 1, 2]]
+    assert junctions(triangles[1:]) == []
 
 
 def test_no_triangles_no_edges() -> None:

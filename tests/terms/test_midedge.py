@@ -376,6 +376,14 @@ def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
     simulation.destroy()
 
 
+def test_creases_are_not_noted(tmp_path: Path) -> None:
+    """The walls of a box are flat, however thin and whatever their triangles."""
+    content = {"mesh": folded(tmp_path / "b.obj", 90.0), "material": STIFF | {"bending": PLATE}}
+    simulation = Run(MPI.COMM_SELF, scene_of(content))
+    assert not [note for note in simulation.notes if "large for the curvature" in note]
+    simulation.destroy()
+
+
 def test_one_sheet_bends_by_one_model() -> None:
     hinge = STIFF | {"bending": 1.0}
     two = {"mesh": [grid(1, 1, 2, 2) | {"name": "a"}, grid(1, 1, 2, 2) | {"name": "b"}]}
@@ -699,3 +707,53 @@ def test_extremes_end_as_numbers(kind: str, scheme: str) -> None:
     assert np.isfinite(x).all()
     assert np.isfinite(energies).all()
     assert np.linalg.norm(np.ptp(x, axis=0)) > 0.1
+
+
+# -- three triangles at an edge ------------------------------------------------------------------------
+
+
+def t_frame(path: Path, n: int) -> dict[str, Any]:
+    """A plate over 0 ≤ x ≤ 2, and one of height 1 that stands on its middle: n cells to a length of 1."""
+    flat, triangles = rectangle(2 * n, 2, 2.0, 2.0 / n)
+    leg, more = rectangle(n, 2, 1.0, 2.0 / n)
+    standing = np.column_stack([np.ones(len(leg)), leg[:, 1], leg[:, 0]])
+    both = np.concatenate([flat, standing])
+    _, first, number = np.unique(np.round(both, 9), axis=0, return_index=True, return_inverse=True)
+    faces = number.ravel()[np.concatenate([triangles, more + len(flat)])]
+    return obj_file(path, both[first], faces)
+
+
+PUSH = 1e-6
+
+
+def pushed(comm: MPI.Comm, path: Path, n: int) -> float:
+    """How far the upper edge of the standing plate gives way [m] to a force per width PUSH [N/m]."""
+    content = {
+        "mesh": t_frame(path, n),
+        "material": STIFF | {"bending": PLATE | {"d12": 0.0, "d33": 0.5}},
+        "handles": [{"box": [[x - 1e-6, -1, -1e-6], [x + 1e-6, 1, 1e-6]]} for x in (0.0, 2.0)],
+        "loads": [{"box": [[0.9, -1, 0.999], [1.1, 1, 1.001]], "force": [PUSH * 2.0 / n, 0, 0]}],
+        "time": {"analysis": "static", "step": 1.0},
+        "solver": TIGHT,
+    }
+    run = Run(comm, scene_of(content))
+    while not run.finished:
+        run.step()
+    x = gathered(run.problem.points, run.problem.system.x)
+    run.destroy()
+    return float(x[x[:, 2] > 0.999][:, 0].mean() - 1.0)
+
+
+@pytest.mark.parallel
+def test_a_plate_stands_on_another(tmp_path: Path, comm: MPI.Comm) -> None:
+    """F L³ / 3D of the plate that stands, and F L³ / 6D by what the joint turns on a span of 2 L."""
+    exact = PUSH * (1.0 / 3.0 + 1.0 / 6.0)
+    coarse, fine = (pushed(comm, tmp_path / f"frame{n}.obj", n) for n in (8, 16))
+    assert abs(fine - exact) < 0.55 * abs(coarse - exact)
+    np.testing.assert_allclose(2.0 * fine - coarse, exact, rtol=0.01)  # the first order's error taken off
+
+
+def test_hinges_are_refused_there(tmp_path: Path) -> None:
+    content = {"mesh": t_frame(tmp_path / "frame.obj", 2), "material": CLOTH | {"bending": 1e-4}}
+    with pytest.raises(InputError, match=r"more than two triangles: vertices \d+-\d+ in .* midedge"):
+        Run(MPI.COMM_SELF, scene_of(content))

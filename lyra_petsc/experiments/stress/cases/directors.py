@@ -76,7 +76,7 @@ CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": STEPS * STEP, "scale": [P
 directors = family(
     "directors",
     "bending_model: midedge",
-    StressCase("directors", "as it is", partial(_changed, _as_it_is), level=QUICK),
+    StressCase("directors-plain", "as it is", partial(_changed, _as_it_is), level=QUICK),
     *(
         StressCase(
             f"directors-1e6-{ms}ms", f"membrane × 1e6, Δt {ms} ms", partial(_changed, scale, stretching=1e6),
