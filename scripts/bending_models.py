@@ -1,6 +1,6 @@
 """Error against run time of both bending models: a square plate under a small uniform load.
 
-    OMP_NUM_THREADS=1 python scripts/bending_models.py [--case "CCCC 0.3"] [--runs 3] [--out FILE.svg]
+    OMP_NUM_THREADS=1 python scripts/bending_models.py [--case "CFFF 0"] [--runs 3] [--out FILE.svg]
 
 Prints a Markdown table of the relative error of the deflection against Kirchhoff's plate, and of the seconds
 of a whole static analysis, set-up included: the median of the runs. Draws the same as an SVG where --out
@@ -22,10 +22,12 @@ from lyra_petsc.experiments.verification.cases.plates import HELD
 from lyra_petsc.experiments.verification.flat_plates import flat_mesh
 from lyra_petsc.show.report.plots import Series, work_precision
 
+PLATES = data("linear_plate")["deflection"]
+"""By edges (C clamped, S supported, F free) and Poisson's ratio."""
+
 KINDS = ("alternating", "gmsh")
 SIZES = (8, 16, 32, 64, 128)
 THICKNESS = 0.01  # m, of a plate of 1 m
-POISSON = 0.3
 STIFFNESS = 1.0  # N m
 DEFLECTION = 1e-6
 """[m] so small that the plate is linear."""
@@ -33,13 +35,14 @@ DEFLECTION = 1e-6
 
 def measure(bench: Bench, name: str, model: str, kind: str, n: int) -> tuple[float, float]:
     """Relative error of the deflection, and wall seconds."""
-    exact = data("linear_plate")["deflection"][name]
-    how, edges = HELD[name.split()[0]]
+    exact = PLATES[name]
+    held, ratio = name.split()
+    (how, edges), poisson = HELD[held], float(ratio)
     scene = {
         "mesh": flat_mesh(bench, kind, n, n),
         "material": {
-            "young": 12.0 * (1.0 - POISSON**2) * STIFFNESS / THICKNESS**3,
-            "poisson": POISSON,
+            "young": 12.0 * (1.0 - poisson**2) * STIFFNESS / THICKNESS**3,
+            "poisson": poisson,
             "thickness": THICKNESS,
             "density": 1.0,
             "bending_model": model,
@@ -55,7 +58,7 @@ def measure(bench: Bench, name: str, model: str, kind: str, n: int) -> tuple[flo
 
 
 @click.command(help=__doc__)
-@click.option("--case", "name", default="CCCC 0.3", show_default=True)
+@click.option("--case", "name", type=click.Choice(list(PLATES)), default="CFFF 0", show_default=True)
 @click.option("--runs", default=3, show_default=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path))
 def main(name: str, runs: int, out: Path | None) -> None:
@@ -74,7 +77,7 @@ def main(name: str, runs: int, out: Path | None) -> None:
                     click.echo(f"| {model} | {kind} | {n} | {errors[-1]:.3g} | {seconds[-1]:.2f} |")
                 lines.append(Series(f"{model}, {kind}", seconds, errors, labels=[f"{n}" for n in SIZES]))
     if out is not None:
-        caption = "Deflection of a clamped square plate against Kirchhoff's; beside the points: cells a side"
+        caption = f"Deflection of a square plate ({name}); beside the points: cells a side"
         drawing = work_precision(lines, name=out.stem, caption=caption, y_label="error of the deflection [%]")
         out.write_bytes(drawing.svg)
 
