@@ -5,6 +5,7 @@ Modules may declare theirs themselves. All are registered at the end.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -92,20 +93,36 @@ def run(
     run_scene(comm, served=Served.of_live(live, host, port, no_browser), **options)
 
 
-@verb("lyra-petsc check configs/flag.yaml --set mesh.size=0.02")
-@scene
+@verb("lyra-petsc check configs/flag.yaml --set mesh.size=0.02", "lyra-petsc check runs/flag")
+@click.argument("path", required=False, type=click.Path(path_type=Path), metavar="[SCENE|RUN]")
 @settings
 @trust_mesh
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scene files, for editors.")
-def check(comm: Any, scene: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool) -> None:
-    """Check SCENE and print what a run would do; runs nothing."""
+@click.option(
+    "--crossings", is_flag=True, help="Exit code 1 if triangles cross in RUN, also without contact."
+)
+def check(
+    comm: Any, path: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool, crossings: bool
+) -> int:
+    """Check SCENE and print what a run would do; runs nothing. Of RUN, count the triangles that cross."""
+    from lyra_petsc.parallel import on_root
+
+    if crossings and path is None:
+        raise InputError("needs the folder of a run, as in: check runs/flag --crossings", key="--crossings")
+    if path is not None and (crossings or on_root(comm, lambda: os.path.isdir(path))):
+        if settings or trust_mesh or schema:
+            raise InputError("for the folder of a run there is no option but --crossings", file=path)
+        from lyra_petsc.cli.check_run import check_run
+
+        return check_run(comm, path, crossings=crossings)
     from lyra_petsc.cli.check import check as check_scene
     from lyra_petsc.cli.check import print_schema
 
     if schema:
         print_schema(comm)
     else:
-        check_scene(comm, scene, settings, trust_mesh=trust_mesh)
+        check_scene(comm, path, settings, trust_mesh=trust_mesh)
+    return 0
 
 
 @verb("lyra-petsc verify --quick", "lyra-petsc verify --list")

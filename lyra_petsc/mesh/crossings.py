@@ -1,0 +1,245 @@
+"""Pairs of triangles that cross: which do is decided exactly, independently of how contact is solved.
+
+Two triangles cross where their relative interiors intersect and they are not in one plane. So what touches
+does not cross: a vertex or an edge that lies on the other triangle, triangles that overlap in one plane (a
+sheet that is folded flat onto itself), triangles without area, which have no interior. Triangles with a
+common edge meet there alone, or lie in one plane; those with a common vertex may cross elsewhere.
+
+Candidates come from a tree of boxes, the decision from signs of determinants alone (Guigue & Devillers, Fast
+and Robust Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics Tools 8 (2003)
+25-42, with open instead of closed triangles).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import cached
+from lyra_petsc.mesh.orient3d import UNDECIDED, rational_side, side
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LEAF = 4
+"""Triangles in a leaf of the tree."""
+
+
+class _Tree(NamedTuple):
+    """A complete binary tree of boxes: node k has the children 2 k and 2 k + 1, node 1 contains all.
+
+    Attributes
+    ----------
+    order : (F,) int64
+        Triangles in the order of the leaves, `LEAF` to each.
+    low, high : (F, 3) float64
+        Boxes of the triangles, in this order [m].
+    node_low, node_high : (2 n, 3) float64
+        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
+    """
+
+    order: Ints
+    low: Array
+    high: Array
+    node_low: Array
+    node_high: Array
+
+
+def self_crossings(points: Array, triangles: Ints) -> Ints:
+    """The pairs of triangles of a surface that cross.
+
+    Parameters
+    ----------
+    points : (V, 3) float64
+        Finite [m].
+    triangles : (F, 3) int64
+
+    Returns
+    -------
+    (n, 2) int64
+        Triangles, the smaller first, in lexicographic order. `have_common_vertex` tells those pairs apart.
+    """
+    found = _search(points, triangles, triangles, *_tree(points, triangles), True)
+    return _certain(points, triangles, triangles, *found)
+
+
+def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triangles: Ints) -> Ints:
+    """The pairs of triangles of two surfaces, as a sheet and an obstacle, that cross.
+
+    Parameters
+    ----------
+    points, others : (V, 3) and (W, 3) float64
+        Finite [m]. The surfaces have no vertex in common, also not where two lie at one place.
+    triangles, other_triangles : (F, 3) and (G, 3) int64
+        Rows of ``points`` and of ``others``.
+
+    Returns
+    -------
+    (n, 2) int64
+        Triangle of the first and of the second surface, in lexicographic order.
+    """
+    every = np.concatenate([points, others])
+    theirs = other_triangles + len(points)
+    found = _search(every, triangles, theirs, *_tree(every, theirs), False)
+    return _certain(every, triangles, theirs, *found)
+
+
+def have_common_vertex(triangles: Ints, pairs: Ints) -> NDArray[np.bool_]:
+    """(n,) whether the triangles of each of the ``pairs`` (n, 2) have a vertex in common."""
+    first, second = triangles[pairs[:, 0]], triangles[pairs[:, 1]]
+    return np.asarray((first[:, :, None] == second[:, None, :]).any(axis=(1, 2)))
+
+
+def _certain(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: NDArray[np.bool_]) -> Ints:
+    """The pairs found without those among the undecided that do not cross, in lexicographic order."""
+    kept = decided.copy()
+    for n in np.flatnonzero(~decided):
+        vertices = [*triangles[pairs[n, 0]].tolist(), *others[pairs[n, 1]].tolist()]
+        exact = {vertex: tuple(map(Fraction, points[vertex].tolist())) for vertex in vertices}
+        kept[n] = _rational_crossing(exact, *vertices)
+    pairs = pairs[kept]
+    return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
+
+
+def _tree(points: Array, triangles: Ints) -> _Tree:
+    """The tree of boxes of triangles, along a space-filling curve."""
+    corners = points[triangles]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    order = np.argsort(_curve(low, high), kind="stable")
+    low, high = low[order], high[order]
+    leaves = 1 << max(0, -(-len(triangles) // LEAF) - 1).bit_length()
+    node_low, node_high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
+    begins = np.arange(0, len(triangles), LEAF)
+    if len(begins):
+        node_low[leaves:][: len(begins)] = np.minimum.reduceat(low, begins)
+        node_high[leaves:][: len(begins)] = np.maximum.reduceat(high, begins)
+    level = leaves
+    while level > 1:
+        below, level = slice(level, 2 * level), level // 2
+        node_low[level : 2 * level] = node_low[below].reshape(level, 2, 3).min(axis=1)
+        node_high[level : 2 * level] = node_high[below].reshape(level, 2, 3).max(axis=1)
+    return _Tree(order, low, high, node_low, node_high)
+
+
+def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
+    """(F,) places along Morton's curve of the centres of boxes, with 21 bits an axis."""
+    # a quarter each: coordinates may be as large as numbers go
+    centres = 0.25 * low + 0.25 * high
+    if not len(centres):
+        return np.empty(0, np.uint64)
+    least = centres.min(axis=0)
+    extent = (centres.max(axis=0) - least).max()
+    bits = ((centres - least) * (1.0 / extent if extent > 1e-300 else 0.0) * (2**21 - 1)).astype(np.uint64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return np.asarray(bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2))
+
+
+def _decides_crossing(side: Any) -> Callable[..., int]:
+    """The function that decides whether two triangles cross, by `orient3d.side` or its like."""
+
+    def crossing(points: Any, a: int, b: int, c: int, d: int, e: int, f: int) -> int:
+        """1 where the triangles a, b, c and d, e, f cross, 0 where not, or `UNDECIDED`."""
+        first, second = (a, b, c), (d, e, f)
+        # each must have corners on both sides of the other's plane: its interior meets the planes' common
+        # line in an open interval then, and else does not meet the other's plane, or lies in it
+        x, y, z = side(points, d, e, f, a), side(points, d, e, f, b), side(points, d, e, f, c)
+        if max(x, y, z) == UNDECIDED:
+            return UNDECIDED
+        if max(x, y, z) < 1 or min(x, y, z) > -1:
+            return 0
+        u, v, w = side(points, a, b, c, d), side(points, a, b, c, e), side(points, a, b, c, f)
+        if max(u, v, w) == UNDECIDED:
+            return UNDECIDED
+        if max(u, v, w) < 1 or min(u, v, w) > -1:
+            return 0
+        # turned so that p is alone on its side, where the normal of the other triangle points
+        k = 0 if x not in (0, y, z) else 1 if y not in (0, x, z) else 2
+        m = 0 if u not in (0, v, w) else 1 if v not in (0, u, w) else 2
+        p, q, r = first[k], first[(k + 1) % 3], first[(k + 2) % 3]
+        s, t, o = second[m], second[(m + 1) % 3], second[(m + 2) % 3]
+        if (x, y, z)[k] < 0:
+            t, o = o, t
+        if (u, v, w)[m] < 0:
+            q, r = r, q
+        # the intervals overlap if each begins before the other one ends
+        mine, others = side(points, p, q, s, t), side(points, p, r, o, s)
+        if max(mine, others) == UNDECIDED:
+            return UNDECIDED
+        return int(mine < 0 and others < 0)
+
+    return crossing
+
+
+_crossing = cached()(_decides_crossing(side))
+_rational_crossing = _decides_crossing(rational_side)
+
+
+@cached()
+def _search(
+    points: Any,
+    queries: Any,
+    triangles: Any,
+    order: Any,
+    low: Any,
+    high: Any,
+    node_low: Any,
+    node_high: Any,
+    within: bool,
+) -> tuple[Any, Any]:
+    """The pairs of a query and a triangle of the tree that cross or are undecided, and which are decided.
+
+    ``within``: queries and triangles are the same; each pair is looked at once, none with a common edge.
+    """
+    pairs, decided, count = np.empty((64, 2), np.int64), np.empty(64, np.bool_), 0
+    leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
+    for i in range(len(queries)):
+        a, b, c = queries[i, 0], queries[i, 1], queries[i, 2]
+        least, most = np.minimum(points[a], points[b]), np.maximum(points[a], points[b])
+        least, most = np.minimum(least, points[c]), np.maximum(most, points[c])
+        stack[0], top = 1, 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            if _apart(least, most, node_low[node], node_high[node]):
+                continue
+            if node < leaves:
+                stack[top], stack[top + 1] = 2 * node, 2 * node + 1
+                top += 2
+                continue
+            first = (node - leaves) * LEAF
+            for place in range(first, min(first + LEAF, len(order))):
+                j = order[place]
+                if (within and j <= i) or _apart(least, most, low[place], high[place]):
+                    continue
+                d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
+                if (a in (d, e, f)) + (b in (d, e, f)) + (c in (d, e, f)) > 1:
+                    continue
+                found = _crossing(points, a, b, c, d, e, f)
+                if found == 0:
+                    continue
+                if count == len(pairs):
+                    pairs, decided = np.concatenate((pairs, pairs)), np.concatenate((decided, decided))
+                pairs[count, 0], pairs[count, 1], decided[count] = i, j, found != UNDECIDED
+                count += 1
+    return pairs[:count], decided[:count]
+
+
+@cached()
+def _apart(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
+    """Whether two boxes have no point in common."""
+    return bool(
+        (low[0] > other_high[0] or high[0] < other_low[0])
+        or (low[1] > other_high[1] or high[1] < other_low[1])
+        or (low[2] > other_high[2] or high[2] < other_low[2])
+    )

@@ -1,0 +1,155 @@
+"""What of a sheet is in an obstacle, against points drawn within triangles and by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from lyra_petsc.mesh.overlaps import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
+from lyra_petsc.mesh.topology import unique_edges
+
+pytestmark = pytest.mark.quick
+
+CUBE = np.array([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)], dtype=float)
+ONE = np.array([[0, 1, 2]])
+
+
+def counts(found: Overlaps) -> tuple[int, int, int]:
+    return len(found.vertices), len(found.edges), len(found.triangles)
+
+
+def turned() -> np.ndarray:
+    axes, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
+    return np.asarray(axes * np.linalg.det(axes))
+
+
+def cloud(triangle: np.ndarray, n: int = 60) -> np.ndarray:
+    """Points of a triangle on a lattice, its edges and corners included."""
+    i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
+    i, j = i[i + j <= n] / n, j[i + j <= n] / n
+    return np.asarray(
+        triangle[0] + np.outer(i, triangle[1] - triangle[0]) + np.outer(j, triangle[2] - triangle[0])
+    )
+
+
+def from_axis(points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    along = axis[-1] - axis[0]
+    square = along @ along
+    share = np.clip((points - axis[0]) @ along / square, 0, 1) if square else np.zeros(len(points))
+    return np.asarray(np.linalg.norm(points - axis[0] - np.outer(share, along), axis=1))
+
+
+def compare(
+    found: Overlaps, points: np.ndarray, triangles: np.ndarray, depth: Callable, slack: float = 0.1
+) -> np.ndarray:
+    """Hold it against the greatest ``depth`` of points within each simplex, where that is not −slack to 0.
+
+    Returns for vertices, edges and triangles how many are in, and how many are not.
+    """
+    edges = unique_edges(triangles)
+    in_edges = (edges[:, None] == found.edges[None]).all(axis=2).any(axis=1)
+    judged = []
+    for corners, told in (
+        (np.arange(len(points))[:, None].repeat(3, 1), np.isin(np.arange(len(points)), found.vertices)),
+        (edges[:, [0, 1, 1]], in_edges),
+        (triangles, np.isin(np.arange(len(triangles)), found.triangles)),
+    ):
+        deepest = np.array([depth(cloud(points[row])).max() for row in corners])
+        assert told[deepest > 1e-9].all()
+        assert not told[deepest < -slack].any()
+        judged.append([(deepest > 1e-9).sum(), (deepest < -slack).sum()])
+    return np.array(judged)
+
+
+def scattered(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
+    points = np.random.default_rng(seed).normal(size=(90, 3)) * spread
+    return points, np.arange(90).reshape(30, 3)
+
+
+@pytest.mark.parametrize("axis", [[[0.1, 0.2, 0.3]], [[-1.0, 0, 0], [1, 0.5, 0.2]]])
+def test_balls_and_capsules_against_points_within_triangles(axis: list[list[float]]) -> None:
+    ends = np.array(axis)
+    judged = np.zeros((2, 3, 2))
+    for seed in range(4):
+        points, triangles = scattered(seed, 1.0)
+        found = in_ball(points, triangles, ends, 0.4)
+        judged[0] += compare(found, points, triangles, lambda x: 0.4 - from_axis(x, ends))
+        found = out_of_ball(points, triangles, ends, 1.8)
+        judged[1] += compare(found, points, triangles, lambda x: from_axis(x, ends) - 1.8)
+    assert (judged > 3).all()
+
+
+def test_boxes_against_points_within_triangles() -> None:
+    size, shift, turn = np.array([1.5, 0.8, 1.0]), np.array([0.3, -0.2, 0.1]), turned()
+    corners = (CUBE - 0.5) * size @ turn.T + shift
+    on_planes, normals = corners[[0, 0, 0, 7, 7, 7]], np.concatenate([turn.T, -turn.T])
+
+    def depth(x: np.ndarray) -> np.ndarray:
+        return np.asarray((size / 2 - np.abs((x - shift) @ turn)).min(axis=1))
+
+    judged = np.zeros((2, 3, 2))
+    for seed in range(4):
+        points, triangles = scattered(seed, 1.0)
+        judged[0] += compare(in_box(points, triangles, corners), points, triangles, depth)
+        points *= 0.25
+        found = beyond_planes(points, triangles, on_planes, normals)
+        judged[1] += compare(found, points, triangles, lambda x: -depth(x))
+    assert (judged > 3).all()
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e3])
+def test_spheres_that_touch_and_that_do_not(shift: float) -> None:
+    triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]]) + shift
+    over = np.array([[0.0, 0, 1]]) + shift
+    assert counts(in_ball(triangle, ONE, over, 1.0)) == (0, 0, 0)
+    assert counts(in_ball(triangle, ONE, over, 1.0 + 1e-9)) == (0, 0, 1)
+    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) - 1e-9)) == (0, 0, 1)
+    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) + 1e-9)) == (0, 1, 1)
+    assert counts(in_ball(triangle, ONE, over, np.sqrt(3.0) + 1e-9)) == (1, 3, 1)
+    assert counts(out_of_ball(triangle, ONE, over, np.sqrt(6.0))) == (0, 0, 0)
+    assert counts(out_of_ball(triangle, ONE, over, np.sqrt(6.0) - 1e-9)) == (2, 3, 1)
+
+
+def test_a_rod_through_the_middle_of_a_triangle() -> None:
+    triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]])
+    rod = np.array([[0.0, 0, -5], [0, 0, 9]])
+    assert counts(in_ball(triangle, ONE, rod, 1e-3)) == (0, 0, 1)
+    assert counts(in_ball(triangle, ONE, rod + [9, 0, 0], 1e-3)) == (0, 0, 0)
+    lying = np.array([[-5.0, 0, 0.5], [5, 0, 0.5]])  # parallel to the triangle and to one side
+    assert counts(in_ball(triangle, ONE, lying, 0.5)) == (0, 0, 0)
+    assert counts(in_ball(triangle, ONE, lying, 0.5 + 1e-9)) == (0, 2, 1)
+
+
+@pytest.mark.parametrize("turn", [np.eye(3), turned()])
+def test_sheets_on_and_in_a_box(turn: np.ndarray) -> None:
+    box = CUBE @ turn.T + 3.0
+
+    def of(*corners: list[float]) -> tuple[int, int, int]:
+        return counts(in_box(np.array(corners, dtype=float) @ turn.T + 3.0, ONE, box))
+
+    assert of([0, 0, 1], [1, 0, 1], [0, 1, 1]) == (0, 0, 0)  # on a side
+    assert of([-3, 0.5, 1], [3, 0.5, 1], [0, 9, 4]) == (0, 0, 0)  # an edge on a side
+    assert of([0, 0, 0], [1, 1, 1], [1, 1, 0]) == (0, 1, 1)  # between corners
+    assert of([0, 0, 0], [-1, 0, 0], [0, -1, 0]) == (0, 0, 0)
+    assert of([-9, 0, -9], [9, 0.5, 9], [0, 0.5, -20]) == (0, 1, 1)
+    # through the diagonals of two sides, and two edges of the box
+    assert of([-9, -9, -9], [9, -9, 9], [0.5, 40, 0.5]) == (0, 0, 1)
+    # past an edge of the box, and over it
+    assert of([2.01, 0, -4.5], [0, 2.01, 5.5], [3, 3, 0]) == (0, 0, 0)
+    assert of([1.99, 0, -4.5], [0, 1.99, 5.5], [3, 3, 0]) == (0, 1, 1)
+    assert of([0.5, 0.5, 0.5], [9, 9, 9], [9, 0, 9]) == (1, 2, 1)
+    assert of([0.5, 0.5, 1 - 1e-9], [9, 9, 9], [9, 0, 9]) == (1, 2, 1)
+
+
+def test_planes() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, -1e-9], [5, 5, 1]])
+    triangles = np.array([[0, 1, 2], [0, 1, 3]])
+    floor, up = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
+    found = beyond_planes(points, triangles, floor, up)
+    assert found.vertices.tolist() == [2]
+    assert found.edges.tolist() == [[0, 2], [1, 2]]
+    assert found.triangles.tolist() == [0]
+    points[2, 2] = -1e-17
+    assert counts(beyond_planes(points, triangles, floor, up)) == (0, 0, 0)
