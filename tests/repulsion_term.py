@@ -17,6 +17,7 @@ from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 DISTANCE, STIFFNESS = 0.08, 4.0e3
 """d [m] and k [N/m²]."""
@@ -38,11 +39,11 @@ class Repulsion(Elastic):
         distance = np.linalg.norm(way, axis=1)
         return way / distance[:, None], distance, np.maximum(DISTANCE - distance, 0.0)
 
-    def neighbours(self, x: Array, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         """Pairs of points, the one with the smaller number first."""
         near = ((x[:, None] - x[None]) ** 2).sum(axis=2) < self.search_distance**2
         one, other = np.nonzero(near & (numbers[:, None] < numbers[None]))
-        return np.column_stack([one, other])
+        return np.column_stack([one, other]), np.empty((len(one), 0), dtype=np.int64)
 
     def energies(self, x: Array, frozen: None) -> Array:
         energy: Array = STIFFNESS / 3.0 * self._pairs(x)[2] ** 3

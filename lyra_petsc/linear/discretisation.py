@@ -57,7 +57,7 @@ class Discretisation:
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
         self.place: Ints | None = None
-        self._current = True
+        self._current = not self._changing  # their offsets are not in the fixed pattern
         self._searched: Array | None = None
 
     @property
@@ -66,20 +66,17 @@ class Discretisation:
         return bool(self._changing)
 
     def follow(self, x: Array) -> bool:
-        """Let stencils be those at positions x (n_owned, 3) [m]; whether ghosts are others; collective."""
+        """Let stencils be those at positions x (n_local, 3) [m]; whether ghosts are others; collective."""
         layout = self.layout
         comm, here = layout.comm, x[: layout.n_vertices]
-        if not self._changing or not self._moved(here):
+        if not self._changing:
+            return False
+        moved = self._moved(here) or any([term.stale for term in self._changing])
+        if not comm.allreduce(int(moved), MPI.MAX):
             return False
         self._searched = here.copy()
-        numbers, positions = self._near(here, max(term.search_distance for term in self._changing))
-        candidates = np.concatenate([layout.start + np.arange(len(here)), numbers])
-        points = np.concatenate([here, positions])
-        found = []
-        for term in self._changing:
-            stencil = np.asarray(term.neighbours(points, candidates))
-            found.append(candidates[stencil[(stencil < len(here)).any(axis=1)]])
-        every = np.unique(np.concatenate([stencil.ravel() for stencil in found]))
+        found = [self._search(term, x) for term in self._changing]
+        every = np.unique(np.concatenate([stencil.ravel() for stencil, _ in found]))
         end = layout.start + layout.n_owned
         more = np.setdiff1d(every[(every < layout.start) | (every >= end)], self._fixed_layout.ghosts)
         present = layout.ghosts[len(self._fixed_layout.ghosts) :]
@@ -89,20 +86,90 @@ class Discretisation:
                 layout.destroy()
             self.layout = layout = self._fixed_layout.with_ghosts(more)
         changed = others
-        for term, stencil in zip(self._changing, found, strict=True):
-            elements = self._elements(stencil)
+        for term, (stencil, what) in zip(self._changing, found, strict=True):
+            elements = self._elements(stencil, what)
             changed |= not np.array_equal(elements.stencil, term.stencil)
             term.take(elements)
         self._current &= not comm.allreduce(int(changed), MPI.MAX)
         return others
 
+    @property
+    def guards(self) -> bool:
+        """Whether ways must be looked at before they are gone: a term has to see who meets there."""
+        return any(np.isfinite(term.unseen) for term in self._changing)
+
+    def largest_step(self, x: Array, way: Array) -> float:
+        """Fraction, up to 1, of the way (n_owned, 3) [m] from x that this rank's vertices may go until
+        stencils are looked for again.
+        """
+        if not self.guards or self._searched is None:
+            return 1.0
+        n = self.layout.n_vertices
+        reach = 0.5 * min(term.unseen for term in self._changing)
+        gone, way = x[:n] - self._searched, way[:n]
+        # |gone + f way| = reach
+        square, mixed = np.einsum("ij,ij->i", way, way), np.einsum("ij,ij->i", gone, way)
+        left = np.maximum(reach**2 - np.einsum("ij,ij->i", gone, gone), 0.0)
+        root = np.sqrt(mixed**2 + square * left)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fraction = np.where(mixed > 0.0, left / (mixed + root), (root - mixed) / square)
+        return float(np.nanmin(np.where(square > 0.0, fraction, 1.0), initial=1.0))
+
+    def _search(self, term: Elastic, x: Array) -> tuple[Ints, Ints]:
+        """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices;
+        collective.
+        """
+        layout = self.layout
+        here = x[: layout.n_vertices]
+        numbers, positions = self._near(here, term.search_distance)
+        candidates = np.concatenate([layout.start + np.arange(len(here)), numbers])
+        points = np.concatenate([here, positions])
+        triangles = np.empty((0, 3), dtype=np.int64)
+        if term.surface is not None:
+            candidates, points, triangles = self._with_triangles(term, x, candidates, points)
+        stencil, what = term.neighbours(points, candidates, triangles)
+        own = (stencil < len(here)).any(axis=1)
+        return candidates[stencil[own]], what[own]
+
+    def _with_triangles(
+        self, term: Elastic, x: Array, candidates: Ints, points: Array
+    ) -> tuple[Ints, Array, Ints]:
+        """Further points, owned ones first, and the triangles (F, 3) of the surface that are near;
+        collective.
+        """
+        layout = self.layout
+        comm, surface, distance = layout.comm, term.surface, term.search_distance
+        assert surface is not None
+        corners, places = layout.global_number[surface], x[surface]
+        if comm.size > 1:
+            here = x[: layout.n_vertices]
+            box = np.array([here.min(axis=0, initial=np.inf), here.max(axis=0, initial=-np.inf)])
+            boxes = np.empty((comm.size, 2, 3))
+            comm.Allgather(box, boxes)
+            low, high = places.min(axis=1), places.max(axis=1)
+            mine = surface[:, 0] < layout.n_owned
+            sent: list[tuple[Ints, Array] | None] = []
+            for rank, (least, most) in enumerate(boxes):
+                near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
+                sent.append((corners[near], places[near]) if rank != comm.rank and near.any() else None)
+            received = [part for part in comm.alltoall(sent) if part is not None]
+            corners = np.concatenate([corners, *(part[0] for part in received)])
+            places = np.concatenate([places, *(part[1] for part in received)])
+            _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+            corners, places = corners[np.sort(first)], places[np.sort(first)]
+        numbers, first = np.unique(corners, return_index=True)
+        more = ~np.isin(numbers, candidates)
+        candidates = np.concatenate([candidates, numbers[more]])
+        points = np.concatenate([points, places.reshape(-1, 3)[first[more]]])
+        order = np.argsort(candidates)
+        return candidates, points, order[np.searchsorted(candidates, corners, sorter=order)]
+
     def _moved(self, here: Array) -> bool:
-        """Whether points may be near that were not when stencils were looked for; collective."""
+        """Whether points of this rank may be near that were not when stencils were looked for."""
         if self._searched is None:
             return True
         way = here - self._searched
         farthest = float(np.einsum("ij,ij->i", way, way).max(initial=0.0))
-        farthest = self.layout.comm.allreduce(farthest, MPI.MAX)
         return not np.sqrt(farthest) <= 0.5 * min(term.skin for term in self._changing)
 
     def _near(self, here: Array, distance: float) -> tuple[Ints, Array]:
@@ -124,15 +191,17 @@ class Discretisation:
         positions = [np.empty((0, 3)), *(part[1] for part in received)]
         return np.concatenate(numbers), np.concatenate(positions)
 
-    def _elements(self, stencil: Ints) -> Elements:
-        """Elements of rows given by global numbers (E, n), in local numbers; counted ones come first."""
+    def _elements(self, stencil: Ints, what: Ints) -> Elements:
+        """Elements of rows given by global numbers (E, n), and what goes with them (E, m), in local numbers;
+        counted ones come first.
+        """
         layout = self.layout
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
         # one order of the elements on any search, so that the same elements are the same stencil
-        order = np.lexsort((*stencil.T[::-1], ~counted))
+        order = np.lexsort((*what.T[::-1], *stencil.T[::-1], ~counted))
         local = layout.local(stencil[order].ravel()).reshape(stencil.shape).astype(np.int32)
-        return Elements(local, {}, int(counted.sum()))
+        return Elements(local, {"what": what[order].astype(np.float64), "number": stencil[order].astype(np.float64)}, int(counted.sum()))
 
     def renew_pattern(self) -> bool:
         """Let ``rows`` have the blocks of the present stencils; whether they are others than before."""

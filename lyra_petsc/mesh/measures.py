@@ -63,8 +63,14 @@ def rest_matrices(mesh: Mesh, warp_degrees: Floats | float = 0.0) -> tuple[Float
 
 def mean_edge_length(mesh: Mesh) -> float:
     """Mean rest length [m] of the triangles' sides (interior edges count twice)."""
+    return float(edge_lengths(mesh).mean())
+
+
+def edge_lengths(mesh: Mesh) -> Floats:
+    """Rest lengths (F, 3) [m] of the triangles' sides (interior edges are there twice)."""
     uv = mesh.triangle_uv
-    return float(np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2).mean())
+    lengths: Floats = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
+    return lengths
 
 
 def bounding_diagonal(points: Floats) -> float:

@@ -24,10 +24,12 @@ def first_guess(system: StageEquations, out: Array) -> None:
         return
     going_on = system.v[:n].copy()
     system.prescribe(going_on)
-    if system.integrator.order > 1:
+    if system.integrator.order > 1 and not system.discretisation.guards:
         out[:] = going_on
         return
     staying = system.velocity_of_staying()
     system.prescribe(staying)
+    if system.discretisation.guards:
+        going_on = staying + system.largest_step(staying, going_on - staying) * (going_on - staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]
     out[:] = staying if less else going_on

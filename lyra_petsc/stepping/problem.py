@@ -32,7 +32,7 @@ from lyra_petsc.stepping.initial_state import check_resolved, start_positions, s
 from lyra_petsc.stepping.integrators import integrator_of
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.motion import Window, motion_of
+from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.prescribed_handles import Held, Selection, disagreements, is_exact, select_held
 from lyra_petsc.terms.registry import Role, active, made, registered
 from lyra_petsc.terms.rest import RestShape
@@ -40,6 +40,7 @@ from lyra_petsc.terms.term import Elastic, Load, Term
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.clamped_edges import ClampedEdges
+    from lyra_petsc.terms.contact import Barrier
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -62,6 +63,7 @@ class Outline:
     """Largest coordinate [m] of the start and rest shape."""
     terms: list[str]
     sources: list[Source]
+    barrier: Barrier | None
     notes: list[str] = field(default_factory=list)
 
 
@@ -222,6 +224,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
         reach=reach,
         terms=names,
         sources=mesh.sources,
+        barrier=_barrier(rest),
         notes=[*mesh.notes, *rest.notes, *disagreements(scene, mesh, held)],
     )
     on_edges = any(each.edges is not None for each in elements.values())
@@ -251,10 +254,32 @@ def _check_symmetry(rest: RestShape, held: Selection) -> None:
             raise InputError(problem, file=scene.source, key=f"handles[{number}].symmetry")
 
 
+def _barrier(rest: RestShape) -> Barrier | None:
+    """What all ranks need to know of contact, where a scene has it."""
+    if rest.scene.contact is None:
+        return None
+    from lyra_petsc.terms.contact import barrier  # with kernels
+
+    return barrier(rest)
+
+
+def _set_up_contact(scene: Scene, outline: Outline, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None) -> None:
+    """Tell contact of the obstacles; collective."""
+    if outline.barrier is None or scene.contact is None:
+        return
+    from lyra_petsc.mesh.obstacles import obstacles_of
+    from lyra_petsc.terms.contact import Contact
+
+    obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
+    contact = next(term for term in terms.values() if isinstance(term, Contact))
+    contact.set_up(outline.barrier, obstacles, itself=scene.contact.self)
+
+
 def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:
     layout = part.layout
     on_vertices = part.vertex_data["mass"]
     terms = {n: made(registered(n), part.elements.get(n), scene, on_vertices) for n in outline.terms}
+    _set_up_contact(scene, outline, terms, layout, mesh)
     for load in terms.values():
         if isinstance(load, Load):
             load.connect(terms.values())

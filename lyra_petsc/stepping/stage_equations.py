@@ -166,6 +166,7 @@ class StageEquations:
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
         self._freeze(t0 + after)
+        self._follow(self.x)  # obstacles may have come near
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
@@ -381,13 +382,39 @@ class StageEquations:
         ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
         self.points.update_ghosts(ahead)
         fraction = min(t.largest_step(x, ahead, self.active.frozen[t]) for t in self.active.limiting)
+        fraction = min(fraction, self.discretisation.largest_step(x, ahead))
         return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
+
+    def may_move(self) -> bool:
+        """Whether what is prescribed in the step can go where it shall, while all else stays; collective."""
+        here = self.velocity_of_staying()
+        there = here.copy()
+        self.prescribe(there)
+        x = self.evaluate_at(here)[0]
+        ahead = fitted((there - here) * self.stage.reach, len(here), self.points.n_local)
+        self.points.update_ghosts(ahead)
+        free = all(term.lets_pass(x, ahead, self.active.frozen[term]) for term in self.active.limiting)
+        free &= self.discretisation.largest_step(x, ahead) == 1.0
+        return not self.points.comm.allreduce(int(not free), MPI.MAX)
+
+    def may_end(self, v: Array) -> bool:
+        """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
+        collective.
+        """
+        if self.stage.after == self.dt and self.integrator.lagged_loads is False:
+            return True
+        n = self.points.n_owned
+        end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
+        if self.integrator.lagged_loads:  # one linear solve has found it
+            v = self.velocity_of_staying()
+        from_x = self.evaluate_at(v)[0][:n]
+        return self.largest_step(v, (end - from_x) / self.stage.reach) == 1.0
 
     # -- what Newton asks for ----------------------------------------------------------------------
 
     def _follow(self, x: Array) -> None:
         """Let stencils be those at positions x (n_owned or more, 3), and make room for their ghosts."""
-        if not self.discretisation.changes or not self.discretisation.follow(x[: self.points.n_owned]):
+        if not self.discretisation.changes or not self.discretisation.follow(x):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local

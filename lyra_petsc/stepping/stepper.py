@@ -52,6 +52,9 @@ FIRST_OF_ALL = 1e-3
 """First Δt of an adaptive run over its length; the estimate corrects it at once."""
 
 
+MEETS = "something would pass through the sheet"
+
+
 class Stepper:
     """Each step's stage by TSBEULER or TSTHETA on the stage equations.
 
@@ -238,8 +241,13 @@ class Stepper:
         number = self.ts.getStepNumber()
         before = equations.x[: self._shape[0]].copy() if equations.edges_lag else None
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
-        velocity, words = self._solve(t0)
         stuck: Stuck | None = None
+        if equations.discretisation.guards and not equations.may_move():
+            self._trace.begin()
+            return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=self._trace.stuck())
+        velocity, words = self._solve(t0)
+        if velocity is not None and equations.discretisation.guards and not equations.may_end(velocity):
+            velocity, words = None, MEETS
         newton, linear = self.snes.getIterationNumber(), self._newton.linear_iterations
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.left, outcome.at_roundoff

@@ -114,6 +114,15 @@ REGISTRY: list[Registration] = [
         edge_state=("frame",),
         coarse="bending",
     ),
+    Registration(
+        "contact",
+        lambda scene, shells: scene.contact is not None,
+        Role.ELASTIC,
+        "contact_energy",
+        {"contacts": "sum", "smallest_gap": "min"},
+        neighbours=True,
+        limits_step=True,
+    ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(
         "spring",

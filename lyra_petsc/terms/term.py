@@ -146,6 +146,15 @@ class Elastic(Term):
     search_distance: float = 0.0
     """Distance [m] within which ``neighbours`` looks for elements; 0 where stencils never change."""
 
+    stale: bool = False
+    """Whether ``neighbours`` has others to name, though no point has moved far."""
+
+    unseen: float = np.inf
+    """Distance [m] by which points that ``neighbours`` did not name may come nearer to each other at most."""
+
+    surface: NDArray[np.int32] | None = None
+    """Triangles (F, 3), in local rows, among which ``neighbours`` looks; None where points do."""
+
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
 
@@ -194,17 +203,22 @@ class Elastic(Term):
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
-    def neighbours(self, x: Array, numbers: Ints) -> NDArray[np.int64]:
+    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
 
-        ``numbers`` (N,) are the points' global numbers. Ranks that see the same points must name them in the
-        same order within an element; the owner of the first counts it.
+        And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
+        the points' global numbers, ``triangles`` (F, 3) those of ``surface`` that are near. Ranks that see
+        the same points must name them in the same order within an element; the owner of the first counts it.
         """
         raise NotImplementedError
 
     def largest_step(self, x: Array, way: Array, frozen: Any) -> float:
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
+
+    def lets_pass(self, x: Array, way: Array, frozen: Any) -> bool:
+        """Whether points may go the way (n_local, 3) [m] from x while targets go where ``frozen`` has them."""
+        return True
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""

@@ -204,7 +204,7 @@ def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: py
     searches = []
     term, search = term_of(simulation), Repulsion.neighbours
     monkeypatch.setattr(
-        term, "neighbours", lambda x, numbers: (searches.append(1), search(term, x, numbers))[1]
+        term, "neighbours", lambda *given: (searches.append(1), search(term, *given))[1]
     )
     simulation.step()
     searches.clear()

@@ -1,0 +1,332 @@
+"""Contact of sheets with themselves, with each other and with obstacles: a barrier on the distances of simplices.
+
+Pairs of a vertex and a triangle and of two edges that have no vertex in common and are nearer than ``gap``
+(beside ``thickness`` and the radius of an obstacle) repel each other (``contact_pairs``). The barrier's
+stiffness k is such that halfway through the gap b″ is the sheet's membrane stiffness, that is about the
+diagonal of its Jacobian.
+
+Nothing passes through: no Newton iteration goes farther than continuous collision detection allows, and none
+moves points so far that pairs might meet which the last search did not see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.measures import edge_lengths
+from lyra_petsc.mesh.near import overlapping
+from lyra_petsc.mesh.obstacles import Body, Container
+from lyra_petsc.mesh.topology import unique_edges
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms import contact_pairs
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, UpcomingStep
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+KEPT = 0.2
+"""Part of its distance that a pair keeps in a Newton iteration."""
+
+PARALLEL = 1e-3
+"""Squared sine of the angle of two of the shortest edges below which they count as nearly parallel."""
+
+HALFWAY = 6.386
+"""b″ / k in the middle of the gap: 2 ln 2 + 5."""
+
+
+class Barrier(NamedTuple):
+    """Numbers of the barrier, the same on all ranks.
+
+    Attributes
+    ----------
+    gap, thickness : float [m]
+    stiffness : float [N/m]
+        k.
+    parallel : float [m⁴]
+        |u × v|² of edges below which their energy fades.
+    """
+
+    gap: float
+    thickness: float
+    stiffness: float
+    parallel: float
+
+
+class Places(NamedTuple):
+    """Where the obstacles' points stand, and normals of planes after them.
+
+    Attributes
+    ----------
+    before, now : (m, 3)
+        At the start of a step, and at its stage.
+    """
+
+    before: Array
+    now: Array
+
+
+class Obstacles:
+    """The points of all obstacles in one array, and the simplices that they make.
+
+    Attributes
+    ----------
+    triangles, edges, points, planes, segments : (n, 4)
+        Numbers of the points, the last column that of the obstacle. Planes are a point and a normal.
+    radius : (obstacles + 1,)
+        Offset [m] of each; the last, 0, is that of sheets.
+    """
+
+    def __init__(self, obstacles: Sequence[Body | Container]) -> None:
+        self.each = list(obstacles)
+        parts: dict[str, list[Ints]] = {kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")}
+        radius, first = np.zeros(len(obstacles) + 1), 0
+        for number, obstacle in enumerate(obstacles):
+            n = len(obstacle.points)
+
+            def rows(of: Ints, number: int = number, first: int = first) -> Ints:
+                filled = np.concatenate([of, np.repeat(of[:, :1], 3 - of.shape[1], axis=1)], axis=1)
+                return np.column_stack([filled + first, np.full(len(of), number)])
+
+            if isinstance(obstacle, Body):
+                radius[number] = obstacle.radius
+                parts["triangles"].append(rows(obstacle.triangles))
+                parts["edges"].append(rows(obstacle.edges))
+                parts["points"].append(rows(np.arange(n)[:, None]))
+            elif obstacle.kind == "planes":
+                parts["planes"].append(rows(np.column_stack([np.arange(n), np.arange(n, 2 * n)])))
+                n *= 2
+            else:
+                radius[number] = -obstacle.radius
+                parts["segments"].append(rows(np.array([[0, n - 1]])))
+            first += n
+        empty = np.empty((0, 4), dtype=np.int64)
+        self.triangles, self.edges, self.points, self.planes, self.segments = (
+            np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
+        )
+        self.radius, self.n_points = radius, first
+
+    def at(self, time: float) -> Array:
+        """Points and normals (m, 3) at a time [s]."""
+        rows = [np.empty((0, 3))]
+        for obstacle in self.each:
+            rows.append(obstacle.positions(time))
+            if isinstance(obstacle, Container) and obstacle.kind == "planes":
+                rows.append(obstacle.normals_at(time))
+        return np.concatenate(rows)
+
+
+class Contact(Elastic):
+    """The barrier between all near pairs.
+
+    Parameters
+    ----------
+    surface : (F, 3)
+        Triangles of this rank, in local rows.
+    """
+
+    def __init__(self, surface: NDArray[np.int32]) -> None:
+        empty = {"what": np.empty((0, 6)), "number": np.empty((0, 4))}
+        self.obstacles, self.itself = Obstacles([]), True
+        self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
+        self.surface = np.ascontiguousarray(surface, dtype=np.int32)
+        self._places = np.empty((0, 3))
+
+    def set_up(self, barrier: Barrier, obstacles: Sequence[Body | Container], *, itself: bool) -> None:
+        """Take what all ranks know alike; before anything else is asked.
+
+        ``itself`` says whether sheets meet sheets.
+        """
+        self.barrier, self.obstacles, self.itself = barrier, Obstacles(obstacles), itself
+        self.skin = barrier.gap
+        self.search_distance = barrier.thickness + barrier.gap + self.skin
+        self.unseen = barrier.gap + self.skin
+        self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 2)
+
+    def take(self, elements: Elements) -> None:
+        super().take(elements)
+        what = elements.data["what"].astype(np.int64)
+        self.number = elements.data["number"].astype(np.int64)
+        self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
+        self.points = np.where(what[:, 2:] < 0, what[:, 2:], self.stencil)
+        self._offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+
+    # -- obstacles ---------------------------------------------------------------------------------
+
+    def freeze(self, step: UpcomingStep) -> Places:
+        places = Places(self.obstacles.at(step.start), self.obstacles.at(step.at))
+        self._swept = np.stack(places)
+        return places
+
+    @property
+    def stale(self) -> bool:  # type: ignore[override]
+        moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
+        return bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
+
+    # -- search ------------------------------------------------------------------------------------
+
+    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+        self._places = self._swept
+        vertices, edges = np.unique(triangles), unique_edges(triangles)
+        edges = np.where((numbers[edges[:, 0]] < numbers[edges[:, 1]])[:, None], edges, edges[:, ::-1])
+        found = [np.empty((0, 6), dtype=np.int64)]
+        if self.itself:
+            found += self._among_sheets(x, numbers, vertices, edges, triangles)
+        found += self._at_obstacles(x, vertices, edges, triangles)
+        every = np.concatenate(found)
+        kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:]
+        sheet = points >= 0
+        first = points[np.arange(len(points)), sheet.argmax(axis=1)]
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points)])
+        return np.where(sheet, points, first[:, None]), what
+
+    def _among_sheets(
+        self, x: Array, numbers: Ints, vertices: Ints, edges: Ints, triangles: Ints
+    ) -> list[Ints]:
+        distance = self.search_distance
+        low, high = x[triangles].min(axis=1), x[triangles].max(axis=1)
+        near = overlapping(x[vertices] - distance, x[vertices] + distance, (low, high))
+        vertex, corners = vertices[near[:, 0]], triangles[near[:, 1]]
+        apart = (corners != vertex[:, None]).all(axis=1)
+        to_triangles = np.column_stack([vertex, corners])[apart]
+        ends = x[edges]
+        low, high = ends.min(axis=1) - 0.5 * distance, ends.max(axis=1) + 0.5 * distance
+        one, other = edges[overlapping(low, high)].transpose(1, 0, 2)
+        apart = (one[:, :, None] != other[:, None, :]).all(axis=(1, 2))
+        one, other = one[apart], other[apart]
+        first = (numbers[one[:, 0]] < numbers[other[:, 0]])[:, None]
+        to_edges = np.concatenate([np.where(first, one, other), np.where(first, other, one)], axis=1)
+        return [
+            self._nearer(x, VERTEX_TRIANGLE, np.full(len(to_triangles), -1), to_triangles),
+            self._nearer(x, EDGE_EDGE, np.full(len(to_edges), -1), to_edges),
+        ]
+
+    def _nearer(self, x: Array, kind: int, obstacle: Ints, points: Ints) -> Ints:
+        """Rows of those pairs that are within the search distance."""
+        points, found = points.astype(np.int64), np.empty(len(points))
+        kinds = np.full(len(points), kind)
+        contact_pairs.distances(x, self._places[1], kinds, points, found)
+        met = found - self.obstacles.radius[obstacle] < self.search_distance
+        return np.column_stack([kinds, obstacle, points])[met]
+
+    def _at_obstacles(self, x: Array, vertices: Ints, edges: Ints, triangles: Ints) -> list[Ints]:
+        """Pairs with obstacles, wherever on their way in the step these are near."""
+        of, found = self.obstacles, []
+        still = np.array_equal(self._places[0], self._places[1])
+
+        def near(kind: int, sheet: Ints, others: Ints, size: int, *, sheet_first: bool) -> None:
+            if not len(others) or not len(sheet):
+                return
+            places = self._places[:, others[:, :size]]
+            reach = (self.search_distance + of.radius[others[:, 3]])[:, None]
+            low, high = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
+            pairs = overlapping(x[sheet].min(axis=1), x[sheet].max(axis=1), (low, high))
+            mine, theirs = sheet[pairs[:, 0]], ~others[pairs[:, 1], :size]
+            points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
+            obstacle = others[pairs[:, 1], 3]
+            if still:
+                found.append(self._nearer(x, kind, obstacle, points))
+            else:
+                found.append(np.column_stack([np.full(len(points), kind), obstacle, points]))
+
+        near(VERTEX_TRIANGLE, vertices[:, None], of.triangles, 3, sheet_first=True)
+        near(VERTEX_TRIANGLE, triangles, of.points, 1, sheet_first=False)
+        near(EDGE_EDGE, edges, of.edges, 2, sheet_first=True)
+        for kind, others in ((VERTEX_PLANE, of.planes), (VERTEX_INSIDE, of.segments)):
+            for one in others:
+                points = np.column_stack([vertices, np.tile(~one[:3], (len(vertices), 1))])
+                obstacle = np.full(len(points), one[3])
+                rows = np.column_stack([np.full(len(points), kind), obstacle, points])
+                close = np.zeros(len(points), dtype=bool)
+                for places in self._places:
+                    distance = np.empty(len(points))
+                    contact_pairs.distances(x, places, rows[:, 0], rows[:, 2:], distance)
+                    close |= distance - of.radius[obstacle] < self.search_distance
+                found.append(rows[close])
+        return found
+
+    # -- energy ------------------------------------------------------------------------------------
+
+    @property
+    def _constants(self) -> tuple[Array, float, float, float]:
+        return self._offset, self.barrier.gap, self.barrier.stiffness, self.barrier.parallel
+
+    def energies(self, x: Array, frozen: Places) -> Array:
+        out = np.empty(self.n_owned)
+        contact_pairs.energies(x, frozen.now, self.kind, self.points, *self._constants, out)
+        return out
+
+    def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
+        pull = np.zeros_like(frozen.now)
+        contact_pairs.add_gradient(x, frozen.now, self.kind, self.points, *self._constants, out, pull)
+
+    def hessians(self, x: Array, frozen: Places, lo: int, hi: int, blend: float, out: Array) -> None:
+        pairs = self.kind, self.points, *self._constants
+        contact_pairs.hessians(x, frozen.now, *pairs, lo, blend, out)
+
+    def force_scale(self, size: float) -> Array:
+        return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
+
+    def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
+        pairs = self.kind, self.points, self._offset
+        still = np.zeros_like(frozen.now)
+        return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
+
+    def lets_pass(self, x: Array, way: Array, frozen: Places) -> bool:
+        pairs = self.kind, self.points, self._offset
+        moved = frozen.now - frozen.before
+        return bool(contact_pairs.free_way(x, frozen.before, way, moved, *pairs, KEPT, 1.0) == 1.0)
+
+    def distances(self, x: Array, others: Array) -> Array:
+        """Distance less thickness and radius [m] of all pairs, (E,)."""
+        out = np.empty(self.n_elements)
+        contact_pairs.distances(x, others, self.kind, self.points, out)
+        found: Array = out - self._offset
+        return found
+
+    def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
+        left = self.distances(x, frozen.now)[: self.n_owned]
+        count = float((left < self.barrier.gap).sum())
+        return {"contacts": count, "smallest_gap": float(left.min(initial=np.inf))}
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles of the sheets."""
+    return Elements(rest.mesh.triangles)
+
+
+def barrier(rest: RestShape) -> Barrier:
+    """The numbers of a scene's barrier (rank 0).
+
+    Raises
+    ------
+    InputError
+        A gap that neighbours in the mesh would feel.
+    """
+    scene = rest.scene
+    assert scene.contact is not None
+    length, thickness = edge_lengths(rest.mesh), scene.contact.thickness
+    shortest = float(length.min())
+    gap = scene.contact.gap or min(0.25 * float(length.mean()), 0.5 * shortest)
+    if gap + thickness >= shortest:
+        raise InputError(
+            f"gap + thickness = {gap + thickness:.3g} m is not below the shortest edge, {shortest:.3g} m: "
+            "neighbours in the mesh would touch; give smaller ones, or a mesh without such short edges",
+            file=scene.source,
+            key="contact",
+        )
+    stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells) / HALFWAY
+    return Barrier(gap, thickness, stiffness, PARALLEL * shortest**4)
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> Contact:
+    """The term on one rank; `Contact.set_up` must follow."""
+    return Contact(elements.stencil)

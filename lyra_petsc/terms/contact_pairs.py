@@ -1,0 +1,431 @@
+"""Distances of pairs of simplices and the barrier on them: pure functions on arrays.
+
+A pair is four points: a vertex p0 and a triangle p1 p2 p3, or two edges p0 p1 and p2 p3. The vector between
+the nearest points of both is g = Σ β_i p_i. Which of the barycentric coordinates are free there, none to two,
+their coefficients γ_k = ∂β/∂t_k tell. With e_k = Σ γ_ki p_i and A_kl = e_k · e_l the derivatives of s = ½ |g|²
+are, as s is least over the t_k::
+
+    ∂s/∂p_i = β_i g
+    ∂²s/∂p_i∂p_j = β_i β_j I − Σ_kl A⁻¹_kl (β_i e_k + γ_ki g)(β_j e_l + γ_lj g)ᵀ
+
+Barrier, of δ = |g| − offset (Li, Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang & Kaufman, Incremental
+potential contact, ACM Trans. Graph. 39 (2020) 49)::
+
+    b(δ) = −k (δ − gap)² ln(δ / gap)  for 0 < δ < gap, 0 beyond, infinite at δ ≤ 0
+
+The nearest points of parallel edges are not unique. Energies of pairs of edges u and v have the factor
+m = c (2 − c), c = |u × v|² / parallel up to 1, with which forces stay continuous; where they lie side by side
+pairs of vertices and triangles are as near (same source, section 5.2).
+
+Points of obstacles have numbers below 0: ~number among the obstacles' points.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.hinge import cross, dot, minus
+
+VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
+"""Kinds of pairs. A plane is a point p1 and a unit normal p2; from a segment p1 p2 a vertex inside keeps no more
+than a radius, and their distance is minus |g|. p3 counts for nothing there."""
+
+CLOSE = 0.1
+"""Part of the way to the least distance that continuous collision detection may leave."""
+
+PARALLEL = 1e-12
+"""Squared sine of the angle of two edges below which they count as parallel."""
+
+
+@kernel(inline="always")
+def _at(x, others, number):  # type: ignore[no-untyped-def]
+    """A vertex of the sheets, or a point of an obstacle."""
+    if number >= 0:
+        i = Index(number)
+        return x[i, 0], x[i, 1], x[i, 2]
+    i = Index(~number)
+    return others[i, 0], others[i, 1], others[i, 2]
+
+
+@kernel(inline="always")
+def _clear(beta, gamma):  # type: ignore[no-untyped-def]
+    for i in range(4):
+        beta[i] = 0.0
+        gamma[0, i] = gamma[1, i] = 0.0
+
+
+@kernel()
+def _to_segment(p, a, b, at, first, second, beta, gamma):  # type: ignore[no-untyped-def]
+    """Nearest point of segment a b to p, whose weights stand at ``first`` and ``second``; free coordinates."""
+    way = minus(b, a)
+    square = dot(way, way)
+    t = dot(minus(p, a), way) / square if square > 0.0 else 0.0
+    beta[at] = 1.0
+    if t <= 0.0:
+        beta[first] = -1.0
+        return 0
+    if t >= 1.0:
+        beta[second] = -1.0
+        return 0
+    beta[first], beta[second] = t - 1.0, -t
+    gamma[0, first], gamma[0, second] = 1.0, -1.0
+    return 1
+
+
+@kernel()
+def _vertex_triangle(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
+    """β (4,) and γ (2, 4) of a vertex and a triangle; how many coordinates are free.
+
+    Regions as in Ericson, Real-time collision detection (2005), 5.1.5.
+    """
+    _clear(beta, gamma)
+    ab, ac, ap = minus(b, a), minus(c, a), minus(p, a)
+    d1, d2 = dot(ab, ap), dot(ac, ap)
+    if d1 <= 0.0 and d2 <= 0.0:
+        beta[0], beta[1] = 1.0, -1.0
+        return 0
+    bp = minus(p, b)
+    d3, d4 = dot(ab, bp), dot(ac, bp)
+    if d3 >= 0.0 and d4 <= d3:
+        beta[0], beta[2] = 1.0, -1.0
+        return 0
+    cp = minus(p, c)
+    d5, d6 = dot(ab, cp), dot(ac, cp)
+    if d6 >= 0.0 and d5 <= d6:
+        beta[0], beta[3] = 1.0, -1.0
+        return 0
+    if d1 * d4 - d3 * d2 <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
+    if d5 * d2 - d1 * d6 <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        return _to_segment(p, a, c, 0, 1, 3, beta, gamma)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        return _to_segment(p, b, c, 0, 2, 3, beta, gamma)
+    total = va + vb + vc
+    if not total > 0.0:  # no area
+        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
+    v, w = vb / total, vc / total
+    beta[0], beta[1], beta[2], beta[3] = 1.0, v + w - 1.0, -v, -w
+    gamma[0, 1], gamma[0, 2] = 1.0, -1.0
+    gamma[1, 1], gamma[1, 3] = 1.0, -1.0
+    return 2
+
+
+@kernel()
+def _edge_edge(a, b, c, d, beta, gamma):  # type: ignore[no-untyped-def]
+    """The same of edges a b and c d."""
+    _clear(beta, gamma)
+    u, v, w = minus(b, a), minus(d, c), minus(a, c)
+    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
+    det = uu * vv - uv * uv
+    if det > PARALLEL * uu * vv:
+        s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
+        if 0.0 < s < 1.0 and 0.0 < t < 1.0:
+            beta[0], beta[1], beta[2], beta[3] = 1.0 - s, s, t - 1.0, -t
+            gamma[0, 0], gamma[0, 1] = -1.0, 1.0
+            gamma[1, 2], gamma[1, 3] = 1.0, -1.0
+            return 2
+    # else an end of one of them is nearest
+    best, found = math.inf, 0
+    for end in range(4):
+        g, _ = _end_distance(end, a, b, c, d, beta, gamma)
+        if g < best:
+            best, found = g, end
+    _, free = _end_distance(found, a, b, c, d, beta, gamma)
+    return free
+
+
+@kernel()
+def _end_distance(end, a, b, c, d, beta, gamma):  # type: ignore[no-untyped-def]
+    """Squared distance of an end of one edge from the other; free coordinates."""
+    _clear(beta, gamma)
+    if end == 0:
+        free = _to_segment(a, c, d, 0, 2, 3, beta, gamma)
+    elif end == 1:
+        free = _to_segment(b, c, d, 1, 2, 3, beta, gamma)
+    elif end == 2:
+        free = _to_segment(c, a, b, 2, 0, 1, beta, gamma)
+    else:
+        free = _to_segment(d, a, b, 3, 0, 1, beta, gamma)
+    square = 0.0
+    for k in range(3):
+        g = beta[0] * a[k] + beta[1] * b[k] + beta[2] * c[k] + beta[3] * d[k]
+        square += g * g
+    return square, free
+
+
+@kernel()
+def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
+    """Distance of points p (4, 3), their β (4,) and γ (2, 4); how many coordinates are free.
+
+    It is |g|, or −|g| inside. Of a plane, whose distance is negative behind it, p1 to p3 become a triangle around the nearest point.
+    """
+    behind = False
+    if kind == VERTEX_PLANE:
+        behind = _around_foot(p)
+    a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
+    c, d = (p[2, 0], p[2, 1], p[2, 2]), (p[3, 0], p[3, 1], p[3, 2])
+    if kind == EDGE_EDGE:
+        free = _edge_edge(a, b, c, d, beta, gamma)
+    elif kind == VERTEX_INSIDE:
+        _clear(beta, gamma)
+        free = _to_segment(a, b, c, 0, 1, 2, beta, gamma)
+        behind = True
+    else:
+        free = _vertex_triangle(a, b, c, d, beta, gamma)
+    square = 0.0
+    for k in range(3):
+        g = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
+        square += g * g
+    return -math.sqrt(square) if behind else math.sqrt(square), free
+
+
+@kernel()
+def _around_foot(p):  # type: ignore[no-untyped-def]
+    """Let p1 p2 p3 be a triangle in the plane of point p1 and normal p2 around the foot of p0; if it lies behind."""
+    height, axis = 0.0, 0
+    for k in range(3):
+        height += p[2, k] * (p[0, k] - p[1, k])
+        if abs(p[2, k]) < abs(p[2, axis]):
+            axis = k
+    n = p[2, 0], p[2, 1], p[2, 2]
+    one = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0
+    u = cross(n, one)
+    v = cross(n, u)
+    for k in range(3):
+        foot = p[0, k] - height * n[k]
+        p[1, k], p[2, k], p[3, k] = foot + u[k], foot + v[k], foot - u[k] - v[k]
+    return height < 0.0
+
+
+@kernel(inline="always")
+def _load(x, others, points, e, p):  # type: ignore[no-untyped-def]
+    for i in range(4):
+        p[i, 0], p[i, 1], p[i, 2] = _at(x, others, points[e, i])
+
+
+@kernel(inline="always")
+def barrier(delta, gap):  # type: ignore[no-untyped-def]
+    """b / k of 0 < δ < gap and its first two derivatives."""
+    less, log = delta - gap, math.log(delta / gap)
+    ratio = less / delta
+    return -less * less * log, -less * (2.0 * log + ratio), -2.0 * log - 4.0 * ratio + ratio * ratio
+
+
+@kernel()
+def _mollifier(p, parallel, slope):  # type: ignore[no-untyped-def]
+    """m of edges p0 p1 and p2 p3, m′, m″ with respect to |u × v|², whose gradient goes to slope (12,)."""
+    uu = uv = vv = 0.0
+    for k in range(3):
+        u, v = p[1, k] - p[0, k], p[3, k] - p[2, k]
+        uu, uv, vv = uu + u * u, uv + u * v, vv + v * v
+    c = (uu * vv - uv * uv) / parallel
+    if c >= 1.0:
+        return 1.0, 0.0, 0.0
+    for k in range(3):
+        u, v = p[1, k] - p[0, k], p[3, k] - p[2, k]
+        to_u, to_v = 2.0 * (u * vv - v * uv), 2.0 * (v * uu - u * uv)
+        slope[k], slope[3 + k], slope[6 + k], slope[9 + k] = -to_u, to_u, -to_v, to_v
+    return c * (2.0 - c), 2.0 * (1.0 - c) / parallel, -2.0 / (parallel * parallel)
+
+
+@kernel()
+def distances(x, others, kind, points, out):  # type: ignore[no-untyped-def]
+    """|g| [m] of each pair, (E,)."""
+    p, beta, gamma = np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    for e in range(len(out)):
+        _load(x, others, points, e, p)
+        out[e], _ = nearest(kind[e], p, beta, gamma)
+
+
+@kernel()
+def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  # type: ignore[no-untyped-def]
+    """Energy [J] of the first len(out) pairs."""
+    p, beta, gamma, slope = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
+    for e in range(len(out)):
+        _load(x, others, points, e, p)
+        d, _ = nearest(kind[e], p, beta, gamma)
+        delta = d - offset[e]
+        if delta >= gap:
+            out[e] = 0.0
+        elif delta > 0.0:
+            out[e] = stiffness * barrier(delta, gap)[0]
+            if kind[e] == EDGE_EDGE:
+                out[e] *= _mollifier(p, parallel, slope)[0]
+        else:
+            out[e] = np.inf
+
+
+@kernel()
+def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, out, pull):  # type: ignore[no-untyped-def]
+    """Add the gradient [N] to rows of out (n_local, 3), that of obstacles' points to pull (m, 3)."""
+    p, beta, gamma, more = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
+    for e in range(len(kind)):
+        _load(x, others, points, e, p)
+        d, _ = nearest(kind[e], p, beta, gamma)
+        delta = d - offset[e]
+        if delta >= gap:
+            continue
+        slope = turn = 0.0
+        if delta > 0.0:
+            energy, slope, _ = barrier(delta, gap)
+            slope *= stiffness / d
+            if kind[e] == EDGE_EDGE:
+                weight, first, _ = _mollifier(p, parallel, more)
+                slope, turn = weight * slope, stiffness * energy * first
+        else:
+            slope = np.nan
+        for k in range(3):
+            g = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
+            for i in range(4):
+                force = slope * beta[i] * g
+                if turn != 0.0:
+                    force += turn * more[3 * i + k]
+                if points[e, i] >= 0:
+                    out[Index(points[e, i]), k] += force
+                else:
+                    pull[Index(~points[e, i]), k] += force
+
+
+@kernel()
+def pair_hessian(p, kind, offset, gap, stiffness, parallel, blend, beta, gamma, h):  # type: ignore[no-untyped-def]
+    """The Hessian of a pair at p (4, 3) into h (12, 12); whether it is not 0.
+
+    ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only, which is positive semidefinite.
+    """
+    d, free = nearest(kind, p, beta, gamma)
+    delta = d - offset
+    if delta >= gap or delta <= 0.0:
+        return False
+    energy, force, second = barrier(delta, gap)
+    energy, force = (1.0 - blend) * stiffness * energy, stiffness * force / d
+    first, second = (1.0 - blend) * force, stiffness * second / (d * d)
+    g, e = np.empty(3), np.zeros((2, 3))
+    for k in range(3):
+        g[k] = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
+        for f in range(free):
+            for i in range(4):
+                e[f, k] += gamma[f, i] * p[i, k]
+    # A⁻¹
+    a00 = a01 = a11 = 0.0
+    if free == 1:
+        a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
+    elif free == 2:
+        u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
+        v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+        w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
+        det = u * w - v * v
+        a00, a01, a11 = w / det, -v / det, u / det
+    across = first / (d * d)
+    for i in range(4):
+        for j in range(4):
+            for k in range(3):
+                c0 = beta[i] * e[0, k] + gamma[0, i] * g[k]
+                c1 = beta[i] * e[1, k] + gamma[1, i] * g[k]
+                for m in range(3):
+                    r0 = beta[j] * e[0, m] + gamma[0, j] * g[m]
+                    r1 = beta[j] * e[1, m] + gamma[1, j] * g[m]
+                    both = beta[i] * beta[j] * g[k] * g[m]
+                    value = (second - across) * both
+                    if k == m:
+                        value += first * beta[i] * beta[j]
+                    value -= first * (a00 * c0 * r0 + a01 * (c0 * r1 + c1 * r0) + a11 * c1 * r1)
+                    h[3 * i + k, 3 * j + m] = value
+    if kind == EDGE_EDGE:
+        slope = np.zeros(12)
+        weight, once, twice = _mollifier(p, parallel, slope)
+        if weight < 1.0:
+            h *= weight
+            for i in range(12):
+                pull = (1.0 - blend) * once * force * beta[i // 3] * g[i % 3]
+                for j in range(12):
+                    push = (1.0 - blend) * once * force * beta[j // 3] * g[j % 3]
+                    h[i, j] += pull * slope[j] + slope[i] * push + energy * twice * slope[i] * slope[j]
+            _add_turn(p, energy * once, h)
+    return True
+
+
+@kernel()
+def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
+    """Add factor times the Hessian of |u × v|² to h (12, 12)."""
+    uu = uv = vv = 0.0
+    u, v = np.empty(3), np.empty(3)
+    for k in range(3):
+        u[k], v[k] = p[1, k] - p[0, k], p[3, k] - p[2, k]
+        uu, uv, vv = uu + u[k] * u[k], uv + u[k] * v[k], vv + v[k] * v[k]
+    for k in range(3):
+        for m in range(3):
+            same = 1.0 if k == m else 0.0
+            one = 2.0 * factor * (vv * same - v[k] * v[m])
+            other = 2.0 * factor * (uu * same - u[k] * u[m])
+            mixed = 2.0 * factor * (2.0 * u[k] * v[m] - v[k] * u[m] - uv * same)
+            for i in range(2):
+                for j in range(2):
+                    sign = 1.0 if i == j else -1.0
+                    h[3 * i + k, 3 * j + m] += sign * one
+                    h[6 + 3 * i + k, 6 + 3 * j + m] += sign * other
+                    h[3 * i + k, 6 + 3 * j + m] += sign * mixed
+                    h[6 + 3 * j + m, 3 * i + k] += sign * mixed
+
+
+@kernel()
+def hessians(x, others, kind, points, offset, gap, stiffness, parallel, lo, blend, out):  # type: ignore[no-untyped-def]
+    """Hessians [N/m] of pairs lo, lo + 1, … into out (n, 4, 4, 3, 3); 0 for points of obstacles."""
+    p, beta, gamma, h = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.empty((12, 12))
+    for n in range(len(out)):
+        e = lo + n
+        _load(x, others, points, e, p)
+        some = pair_hessian(p, kind[e], offset[e], gap, stiffness, parallel, blend, beta, gamma, h)
+        for i in range(4):
+            for j in range(4):
+                here = some and points[e, i] >= 0 and points[e, j] >= 0
+                for k in range(3):
+                    for m in range(3):
+                        out[n, i, j, k, m] = h[3 * i + k, 3 * j + m] if here else 0.0
+
+
+@kernel()
+def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+    """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
+
+    Each keeps at least the part ``keep`` of its distance less the offset. Additive continuous collision
+    detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
+    170, algorithm 1.
+    """
+    p, w = np.empty((4, 3)), np.empty((4, 3))
+    beta, gamma = np.empty(4), np.empty((2, 4))
+    for e in range(len(kind)):
+        _load(x, others, points, e, p)
+        _load(way, others_way, points, e, w)
+        longest = np.zeros(4)
+        for k in range(3):
+            mean = 0.25 * (w[0, k] + w[1, k] + w[2, k] + w[3, k])
+            for i in range(4):
+                w[i, k] -= mean
+                longest[i] += w[i, k] * w[i, k]
+        if kind[e] == EDGE_EDGE:
+            speed = math.sqrt(max(longest[0], longest[1])) + math.sqrt(max(longest[2], longest[3]))
+        else:
+            speed = math.sqrt(longest[0]) + math.sqrt(max(longest[1], longest[2], longest[3]))
+        d, _ = nearest(kind[e], p, beta, gamma)
+        left = d - offset[e]
+        if left - most * speed >= keep * left or speed == 0.0:
+            continue
+        least, enough, t = keep * left, (1.0 - keep) * CLOSE * left, 0.0
+        # each advance is shorter than what is left of the way to the least distance
+        while left - least > enough:
+            t += (left - least) / speed
+            if t >= most:
+                break
+            _load(x, others, points, e, p)
+            for i in range(4):
+                for k in range(3):
+                    p[i, k] += t * w[i, k]
+            d, _ = nearest(kind[e], p, beta, gamma)
+            left = d - offset[e]
+        most = min(most, t)
+    return most
