@@ -201,7 +201,11 @@ class Discretisation:
         # one order of the elements on any search, so that the same elements are the same stencil
         order = np.lexsort((*what.T[::-1], *stencil.T[::-1], ~counted))
         local = layout.local(stencil[order].ravel()).reshape(stencil.shape).astype(np.int32)
-        return Elements(local, {"what": what[order].astype(np.float64), "number": stencil[order].astype(np.float64)}, int(counted.sum()))
+        return Elements(
+            local,
+            {"what": what[order].astype(np.float64), "number": stencil[order].astype(np.float64)},
+            int(counted.sum()),
+        )
 
     def renew_pattern(self) -> bool:
         """Let ``rows`` have the blocks of the present stencils; whether they are others than before."""

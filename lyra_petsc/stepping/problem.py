@@ -263,7 +263,9 @@ def _barrier(rest: RestShape) -> Barrier | None:
     return barrier(rest)
 
 
-def _set_up_contact(scene: Scene, outline: Outline, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None) -> None:
+def _set_up_contact(
+    scene: Scene, outline: Outline, terms: Mapping[str, Term], layout: Layout, mesh: Mesh | None
+) -> None:
     """Tell contact of the obstacles; collective."""
     if outline.barrier is None or scene.contact is None:
         return

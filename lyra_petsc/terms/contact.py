@@ -1,4 +1,4 @@
-"""Contact of sheets with themselves, with each other and with obstacles: a barrier on the distances of simplices.
+"""Contact of sheets with themselves, each other and obstacles: a barrier on the distances of simplices.
 
 Pairs of a vertex and a triangle and of two edges that have no vertex in common and are nearer than ``gap``
 (beside ``thickness`` and the radius of an obstacle) repel each other (``contact_pairs``). The barrier's
@@ -86,7 +86,9 @@ class Obstacles:
 
     def __init__(self, obstacles: Sequence[Body | Container]) -> None:
         self.each = list(obstacles)
-        parts: dict[str, list[Ints]] = {kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")}
+        parts: dict[str, list[Ints]] = {
+            kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
+        }
         radius, first = np.zeros(len(obstacles) + 1), 0
         for number, obstacle in enumerate(obstacles):
             n = len(obstacle.points)
@@ -329,4 +331,4 @@ def barrier(rest: RestShape) -> Barrier:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Contact:
     """The term on one rank; `Contact.set_up` must follow."""
-    return Contact(elements.stencil)
+    return Contact(elements.stencil.astype(np.int32))

@@ -2,8 +2,8 @@
 
 A pair is four points: a vertex p0 and a triangle p1 p2 p3, or two edges p0 p1 and p2 p3. The vector between
 the nearest points of both is g = Σ β_i p_i. Which of the barycentric coordinates are free there, none to two,
-their coefficients γ_k = ∂β/∂t_k tell. With e_k = Σ γ_ki p_i and A_kl = e_k · e_l the derivatives of s = ½ |g|²
-are, as s is least over the t_k::
+their coefficients γ_k = ∂β/∂t_k tell. With e_k = Σ γ_ki p_i and A_kl = e_k · e_l the derivatives of
+s = ½ |g|² are, as s is least over the t_k::
 
     ∂s/∂p_i = β_i g
     ∂²s/∂p_i∂p_j = β_i β_j I − Σ_kl A⁻¹_kl (β_i e_k + γ_ki g)(β_j e_l + γ_lj g)ᵀ
@@ -31,8 +31,8 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms.hinge import cross, dot, minus
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
-"""Kinds of pairs. A plane is a point p1 and a unit normal p2; from a segment p1 p2 a vertex inside keeps no more
-than a radius, and their distance is minus |g|. p3 counts for nothing there."""
+"""Kinds of pairs. A plane is a point p1 and a unit normal p2; a vertex inside keeps no more than a radius
+from a segment p1 p2, and their distance is minus |g|. p3 counts for nothing there."""
 
 CLOSE = 0.1
 """Part of the way to the least distance that continuous collision detection may leave."""
@@ -60,7 +60,7 @@ def _clear(beta, gamma):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _to_segment(p, a, b, at, first, second, beta, gamma):  # type: ignore[no-untyped-def]
-    """Nearest point of segment a b to p, whose weights stand at ``first`` and ``second``; free coordinates."""
+    """Nearest point of segment a b to p, its weights at ``first`` and ``second``; how many are free."""
     way = minus(b, a)
     square = dot(way, way)
     t = dot(minus(p, a), way) / square if square > 0.0 else 0.0
@@ -162,7 +162,8 @@ def _end_distance(end, a, b, c, d, beta, gamma):  # type: ignore[no-untyped-def]
 def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
     """Distance of points p (4, 3), their β (4,) and γ (2, 4); how many coordinates are free.
 
-    It is |g|, or −|g| inside. Of a plane, whose distance is negative behind it, p1 to p3 become a triangle around the nearest point.
+    It is |g|, or −|g| inside. Of a plane, whose distance is negative behind it, p1 to p3 become a triangle
+    around the nearest point.
     """
     behind = False
     if kind == VERTEX_PLANE:
@@ -186,7 +187,9 @@ def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _around_foot(p):  # type: ignore[no-untyped-def]
-    """Let p1 p2 p3 be a triangle in the plane of point p1 and normal p2 around the foot of p0; if it lies behind."""
+    """Let p1 p2 p3 be a triangle around the foot of p0 in the plane of point p1 and normal p2; whether p0
+    lies behind it.
+    """
     height, axis = 0.0, 0
     for k in range(3):
         height += p[2, k] * (p[0, k] - p[1, k])

@@ -217,7 +217,7 @@ class Elastic(Term):
         return 1.0
 
     def lets_pass(self, x: Array, way: Array, frozen: Any) -> bool:
-        """Whether points may go the way (n_local, 3) [m] from x while targets go where ``frozen`` has them."""
+        """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in the step."""
         return True
 
     def begin(self, x: Array) -> None:

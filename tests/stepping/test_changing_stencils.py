@@ -203,9 +203,7 @@ def test_steps_without_change_search_for_nothing(comm: MPI.Comm, monkeypatch: py
     simulation = thrown(comm, {"time": {"end": 1.0, "step": 1e-4}})
     searches = []
     term, search = term_of(simulation), Repulsion.neighbours
-    monkeypatch.setattr(
-        term, "neighbours", lambda *given: (searches.append(1), search(term, *given))[1]
-    )
+    monkeypatch.setattr(term, "neighbours", lambda *given: (searches.append(1), search(term, *given))[1])
     simulation.step()
     searches.clear()
     matrices = simulation.stepper.linear.operator
