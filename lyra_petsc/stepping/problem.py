@@ -275,6 +275,10 @@ def _set_up_contact(
     obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, Contact))
     contact.set_up(outline.barrier, obstacles, itself=scene.contact.self)
+    if "friction" in terms:
+        from lyra_petsc.terms.friction import Friction
+
+        cast(Friction, terms["friction"]).set_up(contact)
 
 
 def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:

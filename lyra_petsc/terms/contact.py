@@ -124,6 +124,15 @@ class Obstacles:
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
 
+    def moved(self, start: float, end: float) -> list[tuple[Array, Array]]:
+        """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
+        found = []
+        for each in self.each:
+            (turn, way), (later, there) = each.displacement(start), each.displacement(end)
+            rotation = later @ turn.T
+            found.append((rotation, there - rotation @ way))
+        return found
+
 
 class Contact(Elastic):
     """The barrier between all near pairs.
@@ -159,7 +168,7 @@ class Contact(Elastic):
         self.number = elements.data["number"].astype(np.int64)
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
         self.points = np.where(what[:, 2:] < 0, what[:, 2:], self.stencil)
-        self._offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+        self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
 
     # -- obstacles ---------------------------------------------------------------------------------
 
@@ -259,7 +268,7 @@ class Contact(Elastic):
 
     @property
     def _constants(self) -> tuple[Array, float, float, float]:
-        return self._offset, self.barrier.gap, self.barrier.stiffness, self.barrier.parallel
+        return self.offset, self.barrier.gap, self.barrier.stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: Places) -> Array:
         out = np.empty(self.n_owned)
@@ -278,12 +287,12 @@ class Contact(Elastic):
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
 
     def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
-        pairs = self.kind, self.points, self._offset
+        pairs = self.kind, self.points, self.offset
         still = np.zeros_like(frozen.now)
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
     def lets_pass(self, x: Array, way: Array, frozen: Places) -> bool:
-        pairs = self.kind, self.points, self._offset
+        pairs = self.kind, self.points, self.offset
         moved = frozen.now - frozen.before
         return bool(contact_pairs.free_way(x, frozen.before, way, moved, *pairs, KEPT, 1.0) == 1.0)
 
@@ -291,7 +300,7 @@ class Contact(Elastic):
         """Distance less thickness and radius [m] of all pairs, (E,)."""
         out = np.empty(self.n_elements)
         contact_pairs.distances(x, others, self.kind, self.points, out)
-        found: Array = out - self._offset
+        found: Array = out - self.offset
         return found
 
     def history(self, x: Array, frozen: Places) -> Mapping[str, float]:

@@ -432,3 +432,23 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
             left = d - offset[e]
         most = min(most, t)
     return most
+
+
+@kernel()
+def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, normal, force):  # type: ignore[no-untyped-def]  # fmt: skip
+    """β (E, 4), unit normals (E, 3) towards the first simplex and normal forces (E,) [N] of pairs."""
+    p, gamma, slope = np.empty((4, 3)), np.empty((2, 4)), np.zeros(12)
+    for e in range(len(kind)):
+        _load(x, others, points, e, p)
+        d, _ = nearest(kind[e], p, beta[e], gamma)
+        delta = d - offset[e]
+        force[e] = 0.0
+        if 0.0 < delta < gap:
+            force[e] = -stiffness * barrier(delta, gap)[1]
+            if kind[e] == EDGE_EDGE:
+                force[e] *= _mollifier(p, parallel, slope)[0]
+        for k in range(3):
+            g = 0.0
+            for i in range(4):
+                g += beta[e, i] * p[i, k]
+            normal[e, k] = g / d

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.materials.library import ShellMaterial
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.schema import Scene, coefficients
 
 if TYPE_CHECKING:
     from lyra_petsc.mesh.elements import Elements
@@ -100,6 +100,12 @@ def _clamps(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(shell.bends_by("hinge") for shell in shells) and any(handle.clamp for handle in scene.handles)
 
 
+def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+    own = [obstacle.friction for obstacle in (scene.obstacles or {}).values()]
+    all_of_them = [] if scene.contact is None else [scene.contact.friction, *own]
+    return any(max(coefficients(each)) > 0.0 for each in all_of_them if each is not None)
+
+
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
     Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True, bends=True),
@@ -122,6 +128,14 @@ REGISTRY: list[Registration] = [
         {"contacts": "sum", "smallest_gap": "min"},
         neighbours=True,
         limits_step=True,
+    ),
+    Registration(
+        "friction",
+        _rubs,
+        Role.CONSTRAINT,
+        columns={"friction_work": "sum"},
+        neighbours=True,
+        state=("friction_work",),
     ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(

@@ -1,0 +1,225 @@
+"""Coulomb friction of all pairs in contact; its potential in a step is that of ``friction_pairs``.
+
+Pairs, their normals and normal forces are those of the last accepted state; a pair that goes on keeps the
+elastic part of its way, so that what sticks does not creep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.scene.schema import Scene, coefficients
+from lyra_petsc.terms import contact_pairs, friction_pairs
+from lyra_petsc.terms.contact import HALFWAY, Contact
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, UpcomingStep
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+ELASTIC = 0.01
+"""Part of the gap that a pair which sticks may go before it slides, at most."""
+
+
+class Pairs(NamedTuple):
+    """Pairs in contact at an accepted state.
+
+    Attributes
+    ----------
+    key : (E, 9)
+        Kind, numbers of the vertices, of obstacles' points: what tells a pair from others.
+    vertices : (E, 4)
+        Their global numbers.
+    obstacle : (E,)
+        −1 of sheets.
+    beta : (E, 4)
+        0 for obstacles' points.
+    normal, start, slip, foot : (E, 3)
+        Unit normals, Σ β_i x_i, elastic part of the way so far, where an obstacle is touched [m].
+    force : (E,)
+        Normal force [N].
+    slid : (E,)
+        Whether it slid in the last step.
+    """
+
+    key: Ints
+    vertices: Ints
+    obstacle: Ints
+    beta: Array
+    normal: Array
+    start: Array
+    slip: Array
+    foot: Array
+    force: Array
+    slid: Mask
+
+
+class Motion(NamedTuple):
+    """How obstacles move in a step.
+
+    Attributes
+    ----------
+    stage, end : list of (3, 3) and (3,)
+        Rotation and translation [m] of each from the start of the step to its stage and its end.
+    places : (m, 3)
+        Their points and normals at its end.
+    """
+
+    stage: list[tuple[Array, Array]]
+    end: list[tuple[Array, Array]]
+    places: Array
+
+
+def _no_pairs() -> Pairs:
+    ints, three = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    four = np.empty((0, 4), dtype=np.int64)
+    nothing = np.empty((0, 9), dtype=np.int64), four, ints, np.empty((0, 4)), three, three, three, three
+    return Pairs(*nothing, np.empty(0), np.empty(0, dtype=np.bool_))
+
+
+class Friction(Elastic):
+    """Friction in a step.
+
+    Parameters
+    ----------
+    scene : Scene
+    n_vertices : int
+        That this rank owns.
+    """
+
+    def __init__(self, scene: Scene, n_vertices: int) -> None:
+        assert scene.contact is not None
+        self._common = coefficients(scene.contact.friction)
+        self._heat = np.zeros((n_vertices, 3))
+        self._pairs, self._began = _no_pairs(), False
+        self.stale = False
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 1))}))
+
+    def set_up(self, contact: Contact) -> None:
+        """Know the contact whose pairs rub."""
+        self._contact, self.surface = contact, contact.surface
+        self.skin, self.search_distance = contact.skin, contact.search_distance
+        each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._common]
+        self._coefficients = np.array(each)
+        self._stiffest = HALFWAY * contact.barrier.stiffness
+
+    def take(self, elements: Elements) -> None:
+        super().take(elements)
+        self._number = number = elements.data["what"][:, 0].astype(np.int64)
+        p = self._pairs
+        if not len(number):
+            number = np.empty(0, dtype=np.int64)
+            self._limit = self._spring = np.empty(0)
+        else:
+            static, kinetic = self._coefficients[p.obstacle[number]].T
+            self._limit = np.where(p.slid[number], kinetic, static) * p.force[number]
+            self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
+        self._beta, self._normal = p.beta[number], p.normal[number]
+        self._slip = p.slip[number].copy()
+
+    # -- pairs -------------------------------------------------------------------------------------
+
+    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+        self.stale = False
+        order = np.argsort(numbers)
+        vertices = self._pairs.vertices
+        stencil = order[np.searchsorted(numbers, vertices.ravel(), sorter=order)].reshape(vertices.shape)
+        return stencil, np.arange(len(vertices))[:, None]
+
+    def _renew(self, x: Array, places: Array) -> None:
+        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points."""
+        contact, old = self._contact, self._pairs
+        n = contact.n_elements
+        beta, normal, force = np.empty((n, 4)), np.empty((n, 3)), np.empty(n)
+        pairs = contact.kind, contact.points, contact.offset, *contact.barrier[:1], *contact.barrier[2:]
+        contact_pairs.touching(x, places, *pairs, beta, normal, force)
+        met = np.flatnonzero(force > 0.0)
+        points, stencil = contact.points[met], contact.stencil[met]
+        sheet = points >= 0
+        key = np.column_stack([contact.kind[met], contact.number[met], np.where(sheet, 0, points)])
+        beta = np.where(sheet, beta[met], 0.0)
+        start = np.einsum("ei,eik->ek", beta, x[stencil])
+        side = beta.sum(axis=1)[:, None]  # 1 or −1 where the other side is an obstacle
+        foot = np.where(np.abs(side) > 0.5, start * side, 0.0)
+        slip, slid = np.zeros((len(met), 3)), np.zeros(len(met), dtype=np.bool_)
+        if len(old.key) and len(met):
+            _, where = np.unique(np.concatenate([old.key, key]), axis=0, return_inverse=True)
+            where = where.ravel()
+            known = np.full(len(old.key) + len(met), -1)
+            known[where[: len(old.key)]] = np.arange(len(old.key))
+            same = known[where[len(old.key) :]]
+            went = same >= 0
+            slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
+            slip -= np.sum(slip * normal[met], axis=1, keepdims=True) * normal[met]
+        obstacle = contact.obstacle[met]
+        self._pairs = Pairs(
+            key, contact.number[met], obstacle, beta, normal[met], start, slip, foot, force[met], slid
+        )
+        self.stale = True
+
+    # -- a step ------------------------------------------------------------------------------------
+
+    def freeze(self, step: UpcomingStep) -> Motion:
+        obstacles = self._contact.obstacles
+        if not self._began:
+            self._began = True
+            self._renew(step.x, obstacles.at(step.start))
+        stage, end = obstacles.moved(step.start, step.at), obstacles.moved(step.start, step.end)
+        return Motion(stage, end, obstacles.at(step.end))
+
+    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[Array, ...]:
+        """What the kernels take, with obstacles moved so."""
+        p, number = self._pairs, self._number
+        start, side = p.start[number].copy(), self._beta.sum(axis=1)
+        for obstacle, (rotation, translation) in enumerate(moved):
+            mine = p.obstacle[number] == obstacle
+            foot = p.foot[number][mine]
+            start[mine] += side[mine, None] * (foot @ rotation.T + translation - foot)
+        return self.stencil, self._beta, self._normal, start, self._slip, self._spring, self._limit
+
+    def energies(self, x: Array, frozen: Motion) -> Array:
+        out = np.empty(self.n_owned)
+        friction_pairs.energies(x, *self._state(frozen.stage), out)
+        return out
+
+    def add_gradient(self, x: Array, frozen: Motion, out: Array) -> None:
+        friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
+
+    def hessians(self, x: Array, frozen: Motion, lo: int, hi: int, blend: float, out: Array) -> None:
+        friction_pairs.hessians(x, *self._state(frozen.stage), lo, out)
+
+    def force_scale(self, size: float) -> Array:
+        return self._spring * size
+
+    def accept(self, x: Array, frozen: Motion) -> None:
+        heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
+        state = self._state(frozen.end)
+        friction_pairs.slide(x, *state, heat, slides)
+        first = self.stencil[: self.n_owned, 0]
+        np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
+        self._pairs.slip[self._number], self._pairs.slid[self._number] = self._slip, slides
+        self._renew(x, frozen.places)
+
+    def state(self) -> dict[str, Array]:
+        return {"friction_work": self._heat}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        self._heat = state["friction_work"].copy()
+
+    def history(self, x: Array, frozen: Motion) -> Mapping[str, float]:
+        return {"friction_work": float(self._heat[:, 0].sum())}
+
+
+def elements(rest: RestShape) -> None:
+    """There are none before anything touches."""
+
+
+def make(elements: None, scene: Scene, mass: Array) -> Friction:
+    """The term on one rank; `Friction.set_up` must follow."""
+    return Friction(scene, len(mass))
