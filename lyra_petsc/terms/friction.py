@@ -7,7 +7,7 @@ elastic part of its way, so that what sticks does not creep.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,7 +173,7 @@ class Friction(Elastic):
         stage, end = obstacles.moved(step.start, step.at), obstacles.moved(step.start, step.end)
         return Motion(stage, end, obstacles.at(step.end))
 
-    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[Array, ...]:
+    def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
         p, number = self._pairs, self._number
         start, side = p.start[number].copy(), self._beta.sum(axis=1)
