@@ -121,7 +121,9 @@ class Friction(Elastic):
             self._limit = np.where(p.slid[number], kinetic, static) * p.force[number]
             self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
         self._beta, self._normal = p.beta[number], p.normal[number]
-        self._slip = p.slip[number].copy()
+        self._slip = p.slip[number]
+        self._moved: list[tuple[Array, Array]] | None = None  # what the starts are of
+        self._start = p.start[number]
 
     # -- pairs -------------------------------------------------------------------------------------
 
@@ -175,13 +177,15 @@ class Friction(Elastic):
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
-        p, number = self._pairs, self._number
-        start, side = p.start[number].copy(), self._beta.sum(axis=1)
-        for obstacle, (rotation, translation) in enumerate(moved):
-            mine = p.obstacle[number] == obstacle
-            foot = p.foot[number][mine]
-            start[mine] += side[mine, None] * (foot @ rotation.T + translation - foot)
-        return self.stencil, self._beta, self._normal, start, self._slip, self._spring, self._limit
+        if self._moved is not moved:
+            p, number = self._pairs, self._number
+            start, side = p.start[number], self._beta.sum(axis=1)
+            for obstacle, (rotation, translation) in enumerate(moved):
+                mine = p.obstacle[number] == obstacle
+                foot = p.foot[number][mine]
+                start[mine] += side[mine, None] * (foot @ rotation.T + translation - foot)
+            self._moved, self._start = moved, start
+        return self.stencil, self._beta, self._normal, self._start, self._slip, self._spring, self._limit
 
     def energies(self, x: Array, frozen: Motion) -> Array:
         out = np.empty(self.n_owned)
