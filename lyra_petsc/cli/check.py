@@ -19,7 +19,7 @@ from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.json_schema import schema_text
-from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -97,6 +97,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
         ("mean edge", f"{outline.spacing:.4g} m"),
         ("active terms", ", ".join(outline.terms)),
         ("handles", str(len(scene.handles))),
+        *_contact(scene),
         ("unknowns", f"{problem.points.n_unknowns} (velocities)"),
         (
             "nonzeros",
@@ -120,9 +121,36 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
 
 def _fences(scene: Scene) -> list[tuple[str, str]]:
     """What stands around gmsh, where the scene has scripts for it."""
-    if not any(source.file and source.file.suffix.lower() == ".geo" for source in scene.mesh):
+    if not scene.has_scripts:
         return []
     return [("gmsh's fences", in_words(standing(), trusted=scene.trusts_meshes))]
+
+
+def _contact(scene: Scene) -> list[tuple[str, str]]:
+    """What sheets meet, and how, where they meet anything."""
+    contact = scene.contact
+    if contact is None:
+        return []
+    gap = f"gap {contact.gap:g} m" if contact.gap is not None else "gap by the mesh"
+    words = [gap, f"thickness {contact.thickness:g} m", f"friction {_friction(contact.friction)}"]
+    words += [] if contact.self else ["with obstacles alone"]
+    return [("contact", ", ".join(words)), *_obstacles(scene, contact)]
+
+
+def _obstacles(scene: Scene, contact: Contact) -> list[tuple[str, str]]:
+    rows = []
+    for name, obstacle in (scene.obstacles or {}).items():
+        friction = contact.friction if obstacle.friction is None else obstacle.friction
+        words = [f"inside of a {obstacle.shape}" if obstacle.inside else obstacle.shape]
+        if obstacle.motion is not None:
+            words.append(f"moves by {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "moves")
+        rows.append((one_line(f"obstacle {name}"), ", ".join([*words, f"friction {_friction(friction)}"])))
+    return rows
+
+
+def _friction(friction: float | Friction) -> str:
+    static, kinetic = coefficients(friction)
+    return f"{static:g}" if static == kinetic else f"{static:g} (sliding {kinetic:g})"
 
 
 def _count(ratio: float) -> float:

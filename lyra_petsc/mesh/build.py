@@ -13,15 +13,44 @@ from lyra_petsc.mesh.capacity import check_capacity
 from lyra_petsc.mesh.grids import grid_sheet, grid_vertices
 from lyra_petsc.mesh.groups import GroupTable
 from lyra_petsc.mesh.measures import lay_out
-from lyra_petsc.mesh.mesh import Mesh, Sheet, Source
+from lyra_petsc.mesh.mesh import Mesh, Sheet, Source, TriangleSurface
 from lyra_petsc.mesh.orientation import orient
 from lyra_petsc.mesh.validate import check_shape, check_topology
-from lyra_petsc.scene.schema import MeshSource, Rotation, Scene
+from lyra_petsc.scene.schema import MeshSource, Rotation, Scene, Transform
 
 
 def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
-    """`build_mesh` of a scene's sources, whose scripts are trusted if the scene's are."""
-    return build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=tell)
+    """`build_mesh` of a scene's sources, with its obstacles; scripts are trusted if the scene's are."""
+    mesh = build_mesh(scene.mesh, file=scene.source, trust_scripts=scene.trusts_meshes, tell=tell)
+    for name, obstacle in (scene.obstacles or {}).items():
+        if obstacle.mesh is not None:
+            source = MeshSource(file=obstacle.mesh.file, transform=obstacle.mesh.transform)
+            mesh.obstacles[name], notes = _surface(source, scene.trusts_meshes, tell)
+            mesh.notes += [f"obstacle {name}: {note}" for note in notes]
+    return mesh
+
+
+def _surface(
+    source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None
+) -> tuple[TriangleSurface, list[str]]:
+    """An obstacle at t = 0 without points in no triangle, and what the reader says of its file."""
+    try:
+        sheet = _read(source, trust_scripts, tell)
+        used, numbers = np.unique(sheet.triangles, return_inverse=True)
+        whole = Sheet(sheet.points[used], numbers.reshape(-1, 3).astype(np.int64))
+        check_topology(whole, file=source.file)
+        _, points = _placed(whole.points, source.transform)
+        check_shape(points[whole.triangles], "start", file=source.file)
+    except MemoryError:
+        raise InputError("the mesh does not fit into memory", file=source.file) from None
+    return TriangleSurface(points, whole.triangles), sheet.notes
+
+
+def _placed(points: NDArray[np.float64], transform: Transform) -> tuple[NDArray[np.float64], ...]:
+    """Points (n, 3) [m] after the scaling, and after the whole transform."""
+    scaled = points * np.asarray(transform.scale)
+    turned = scaled if transform.rotate is None else scaled @ _rotation_matrix(transform.rotate).T
+    return scaled, turned + np.asarray(transform.translate)
 
 
 def build_mesh(
@@ -112,10 +141,7 @@ def _prepare(sheet: Sheet, source: MeshSource, key: str, file: object | None) ->
     where = {"file": source.file} if source.file is not None else {"file": file, "key": f"{key}.grid"}
     check_topology(sheet, **where)
     orient(sheet, **where)
-    transform = source.transform
-    rest = sheet.points * np.asarray(transform.scale)
-    turned = rest if transform.rotate is None else rest @ _rotation_matrix(transform.rotate).T
-    positions = turned + np.asarray(transform.translate)
+    rest, positions = _placed(sheet.points, source.transform)
     uv, seams = sheet.uv, False
     if uv is not None:
         check_shape(uv, "rest", **where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,13 @@ class Source:
     n_triangles: int
 
 
+class TriangleSurface(NamedTuple):
+    """Points (n, 3) float64 [m], and the numbers (m, 3) int64 of those of each triangle."""
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+
 @dataclass
 class Mesh:
     """Triangle mesh of all sheets of a scene.
@@ -71,6 +79,8 @@ class Mesh:
         In the order of the numbering.
     tags : (V,) int64 or None
         Node tags of .msh files, 0 elsewhere; None where they only count the vertices.
+    obstacles : dict of str to TriangleSurface
+        The scene's obstacles that are meshes, at t = 0; no part of the sheets.
     """
 
     positions: NDArray[np.float64]
@@ -84,6 +94,7 @@ class Mesh:
     has_uv: bool = False
     sources: list[Source] = field(default_factory=list)
     tags: NDArray[np.int64] | None = None
+    obstacles: dict[str, TriangleSurface] = field(default_factory=dict)
 
     @property
     def n_vertices(self) -> int:

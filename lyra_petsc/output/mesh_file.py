@@ -33,7 +33,8 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     The attribute ``vt`` of ``/mesh`` is 1 if they came with the mesh, as texture coordinates.
     Beside them, for `check_same_mesh`: ``/start`` (V, 3), the start positions [m], and
     ``/groups/<number>`` with an attribute ``name`` and its ``vertices`` (n,), ``edges`` (k, 2)
-    and ``triangles`` (m,) where it has any.
+    and ``triangles`` (m,) where it has any; ``/obstacles/<number>`` with an attribute ``name``,
+    ``points`` (n, 3) [m] at t = 0 and ``triangles`` (m, 3), of obstacles that are meshes.
 
     Parameters
     ----------
@@ -59,6 +60,9 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
             names[f"groups/{number}"] = {"name": name}
             parts = _parts(group)
             datasets |= {f"groups/{number}/{part}": rows for part, rows in parts.items() if len(rows)}
+        for number, (name, surface) in enumerate(mesh.obstacles.items()):
+            names[f"obstacles/{number}"] = {"name": name}
+            datasets |= {f"obstacles/{number}/{part}": rows for part, rows in surface._asdict().items()}
         names |= {name: {SUM: str(check_sum(rows))} for name, rows in datasets.items()}
         write_collective([NewFile(Path(folder) / MESH_FILE, datasets, names)], MPI.COMM_SELF)
 
@@ -156,6 +160,14 @@ def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
             pairs = zip(_parts(group).values(), _parts(mesh.groups[name]).values(), strict=True)
             if not all(np.array_equal(theirs, ours) for theirs, ours in pairs):
                 return f"group {name!r} has other members"
+    before = stored.obstacles if mesh.obstacles else {}
+    for name, surface in mesh.obstacles.items():
+        if name not in before:
+            return f"obstacle {name!r} is new"
+        slack = ROUNDING * float(np.abs(surface.points).max())
+        same = np.array_equal(before[name].triangles, surface.triangles)
+        if not same or _apart(before[name].points, surface.points, slack):
+            return f"obstacle {name!r} is another mesh"
     return ""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.mesh import Group
+from lyra_petsc.mesh.mesh import Group, TriangleSurface
 from lyra_petsc.output.stored import open_stored, read_stored, text_of
 from lyra_petsc.output.xdmf import MESH_FILE
 
@@ -95,6 +95,18 @@ class StoredMesh:
             )
             for number, name in names.items()
         }
+
+    @property
+    def obstacles(self) -> dict[str, TriangleSurface]:
+        """The obstacles that are meshes, at t = 0, by their names."""
+        with open_stored(self.path) as file:
+            names = {number: text_of(group, "name") for number, group in file.get("obstacles", {}).items()}
+        found = {}
+        for number, name in names.items():
+            points = read_stored(self.path, f"obstacles/{number}/points", (None, 3), "f")
+            triangles = self._numbers(f"obstacles/{number}/triangles", (None, 3), len(points))
+            found[name] = TriangleSurface(points, triangles)
+        return found
 
     def _numbers(self, dataset: str, shape: tuple[int | None, ...], end: int) -> Ints:
         """Whole numbers from 0 to before ``end``."""

@@ -28,10 +28,8 @@ def scene_schema() -> dict[str, Any]:
         entry = keys[key].pop("items")
         many = {"type": keys[key].pop("type"), "items": entry, "minItems": 1}
         keys[key] = {**keys[key], "anyOf": [entry, many]}
-    motions = keys["motions"]["anyOf"][0]
-    motions["additionalProperties"]["minItems"] = 1
-    for blocks_of_names in (motions, keys["probes"]["anyOf"][0]):
-        blocks_of_names["propertyNames"] = {"pattern": r"\S"}
+    for key in ("motions", "obstacles", "probes"):
+        keys[key]["anyOf"][0]["propertyNames"] = {"pattern": r"\S"}
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "Scene of lyra_petsc",

@@ -143,9 +143,9 @@ def _checked(
         scene = checked(Scene, data, file=source, overridden=overridden, context={"directory": directory})
     except RecursionError:
         raise InputError("is nested too deeply, or refers to itself", file=source) from None
-    for i, mesh in enumerate(scene.mesh):
-        if meshes_needed and mesh.file is not None:
-            _check_mesh_file(mesh.file, dotted(["mesh", i, "file"], data), source)
+    if meshes_needed:
+        for key, mesh in scene.mesh_files.items():
+            _check_mesh_file(mesh, dotted(key, data), source)
     scene._source, scene._given, scene._directory = source, data, directory
     return scene
 

@@ -67,7 +67,7 @@ def _apply(data: dict[str, Any], text: str) -> str:
 
 def _set(data: dict[str, Any], path: str, value: Any, option: str) -> str:
     parts = _parts(path, option)
-    if parts[0] == "mesh":
+    if parts[0] in ("mesh", "obstacles"):
         value = _found_here(value, parts[-1])
     first = parts[0]
     single = first in ONE_OR_MANY and isinstance(data.get(first), dict) and len(parts) > 1

@@ -123,6 +123,20 @@ def _file(*endings: str) -> dict[str, Any]:
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
 
+def _beside_scene(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
+        raise problem(f"must be the path of a mesh file, not {shown(value)}")
+    path = Path(value)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
+    directory = (info.context or {}).get("directory", Path.cwd())
+    # normalised by name only: a symbolic link may be what the user wants to see
+    return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
+
+
+MeshPath = Annotated[Path, BeforeValidator(_beside_scene), JsonSchema(_file("geo", "msh", "obj"))]
+
+
 class MeshSource(Block):
     """Where one sheet comes from: a file or a grid.
 
@@ -156,24 +170,12 @@ class MeshSource(Block):
         ),
     )
 
-    file: Annotated[Path, JsonSchema(_file("geo", "msh", "obj"))] | None = None
+    file: MeshPath | None = None
     grid: Grid | None = None
     size: Positive | None = None
     algorithm: Literal["automatic", "mesh-adapt", "delaunay", "frontal-delaunay"] | None = None
     transform: Transform = Field(default_factory=Transform)
     name: Name | None = None
-
-    @field_validator("file", mode="before")
-    @classmethod
-    def _beside_scene(cls, value: Any, info: ValidationInfo) -> Any:
-        if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
-            raise problem(f"must be the path of a mesh file, not {shown(value)}")
-        path = Path(value)
-        if path.suffix.lower() not in MESH_SUFFIXES:
-            raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
-        directory = (info.context or {}).get("directory", Path.cwd())
-        # normalised by name only: a symbolic link may be what the user wants to see
-        return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
 
 
 class MembraneStiffness(Block):
@@ -569,6 +571,222 @@ class Keyframe(Block):
     velocity: Vector | None = None
 
 
+def _many(value: Any) -> Any:
+    if isinstance(value, dict):
+        raise problem("must be a list; put '- ' before the entry")
+    if not isinstance(value, (list, tuple)):
+        raise problem(f"must be a list, not {shown(value)}")
+    return list(value)
+
+
+Keyframes = Annotated[list[Keyframe], BeforeValidator(_many), Field(json_schema_extra={"minItems": 1})]
+
+
+class Friction(Block):
+    """Coulomb friction whose coefficient at rest is not that of sliding.
+
+    Attributes
+    ----------
+    static : float
+        Coefficient at rest.
+    kinetic : float
+        Coefficient while sliding; at most the static one.
+    """
+
+    static: NonNegative
+    kinetic: NonNegative
+
+    @model_validator(mode="after")
+    def _rest_holds_more(self) -> Self:
+        if self.kinetic > self.static:
+            raise problem(f"must be at most static = {self.static:g}, not {self.kinetic:g}", "kinetic")
+        return self
+
+
+_AnyFriction = Annotated[
+    Annotated[NonNegative, Tag("[number]")] | Annotated[Friction, Tag("[coefficients]")],
+    Discriminator(lambda value: "[coefficients]" if isinstance(value, (dict, Friction)) else "[number]"),
+]
+
+
+def coefficients(friction: float | Friction) -> tuple[float, float]:
+    """Static and kinetic coefficient of friction."""
+    if isinstance(friction, Friction):
+        return friction.static, friction.kinetic
+    return friction, friction
+
+
+class Contact(Block):
+    """Contact of sheets with themselves, each other and obstacles; without this key there is none.
+
+    Attributes
+    ----------
+    gap : float [m] or None
+        Distance below which surfaces feel each other; by default the smaller of a quarter of the mean edge
+        and half of the shortest.
+    thickness : float [m]
+        Distance kept between mid-surfaces.
+    self : bool
+        Whether sheets meet themselves and other sheets, not obstacles alone.
+    friction : float or Friction
+        Coulomb's coefficient, or a block of two.
+    """
+
+    gap: Positive | None = None
+    thickness: NonNegative = 0.0
+    self: Flag = True
+    friction: _AnyFriction = 0.0
+
+
+class Plane(Block):
+    """A plane without end.
+
+    Attributes
+    ----------
+    point : (3,) [m]
+        Any point of it.
+    normal : (3,)
+        Towards the side that is free; not zero, need not be a unit vector.
+    """
+
+    point: Vector
+    normal: Axis
+
+
+class Sphere(Block):
+    """A sphere.
+
+    Attributes
+    ----------
+    center : (3,) [m]
+        Its middle.
+    radius : float [m]
+        Of the surface.
+    """
+
+    center: Vector
+    radius: Positive
+
+
+class Capsule(Block):
+    """A cylinder with half spheres as ends.
+
+    Attributes
+    ----------
+    start, to : (3,) [m]
+        Ends of its axis, the centres of the half spheres.
+    radius : float [m]
+        Of cylinder and half spheres.
+    """
+
+    start: Vector = Field(alias="from")
+    to: Vector
+    radius: Positive
+
+    @model_validator(mode="after")
+    def _has_an_axis(self) -> Self:
+        if self.start == self.to:
+            raise problem("must be another point than from; for a ball give sphere", "to")
+        return self
+
+
+class Cuboid(Block):
+    """A box with sides along x, y and z (at t = 0).
+
+    Attributes
+    ----------
+    min, max : (3,) [m]
+        Lower and upper corner.
+    """
+
+    min: Vector
+    max: Vector
+
+    @model_validator(mode="after")
+    def _has_a_volume(self) -> Self:
+        for axis, low, high in zip(AXES, self.min, self.max, strict=True):
+            if low >= high:
+                raise problem(f"must be above min in {axis}: {high:g} is not above {low:g}", "max")
+        return self
+
+
+class ObstacleMesh(Block):
+    """Any triangle mesh, closed or open, of which both sides are met.
+
+    Attributes
+    ----------
+    file : Path
+        A .geo, .msh or .obj; a relative path stands beside the scene file.
+    transform : Transform
+        Where it stands at t = 0.
+    """
+
+    file: MeshPath
+    transform: Transform = Field(default_factory=Transform)
+
+
+SHAPES = ("plane", "sphere", "capsule", "box", "mesh")
+"""Kinds of obstacles."""
+
+
+class Obstacle(Block):
+    """What sheets cannot pass: one shape, still or moving rigidly.
+
+    Attributes
+    ----------
+    plane : Plane or None
+        A plane, free on the side of its normal.
+    sphere : Sphere or None
+        A sphere, kept out of or in.
+    capsule : Capsule or None
+        A rod with round ends.
+    box : Cuboid or None
+        A box, at first along x, y and z.
+    mesh : ObstacleMesh or None
+        A triangle mesh.
+    inside : bool
+        Sheets stay inside of the sphere, capsule or box.
+    motion : str or list of Keyframe or None
+        Name in ``motions``, or keyframes; without: stands still. Rigid, hence without ``scale``.
+    interpolation : str
+        Of the motion in time, between keyframes.
+    friction : float or Friction or None
+        Wins over that of ``contact``.
+    """
+
+    rules = (
+        exactly_one(*SHAPES),
+        Rule(
+            when(given(inside={"const": True}), some("sphere", "capsule", "box")),
+            "is for sphere, capsule and box; a plane is free on the side of its normal, and a mesh on both",
+            "inside",
+        ),
+    )
+
+    plane: Plane | None = None
+    sphere: Sphere | None = None
+    capsule: Capsule | None = None
+    box: Cuboid | None = None
+    mesh: ObstacleMesh | None = None
+    inside: Flag = False
+    motion: (
+        Annotated[
+            Annotated[Name, Tag("[name]")] | Annotated[Keyframes, Tag("[keyframes]")],
+            Discriminator(
+                lambda value: "[keyframes]" if isinstance(value, (dict, list, tuple)) else "[name]"
+            ),
+        ]
+        | None
+    ) = None
+    interpolation: Literal["hermite", "linear"] = "hermite"
+    friction: _AnyFriction | None = None
+
+    @property
+    def shape(self) -> str:
+        """The one of `SHAPES` that it is."""
+        return self.given(*SHAPES)[0]
+
+
 class AppliedLoad(VertexChoice):
     """A force, a pressure, a traction or a moment.
 
@@ -940,14 +1158,6 @@ def _one_or_many(value: Any) -> Any:
     return [value]
 
 
-def _many(value: Any) -> Any:
-    if isinstance(value, dict):
-        raise problem("must be a list; put '- ' before the entry")
-    if not isinstance(value, (list, tuple)):
-        raise problem(f"must be a list, not {shown(value)}")
-    return list(value)
-
-
 def _named(value: Any) -> Any:
     if not isinstance(value, dict):
         raise problem(f"must be a block of names, not {shown(value)}")
@@ -972,7 +1182,11 @@ class Scene(Block):
     handles : list of Handle
         Vertices that are held or moved.
     motions : dict of list of Keyframe
-        Motions of handles, by name; times strictly ascending.
+        Motions of handles and obstacles, by name; times strictly ascending.
+    contact : Contact or None
+        How surfaces meet; without this key they pass through each other.
+    obstacles : dict of Obstacle or None
+        What sheets meet beside themselves, by name.
     loads : list of AppliedLoad
         Forces, pressures and tractions.
     initial : Initial or None
@@ -1002,6 +1216,13 @@ class Scene(Block):
             f"initial.{key}",
         )
         for key in ("velocity", "angular_velocity")
+    ) + (
+        Rule(
+            when(given("obstacles"), given("contact")),
+            # a template would take the braces for a key
+            lambda _: "are met only with contact; add the line 'contact: {friction: 0.3}'",
+            "obstacles",
+        ),
     )
 
     title: Text = ""
@@ -1010,9 +1231,9 @@ class Scene(Block):
     gravity: Vector | None = None
     wind: UniformWind | None = None
     handles: Annotated[list[Handle], BeforeValidator(_many)] = Field(default_factory=list)
-    motions: Annotated[
-        dict[Name, Annotated[list[Keyframe], BeforeValidator(_many)]], BeforeValidator(_named)
-    ] = Field(default_factory=dict)
+    motions: Annotated[dict[Name, Keyframes], BeforeValidator(_named)] = Field(default_factory=dict)
+    contact: Contact | None = None
+    obstacles: Annotated[dict[Name, Obstacle], BeforeValidator(_named)] | None = None
     loads: Annotated[list[AppliedLoad], BeforeValidator(_many)] = Field(default_factory=list)
     initial: Initial | None = None
     time: Time
@@ -1038,6 +1259,23 @@ class Scene(Block):
     def trusts_meshes(self) -> bool:
         """Whether gmsh is given this scene's scripts whatever they say; the caller's word, no part of it."""
         return self._trusts_meshes
+
+    @property
+    def mesh_files(self) -> dict[tuple[str | int, ...], Path]:
+        """Files of sheets and obstacles, by their keys."""
+        files: dict[tuple[str | int, ...], Path] = {}
+        for i, source in enumerate(self.mesh):
+            if source.file is not None:
+                files["mesh", i, "file"] = source.file
+        for name, obstacle in (self.obstacles or {}).items():
+            if obstacle.mesh is not None:
+                files["obstacles", name, "mesh", "file"] = obstacle.mesh.file
+        return files
+
+    @property
+    def has_scripts(self) -> bool:
+        """Whether some of its meshes are made by gmsh."""
+        return any(file.suffix.lower() == ".geo" for file in self.mesh_files.values())
 
     def trusting_meshes(self) -> Scene:
         """The same scene, whose mesh scripts the caller trusts."""
@@ -1077,26 +1315,23 @@ class Scene(Block):
     @model_validator(mode="after")
     def _names_agree(self) -> Self:
         for name, keyframes in self.motions.items():
-            if not keyframes:
-                raise problem("must hold at least one keyframe", "motions", name)
-            for i in range(1, len(keyframes)):
-                if keyframes[i].time <= keyframes[i - 1].time:
-                    raise problem(
-                        f"must be later than the keyframe before ({keyframes[i - 1].time:g} s),"
-                        f" not {keyframes[i].time:g}",
-                        "motions",
-                        name,
-                        i,
-                        "time",
-                    )
+            _check_keyframes(keyframes, "motions", name)
         for i, handle in enumerate(self.handles):
-            if handle.motion is not None and handle.motion not in self.motions:
-                raise problem(
-                    f"unknown motion {handle.motion!r}, {nearest(handle.motion, self.motions)}",
-                    "handles",
-                    i,
-                    "motion",
-                )
+            self._check_motion(handle.motion, "handles", i)
+        for name, obstacle in (self.obstacles or {}).items():
+            at: tuple[str | int, ...] = "obstacles", name
+            if isinstance(obstacle.motion, list):
+                _check_keyframes(obstacle.motion, *at, "motion")
+            else:
+                self._check_motion(obstacle.motion, *at)
+            for i, keyframe in enumerate(self.keyframes(obstacle)):
+                if keyframe.scale not in (1.0, (1.0, 1.0, 1.0)):
+                    where = f"motion {obstacle.motion!r}" if isinstance(obstacle.motion, str) else "it"
+                    raise problem(
+                        f"{where} scales in keyframe {i}, but an obstacle is rigid: leave out scale",
+                        *at,
+                        "motion",
+                    )
         groups: set[str | None] = set()
         for i, material in enumerate(self.material):
             if material.group in groups:
@@ -1112,3 +1347,23 @@ class Scene(Block):
             if sheet is not None and sheet in names[:i]:
                 raise problem(f"{sheet!r} is the name of an earlier sheet too", "mesh", i, "name")
         return self
+
+    def _check_motion(self, motion: str | None, *at: str | int) -> None:
+        if motion is not None and motion not in self.motions:
+            raise problem(f"unknown motion {motion!r}, {nearest(motion, self.motions)}", *at, "motion")
+
+    def keyframes(self, obstacle: Obstacle) -> list[Keyframe]:
+        """Of the motion of one of its obstacles; none where it stands still."""
+        motion = obstacle.motion
+        return self.motions[motion] if isinstance(motion, str) else motion or []
+
+
+def _check_keyframes(keyframes: list[Keyframe], *at: str | int) -> None:
+    if not keyframes:
+        raise problem("must hold at least one keyframe", *at)
+    for i in range(1, len(keyframes)):
+        before, time = keyframes[i - 1].time, keyframes[i].time
+        if time <= before:
+            raise problem(
+                f"must be later than the keyframe before ({before:g} s), not {time:g}", *at, i, "time"
+            )

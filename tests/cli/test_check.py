@@ -50,6 +50,40 @@ def test_edges_with_an_unknown_are_counted_apart(tmp_path: Path, ranks: int) -> 
     assert [sum(int(row[k]) for row in table) for k in (1, 2)] == [121, 320]
 
 
+CONTACT = """
+contact: {gap: 0.01, friction: {static: 0.4, kinetic: 0.3}}
+obstacles:
+  floor: {plane: {point: [0, 0, -1], normal: [0, 0, 1]}, friction: 0.5}
+  ball: {sphere: {center: [0, 0, -0.5], radius: 0.3}, motion: roll}
+  crate: {box: {min: [-2, -2, -2], max: [2, 2, 2]}, inside: true}
+motions: {roll: [{time: 0}, {time: 1, rotate: {axis: [0, 0, 1], degrees: 90}}]}
+"""
+
+
+def test_contact_and_obstacles_are_shown(tmp_path: Path) -> None:
+    (tmp_path / "floor.yaml").write_text(MEMBRANE + CONTACT)
+    result = lyra(["check", "floor.yaml"], tmp_path)
+    assert result.code == 0, result.err
+    lines = [" ".join(line.split()) for line in result.out.splitlines()]
+    assert lines[lines.index("handles 0") + 1 :][:4] == [
+        "contact gap 0.01 m, thickness 0 m, friction 0.4 (sliding 0.3)",
+        "obstacle floor plane, friction 0.5",
+        "obstacle ball sphere, moves by 'roll', friction 0.4 (sliding 0.3)",
+        "obstacle crate inside of a box, friction 0.4 (sliding 0.3)",
+    ]
+
+
+def test_obstacles_without_contact_are_refused(tmp_path: Path) -> None:
+    """On every rank alike, with the line to add, which makes a scene of it."""
+    text = MEMBRANE + CONTACT.replace("contact: {gap: 0.01, friction: {static: 0.4, kinetic: 0.3}}", "")
+    (tmp_path / "floor.yaml").write_text(text)
+    result = lyra(["check", "floor.yaml"], tmp_path, ranks=2)
+    assert result.code == 2
+    assert result.err.count("add the line 'contact: {friction: 0.3}'") == 1
+    (tmp_path / "floor.yaml").write_text(text + "contact: {friction: 0.3}\n")
+    assert lyra(["check", "floor.yaml"], tmp_path).code == 0
+
+
 SQUARE = """
 Point(1) = {0, 0, 0, 0.5}; Point(2) = {1, 0, 0, 0.5}; Point(3) = {1, 1, 0, 0.5}; Point(4) = {0, 1, 0, 0.5};
 Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};

@@ -27,6 +27,9 @@ from lyra_petsc.scene.schema import (
     FIELDS,
     INTEGRATORS,
     AppliedLoad,
+    Capsule,
+    Contact,
+    Cuboid,
     Grid,
     Handle,
     Initial,
@@ -34,9 +37,12 @@ from lyra_petsc.scene.schema import (
     Material,
     MembraneStiffness,
     MeshSource,
+    Obstacle,
     Output,
+    Plane,
     Scene,
     Solver,
+    Sphere,
     Time,
     Transform,
     UniformWind,
@@ -59,6 +65,7 @@ KEYS = sorted(
             AppliedLoad,
         )
         + (Initial, Time, Output, Solver)
+        + (Contact, Obstacle, Plane, Sphere, Capsule, Cuboid)
         for key in block.keys()  # noqa: SIM118
     }
     | {"axis", "degrees", "seconds", "<<", "stepp"}
@@ -206,6 +213,45 @@ def _load(draw: Draw) -> dict[str, Any]:
     return _window(draw, {"traction": draw(vector(0.0, 10.0))})
 
 
+def _friction(draw: Draw) -> Any:
+    if draw(st.booleans()):
+        return draw(usual(0.0, 1.0))
+    static = draw(usual(0.0, 1.0))
+    return {"static": static, "kinetic": draw(st.floats(0.0, 1.0)) * static}
+
+
+def _contact(draw: Draw) -> dict[str, Any]:
+    block: dict[str, Any] = {"gap": draw(usual(1e-5, 1e-2)), "friction": _friction(draw)}
+    if draw(st.booleans()):
+        block |= {"thickness": draw(usual(0.0, 1e-3)), "self": draw(st.booleans())}
+    return block
+
+
+def _obstacle(draw: Draw, motions: list[str]) -> dict[str, Any]:
+    low, radius = draw(vector(0.0, 1.0)), draw(usual(0.1, 1.0))
+    shape = draw(st.sampled_from(["plane", "sphere", "capsule", "box", "mesh"]))
+    block: dict[str, Any] = {
+        shape: {
+            "plane": {"point": low, "normal": [0, 1, draw(signed(0.1, 1.0))]},
+            "sphere": {"center": low, "radius": radius},
+            "capsule": {"from": low, "to": [draw(usual(2.0, 3.0)), 0, 0], "radius": radius},
+            "box": {"min": [-1, -1, -1], "max": draw(st.lists(usual(0.1, 1.0), min_size=3, max_size=3))},
+            "mesh": {"file": "sheet.obj", "transform": _transform(draw)},
+        }[shape]
+    }
+    if shape not in ("plane", "mesh"):
+        block["inside"] = draw(st.booleans())
+    if draw(st.booleans()):
+        block["friction"] = _friction(draw)
+    kind = draw(st.integers(0, 2))
+    if kind == 1 and motions:
+        block["motion"] = draw(st.sampled_from(motions))
+    elif kind == 2:
+        frames = _motion(draw)
+        block["motion"] = [{key: frame[key] for key in frame if key != "scale"} for frame in frames]
+    return block
+
+
 def _time(draw: Draw) -> dict[str, Any]:
     if draw(st.integers(0, 5)) == 0:
         return {"analysis": "static", **({"step": draw(usual(0.01, 1.0))} if draw(st.booleans()) else {})}
@@ -253,6 +299,11 @@ def scenes(draw: Draw) -> dict[str, Any]:
             "fields": draw(st.lists(st.sampled_from(FIELDS), max_size=3)),
             "checkpoint": {"seconds": draw(usual(1.0, 60.0))},
             "reactions": draw(st.booleans()),
+        }
+    if draw(st.integers(0, 2)) == 0:
+        blocks["contact"] = _contact(draw)
+        blocks["obstacles"] = {
+            name: _obstacle(draw, motions) for name in ("one", "two")[: draw(st.integers(0, 2))]
         }
     if draw(st.integers(0, 4)) == 0:
         blocks["probes"] = {"tip": _selection(draw)}

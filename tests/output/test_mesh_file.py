@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.mesh import Group, Mesh
+from lyra_petsc.mesh.mesh import Group, Mesh, TriangleSurface
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
+from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.xdmf import MESH_FILE
 
 pytestmark = pytest.mark.parallel
@@ -46,6 +47,33 @@ def moved(rows, row, by):
 def with_group(name, group):
     mesh = strip()
     return replace(mesh, groups=mesh.groups | {name: group})
+
+
+POST = TriangleSurface(10.0 * REST, TRIANGLES)
+
+
+def test_obstacles_are_kept_by_their_names(comm, shared_tmp):
+    wall = TriangleSurface(REST[:3] + np.pi, TRIANGLES[:1])
+    with_them = replace(strip(), obstacles={"a/b": POST, "wall": wall})
+    write_mesh(shared_tmp, with_them if comm.rank == 0 else None, comm)
+    stored = StoredMesh(shared_tmp).obstacles
+    assert list(stored) == ["a/b", "wall"]
+    for name, surface in with_them.obstacles.items():
+        assert np.array_equal(stored[name].points, surface.points)
+        assert np.array_equal(stored[name].triangles, surface.triangles)
+    for now, words in (
+        ({"wall": wall}, ""),
+        ({"a/b": POST._replace(points=POST.points * (1 + 1e-15))}, ""),
+        ({"a/b": POST._replace(points=moved(POST.points, 1, 1e-6))}, "obstacle 'a/b' is another mesh"),
+        ({"a/b": wall}, "obstacle 'a/b' is another mesh"),
+        ({"new": wall}, "obstacle 'new' is new"),
+    ):
+        mesh = replace(strip(), obstacles=now) if comm.rank == 0 else None
+        if not words:
+            check_same_mesh(shared_tmp, mesh, (), comm)
+            continue
+        with pytest.raises(InputError, match=words):
+            check_same_mesh(shared_tmp, mesh, (), comm)
 
 
 def test_the_same_mesh(compare):

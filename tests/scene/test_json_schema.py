@@ -24,6 +24,10 @@ BEYOND_SCHEMA = (
     "positive definite",
     "is too small",
     "must be later than",
+    "must be at most static",
+    "another point than from",
+    "must be above min",
+    "an obstacle is rigid",
     "unknown motion",
     "a second material",
     "earlier sheet",
@@ -118,6 +122,10 @@ def test_known_mistakes_are_refused(validator: Any) -> None:
         "time: {analysis: static, end: 1, step: 1}",
         "time: {end: 1, step: auto, integrator: alpha2, spectral_radius: 0, tolerance: 0.1}",
         "loads: [{pressure: -3}, {traction: [0, 0, 1], group: a}, {force: [0, 0, 1], nodes: [0]}]",
+        "contact: {friction: {static: 1, kinetic: 0}, self: false, gap: }",
+        "obstacles:",
+        "contact: {gap: 1}\nobstacles: {a: {box: {min: [0, 0, 0], max: [1, 1, 1]}, inside: true}}",
+        "contact: {gap: 1}\nobstacles: {1: {mesh: {file: a.OBJ}, motion: [{time: 0, scale: [1, 1, 1]}]}}",
         "petsc: {ksp_monitor: , ksp_view: '::ascii_info', ksp_rtol: 1e-8, snes_lag_jacobian: -1}",
     ],
 )
@@ -141,6 +149,8 @@ def test_unusual_scenes_are_accepted(part: str, validator: Any) -> None:
         "loads: [{force: [0, 0, 1]}]",
         "probes: {' ': {nodes: [0]}}",
         "motions: {swing: []}",
+        "obstacles: {' ': {sphere: {center: [0, 0, 0], radius: 1}}}\ncontact: {gap: 1}",
+        "obstacles: {}",
     ],
 )
 def test_further_mistakes_are_refused(part: str, validator: Any) -> None:

@@ -24,6 +24,9 @@ def scene_text(part: str) -> str:
 
 SHEET = "density: 1, membrane: {c11: 1, c22: 1, c12: 0, c33: 1}, "
 
+PLANE = "plane: {point: [0, 0, 0], normal: [0, 0, 1]}"
+BALL = "{ball: {sphere: {center: [0, 0, 0], radius: 1}}}"
+
 # (block, key in the message, words in the message)
 CASES = [
     # unknown keys, at every depth, with the nearest
@@ -58,6 +61,50 @@ CASES = [
     ("title: 3", "title", "must be text"),
     ("mesh: {file: 3}", "mesh.file", "path of a mesh file"),
     ("handles: [{group: [a]}]", "handles[0].group", "must be text"),
+    # contact and obstacles
+    ("contact: 3", "contact", "must be a block with keys (gap, thickness, self, friction)"),
+    ("contact: {gap: 0}", "contact.gap", "must be > 0, not 0"),
+    ("contact: {thickness: -1}", "contact.thickness", "must be >= 0, not -1"),
+    ("contact: {self: 1}", "contact.self", "must be true or false, not 1"),
+    ("contact: {friction: -0.1}", "contact.friction", "must be >= 0, not -0.1"),
+    ("contact: {friction: rough}", "contact.friction", "must be a number, not 'rough'"),
+    ("contact: {friction: {static: 0.3}}", "contact.friction.kinetic", "missing"),
+    ("contact: {friction: {static: 0.3, kinetic: 0.4}}", "contact.friction.kinetic", "at most static = 0.3"),
+    (f"obstacles: {BALL}", "obstacles", "add the line 'contact: {friction: 0.3}'"),
+    ("obstacles: [1]\ncontact: {gap: 1}", "obstacles", "block of names"),
+    ("obstacles: {a: }\ncontact: {gap: 1}", "obstacles.a", "must be a block with keys (plane, sphere"),
+    ("obstacles: {a: {cube: {}}}\ncontact: {gap: 1}", "obstacles.a.cube", "unknown key"),
+    ("obstacles: {a: {friction: 1}}\ncontact: {gap: 1}",
+     "obstacles.a", "must have exactly one of plane, sphere, capsule, box, mesh"),
+    (f"obstacles: {{a: {{{PLANE}, sphere: {{center: [0, 0, 0], radius: 1}}}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a", "must have exactly one of"),
+    ("obstacles: {a: {plane: {point: [0, 0, 0], normal: [0, 0, 0]}}}\ncontact: {gap: 1}",
+     "obstacles.a.plane.normal", "must be a direction"),
+    ("obstacles: {a: {sphere: {center: [0, 0, 0], radius: 0}}}\ncontact: {gap: 1}",
+     "obstacles.a.sphere.radius", "must be > 0, not 0"),
+    ("obstacles: {a: {sphere: {centre: [0, 0, 0], radius: 1}}}\ncontact: {gap: 1}",
+     "obstacles.a.sphere.centre", "did you mean 'center'"),
+    ("obstacles: {a: {capsule: {from: [0, 0, 0], to: [0, 0, 0], radius: 1}}}\ncontact: {gap: 1}",
+     "obstacles.a.capsule.to", "another point than from; for a ball give sphere"),
+    ("obstacles: {a: {box: {min: [0, 0, 0], max: [1, 0, 1]}}}\ncontact: {gap: 1}",
+     "obstacles.a.box.max", "must be above min in y: 0 is not above 0"),
+    ("obstacles: {a: {mesh: {file: a.stl}}}\ncontact: {gap: 1}",
+     "obstacles.a.mesh.file", "'a.stl' must end in .geo, .msh, .obj"),
+    ("obstacles: {a: {mesh: {file: none.obj}}}\ncontact: {gap: 1}", "obstacles.a.mesh.file", "no such file"),
+    (f"obstacles: {{a: {{{PLANE}, inside: true}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.inside", "is for sphere, capsule and box"),
+    (f"obstacles: {{a: {{{PLANE}, motion: roll}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.motion", "unknown motion 'roll'"),
+    (f"obstacles: {{a: {{{PLANE}, motion: {{time: 0}}}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.motion", "must be a list; put '- '"),
+    (f"obstacles: {{a: {{{PLANE}, motion: []}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.motion", "at least one keyframe"),
+    (f"obstacles: {{a: {{{PLANE}, motion: [{{time: 1}}, {{time: 1}}]}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.motion[1].time", "must be later than the keyframe before (1 s)"),
+    (f"obstacles: {{a: {{{PLANE}, motion: [{{time: 0}}, {{time: 1, scale: 2}}]}}}}\ncontact: {{gap: 1}}",
+     "obstacles.a.motion", "it scales in keyframe 1, but an obstacle is rigid: leave out scale"),
+    (f"obstacles: {{a: {{{PLANE}, motion: m}}}}\ncontact: {{}}\nmotions: {{m: [{{time: 0, scale: 2}}]}}",
+     "obstacles.a.motion", "motion 'm' scales in keyframe 0"),
     # not finite, out of range
     ("initial: {velocity: [0, 1.0e+200, 0]}", "initial.velocity", "must not be faster than 1e+08 m/s"),
     ("wind: {velocity: [0, -1.0e+9, 0], density: 1}", "wind.velocity", "faster than 1e+08 m/s"),

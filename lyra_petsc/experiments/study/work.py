@@ -634,9 +634,7 @@ class Work:
             scene = scene_of(path, (), overrides)
         except InputError as error:
             return fingerprint(str(error), overrides)
-        meshes = [
-            hashlib.sha256(source.file.read_bytes()).hexdigest() for source in scene.mesh if source.file
-        ]
+        meshes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in scene.mesh_files.values()]
         options = [f"{name}={value}" for name, value in sorted(PETSc.Options().getAll().items())]
         ranks = str(self.plan.request.ranks or self.comm.size)
         return fingerprint(dump_scene(scene), meshes, options, str(repeats), ranks, lyra_petsc.__version__)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
 from lyra_petsc.show.render.opengl import import_pyvista
@@ -20,8 +22,11 @@ Image = NDArray[np.uint8]
 
 SKY, HORIZON = "#d9e2ec", "#ecebe8"
 INK = "#2b2f36"
-HANDLE_COLOR, WIND_COLOR = "#30343b", "#6d8fae"
+HANDLE_COLOR, WIND_COLOR, OBSTACLE_COLOR = "#30343b", "#6d8fae", "#9aa0a8"
 MAP, SIGNED_MAP = "viridis", "coolwarm"
+
+NEAR = 0.25
+"""How far around the sheets' motion obstacles are in the picture, over its size."""
 
 FLOOR_PIXELS = 512
 """Of the picture on the floor, in each direction."""
@@ -59,6 +64,35 @@ class Bounds:
         """Diagonal [m]."""
         return float(np.linalg.norm(self.high - self.low))
 
+    @property
+    def middle(self) -> Array:
+        """(3,) its centre [m], along x, y and z."""
+        centre: Array = (self.low + self.high) / 2.0 @ self.axes
+        return centre
+
+    def around(self, points: Array) -> Bounds:
+        """A box that holds points (n, 3) along its axes [m], too."""
+        whole = np.concatenate([points, [self.low, self.high]])
+        return Bounds(self.axes, whole.min(axis=0), whole.max(axis=0))
+
+
+def near_points(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Array) -> Array:
+    """(n, 3) where obstacles reach at some times [s], as far as that is near the sheets' motion.
+
+    Coordinates [m] along the axes of the ``bounds`` around it; what is farther away is moved to its limits.
+    """
+    reach = NEAR * bounds.size
+    found = [np.empty((0, 3))]
+    for obstacle in obstacles:
+        for time in times[:1] if obstacle.still else times:
+            if not obstacle.endless:
+                x = obstacle.positions(float(time)) @ bounds.axes.T
+                found.append(np.array([x.min(axis=0), x.max(axis=0)]))
+    corners = np.clip(np.concatenate(found), bounds.low - reach, bounds.high + reach).reshape(-1, 2, 3)
+    which = np.array(list(np.ndindex(2, 2, 2)))
+    points: Array = corners[:, which, np.arange(3)].reshape(-1, 3)
+    return points
+
 
 class SceneDrawing:
     """An off-screen window in which one state after another is drawn.
@@ -75,6 +109,7 @@ class SceneDrawing:
         Range of the colours.
     wind : (3,) float64 or None
         Velocity of the wind [m/s], if it is to be drawn.
+    obstacles : list of ObstacleSurface
     """
 
     def __init__(
@@ -85,6 +120,7 @@ class SceneDrawing:
         quantity: ColourQuantity | None,
         limits: tuple[float, float],
         wind: Array | None,
+        obstacles: list[ObstacleSurface],
     ) -> None:
         self._plan, self._bounds, self._quantity = plan, bounds, quantity
         self._triangles = plan.run.triangles
@@ -100,8 +136,10 @@ class SceneDrawing:
         self._scale = plan.size[1] / 720.0
         key_light = self._add_lights(view)
         self._add_sheet(limits)
+        self._obstacles = [(each, self._add_obstacle(each)) for each in obstacles]
         self._ground = None
-        if plan.options.ground and plan.scene.gravity is not None:
+        floor = plan.options.ground and not any(obstacle.endless for obstacle in obstacles)
+        if floor and plan.scene.gravity is not None:
             self._ground = Ground(bounds, self._triangles, len(plan.run.rest), key_light)
             self._floor = plotter.add_mesh(self._ground.mesh(), color="white", lighting=False)
         self._held = HeldVertices(plan.run) if plan.options.handles else None
@@ -129,6 +167,12 @@ class SceneDrawing:
                 self._sheet.cell_data["colour"] = values
             else:
                 self._sheet.point_data["colour"] = values[self._source]
+        for obstacle, mesh in self._obstacles:
+            if self._first or not obstacle.still:
+                mesh.points = obstacle.positions(time)
+                if obstacle.round:
+                    normals = vertex_normals(np.asarray(mesh.points), obstacle.triangles)
+                    mesh.point_data.active_normals = normals.astype(np.float32)
         if self._ground is not None:
             floor = self._pyvista.Texture(self._ground.picture(x))
             floor.interpolate = True
@@ -187,6 +231,16 @@ class SceneDrawing:
         self._plotter.add_mesh(sheet, reset_camera=False, **light, **look)
         if quantity is not None:
             self._add_bar(quantity)
+
+    def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
+        """Its mesh, in the right place only once a state is drawn."""
+        points = obstacle.positions(0.0)
+        mesh = self._pyvista.PolyData.from_regular_faces(points, obstacle.triangles)
+        look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.round else "flat"}
+        self._plotter.add_mesh(
+            mesh, color=OBSTACLE_COLOR, opacity=obstacle.opacity, reset_camera=False, **look
+        )
+        return mesh
 
     def _add_bar(self, quantity: ColourQuantity) -> None:
         left = 0.64
@@ -302,7 +356,7 @@ def wind_arrows(bounds: Bounds, wind: Array) -> tuple[Array, Array]:
     """Feet (n, 3) of arrows upwind of the motion, and the arrow (3,), all [m]."""
     length = 0.16 * bounds.size
     towards = wind / np.linalg.norm(wind)
-    middle = (bounds.low + bounds.high) / 2.0 @ bounds.axes
+    middle = bounds.middle
     fractions = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     corners = (bounds.low + fractions * (bounds.high - bounds.low)) @ bounds.axes
     upwind = middle + towards * ((corners - middle) @ towards).min()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Window
@@ -67,8 +68,7 @@ class HeldVertices:
             (Window.of(handle), select_vertices(mesh, handle, key=f"handles[{i}]", file=path))
             for i, handle in enumerate(run.scene.handles)
         ]
-        sides = np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-        self._edges: Indices = np.unique(np.sort(sides, axis=1), axis=0)
+        self._edges = unique_edges(mesh.triangles)
 
     def at(self, time: float) -> tuple[Indices, Indices]:
         """Vertices (n,) held at a time [s], and the edges (k, 2) between them."""

@@ -342,7 +342,7 @@ def _output(facts: Facts) -> Iterator[str]:
 def _meshing(facts: Facts) -> Iterator[str]:
     share = facts.share("mesh")
     if share > MUCH_MESHING and facts.phases["mesh"] > 1.0:
-        made = any(source.file and source.file.suffix.lower() == ".geo" for source in facts.run.scene.mesh)
+        made = facts.run.scene.has_scripts
         remedy = " Mesh the .geo once (gmsh -2 FILE.geo) and name the .msh in the scene." if made else ""
         yield f"Reading the mesh took {percent(share)} of the wall time.{remedy}"
 
