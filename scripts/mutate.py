@@ -305,6 +305,18 @@ CHANGES: list[Change] = [
         ("tests/mesh/test_grids.py",),
     ),
     Change(
+        "lyra_petsc/mesh/obstacles.py",
+        "rotation = turn @ start.T",
+        "rotation = turn",
+        ("tests/mesh/test_obstacles.py",),
+    ),
+    Change(
+        "lyra_petsc/show/obstacle_surfaces.py",
+        "((middle - place) @ normal) * normal",
+        "(middle - place)",
+        ("tests/show/test_obstacle_surfaces.py",),
+    ),
+    Change(
         "lyra_petsc/mesh/measures.py",
         "mirror = np.where(determinant < 0.0, -1.0, 1.0)",
         "mirror = np.ones_like(determinant)",

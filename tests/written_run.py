@@ -1,11 +1,12 @@
 """Run folders made by the writers of a run, without simulating."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
 
-from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS, History
 from lyra_petsc.output.mesh_file import write_mesh
@@ -13,6 +14,7 @@ from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.text import parse_yaml
 
 # a square ring: a hole in the middle, and vertices in no order of space
 REST = np.array(
@@ -110,3 +112,26 @@ def written(
         writer.write()
     writer.history.close()
     return folder
+
+
+POST = TriangleSurface(np.array([[3.2, 0, 1], [4, 0, 1], [3.2, 1, 1.0]]), np.array([[0, 1, 2]]))
+"""Half a square beside the ring."""
+MET = {
+    "ball": {
+        "sphere": {"center": [0, 3.6, 0], "radius": 0.3},
+        "motion": [{"time": 0}, {"time": 0.5, "translate": [1.5, 0, 0]}],
+    },
+    "post": {"mesh": {"file": "gone.obj"}},
+}
+
+
+def met(folder: Path, obstacles: dict[str, object] = MET) -> Path:
+    """The run of the ring in a scene with obstacles, of which no mesh file is left."""
+    run = written(folder, states=6)
+    write_mesh(run, replace(ring(), obstacles={"post": POST}), MPI.COMM_SELF)
+    data = parse_yaml((run / "scene.yaml").read_text(), file=None) | {
+        "contact": {"gap": 0.01},
+        "obstacles": obstacles,
+    }
+    (run / "scene.yaml").write_text(dump_scene(Scene.model_validate(data)))
+    return run

@@ -305,7 +305,6 @@ def weigh(content: Content, factor: float) -> Content:
 def release(content: Content) -> Content:
     """Take all handles away."""
     content["handles"] = []
-    content.pop("motions", None)
     return content
 
 
@@ -313,7 +312,7 @@ def move(content: Content, keyframes: list[dict[str, Any]]) -> Content:
     """Move all handles alike, for ever, linearly between the keyframes."""
     if not content.get("handles"):
         raise NotHere("needs a handle")
-    content["motions"] = {"stress": keyframes}
+    content["motions"] = {**(content.get("motions") or {}), "stress": keyframes}  # obstacles keep theirs
     for handle in content["handles"]:
         handle |= {"motion": "stress", "interpolation": "linear", "from": 0.0}
         for key in ("until", "fade"):

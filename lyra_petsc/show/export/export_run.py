@@ -35,16 +35,19 @@ class ExportFormat:
         What it needs of the extra ``export``.
     fields : bool
         Whether it holds more than positions.
+    sequence : bool
+        Whether each state has a file, which does not hold its time.
     """
 
     module: str
     packages: tuple[str, ...] = ()
     fields: bool = True
+    sequence: bool = False
 
 
 FORMATS = {
-    "obj": ExportFormat("obj_and_ply", fields=False),
-    "ply": ExportFormat("obj_and_ply", ("meshio",)),
+    "obj": ExportFormat("obj_and_ply", fields=False, sequence=True),
+    "ply": ExportFormat("obj_and_ply", ("meshio",), sequence=True),
     "gltf": ExportFormat("gltf", ("pygltflib",), fields=False),
     "usd": ExportFormat("usd", ("pxr",)),
     "vtkhdf": ExportFormat("npz_and_vtkhdf"),
@@ -122,7 +125,7 @@ def export_run(
     def work(part: Path) -> None:
         module = import_module(f"lyra_petsc.show.export.{FORMATS[to].module}")
         getattr(module, f"write_{to}")(states, part, name)
-        if len(list(part.iterdir())) > 1:  # whose files do not hold their times
+        if FORMATS[to].sequence and len(states) > 1:
             with open(part / "times.csv", "w", encoding="utf-8", newline="") as file:
                 table = csv.writer(file, lineterminator="\n")
                 table.writerow(("file", "state", "time"))

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import StoredRun
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 
@@ -71,6 +77,28 @@ class ExportedStates:
             start = self.run.positions[0]
             return (position - start for position in self.positions)
         return (self.run.field(name)[i] for i in self.chosen)
+
+    @cached_property
+    def obstacles(self) -> dict[str, ObstacleSurface]:
+        """The run's obstacles, by names of letters, digits and underscores, each another, none ``cloth``."""
+        if not self.run.scene.obstacles:
+            return {}
+        from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
+
+        boxes = [(x.min(axis=0), x.max(axis=0)) for x in self.positions]
+        low, high = np.min([a for a, _ in boxes], axis=0), np.max([b for _, b in boxes], axis=0)
+        named: dict[str, ObstacleSurface | None] = {"cloth": None}
+        for surface in obstacle_surfaces(self.run, (low + high) / 2.0, float(np.linalg.norm(high - low))):
+            label = re.sub(r"\W", "_", surface.name, flags=re.ASCII)
+            label = f"_{label}" if label[:1].isdigit() else label
+            while label in named:
+                label += "_"
+            named[label] = surface
+        return {label: surface for label, surface in named.items() if surface is not None}
+
+    def places(self, obstacle: ObstacleSurface) -> Iterator[Array]:
+        """(n, 3) positions [m] of an obstacle's points in each state."""
+        return (obstacle.positions(float(time)) for time in self.times)
 
     @property
     def up(self) -> tuple[int, int]:

@@ -29,7 +29,8 @@ def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>.npz``, one state in memory at a time.
 
     ``time`` (T,), ``position`` (T, V, 3), each field (T, …), ``triangles`` (F, 3), ``rest`` (V, 3), where the
-    mesh has them ``uv`` (V, 2) or ``corner_uv`` (F, 3, 2), and ``names`` and ``units`` (n,) of all of these.
+    mesh has them ``uv`` (V, 2) or ``corner_uv`` (F, 3, 2), of each obstacle ``obstacle_<name>`` (T, n, 3) and
+    ``triangles_of_<name>`` (m, 3), and ``names`` and ``units`` (n,) of all of these.
     """
     run = states.run
     fixed = {"time": states.times, "triangles": run.triangles, "rest": run.rest}
@@ -40,6 +41,10 @@ def write_npz(states: ExportedStates, folder: Path, name: str) -> None:
     units = {"time": "s", "triangles": "1", "rest": "m", "uv": "m", "corner_uv": "m", "position": "m"}
     units |= {field: run.field_units(field) for field in states.fields}
     moving = {"position": states.positions} | {field: states.field(field) for field in states.fields}
+    for label, obstacle in states.obstacles.items():
+        moving[f"obstacle_{label}"] = states.places(obstacle)
+        fixed[f"triangles_of_{label}"] = obstacle.triangles
+        units |= {f"obstacle_{label}": "m", f"triangles_of_{label}": "1"}
     names = [*fixed, *moving]
     fixed |= {"names": np.array(names), "units": np.array([units[one] for one in names])}
     with zipfile.ZipFile(folder / f"{name}.npz", "w", zipfile.ZIP_STORED) as archive:
@@ -66,36 +71,68 @@ def _write_array(
 def write_vtkhdf(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>.vtkhdf``: times, positions, rest shape and all fields, in double precision.
 
+    Obstacles have files of their own, ``<name>-<obstacle>.vtkhdf``.
+
     Raises
     ------
     OutputError
         If it cannot be written.
     """
-    run, n = states.run, len(states)
-    path = folder / f"{name}.vtkhdf"
-    samples = {field: next(states.field(field)) for field in states.fields}
-    size = sum(array.nbytes for array in (run.positions[states.chosen[0]], *samples.values())) * n
+    run = states.run
+    fields = {field: (states.field_on(field), states.field(field)) for field in states.fields}
+    moving = {"Points": ("vertex", states.positions), **fields}
+    _write_moving(folder / f"{name}.vtkhdf", states.times, run.triangles, {"rest": run.rest}, moving)
+    for label, obstacle in states.obstacles.items():
+        path, places = folder / f"{name}-{label}.vtkhdf", states.places(obstacle)
+        _write_moving(path, states.times, obstacle.triangles, {}, {"Points": ("vertex", places)})
+
+
+def _write_moving(
+    path: Path,
+    times: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    fixed: dict[str, NDArray[np.float64]],
+    moving: dict[str, tuple[str, Iterator[NDArray[Any]]]],
+) -> None:
+    """Write a file of triangles.
+
+    Parameters
+    ----------
+    path : Path
+    times : (T,)
+        Of the states [s].
+    triangles : (F, 3)
+    fixed : dict of arrays
+        On vertices, the same in all states.
+    moving : dict of (str, iterator)
+        For each state an array on the vertices or triangles; ``Points`` are the positions [m].
+    """
+    n, arrays, samples = len(times), {}, {}
+    for field, (_, each) in moving.items():
+        samples[field] = next(each)
+        arrays[field] = chain([samples[field]], each)
+    size = n * sum(array.nbytes for array in samples.values()) + 2 * triangles.nbytes + 64 * n + OVERHEAD
     try:
-        _reserve(path, size + 2 * run.rest.nbytes + 2 * run.triangles.nbytes + 64 * n + OVERHEAD)
+        _reserve(path, size + 2 * sum(array.nbytes for array in fixed.values()))
+        places = {}
         with import_h5py().File(path, "w") as file:
-            root = describe(file, states.times.tolist(), len(run.rest), len(run.triangles))
-            for key, array in cells(run.triangles).items():
+            root = describe(file, times.tolist(), len(samples["Points"]), len(triangles))
+            for key, array in cells(triangles).items():
                 root[key] = array
-            root["PointData/rest"] = run.rest
-            add_offsets(root, "vertex", "rest", n, 0)
-            moving = {"Points": states.positions}
-            _allocate(root, "Points", (n * len(run.rest), 3), np.dtype(np.float64))
+            for key, array in fixed.items():
+                root[f"PointData/{key}"] = array
+                add_offsets(root, "vertex", key, n, 0)
             for field, first in samples.items():
-                on = states.field_on(field)
-                place = f"{GROUPS[on]}/{field}"
-                _allocate(root, place, (n * len(first), *first.shape[1:]), first.dtype)
-                add_offsets(root, on, field, n, len(first))
-                moving[place] = states.field(field)
+                on = moving[field][0]
+                places[field] = field if field == "Points" else f"{GROUPS[on]}/{field}"
+                _allocate(root, places[field], (n * len(first), *first.shape[1:]), first.dtype)
+                if field != "Points":
+                    add_offsets(root, on, field, n, len(first))
         _reserve(path, path.stat().st_size)
         with import_h5py().File(path, "r+") as file:
-            for place, arrays in moving.items():
-                stored = file[f"VTKHDF/{place}"]
-                for i, array in enumerate(arrays):
+            for field, each in arrays.items():
+                stored = file[f"VTKHDF/{places[field]}"]
+                for i, array in enumerate(each):
                     stored[i * len(array) : (i + 1) * len(array)] = in_vtk_order(array)
     except InputError:
         raise

@@ -9,17 +9,35 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.show.export.exported_states import ExportedStates
 
 
 def write_obj(states: ExportedStates, folder: Path, name: str) -> None:
-    """Write ``<name>_0000.obj``, …; texture coordinates where the mesh came with them."""
+    """Write ``<name>_0000.obj``, …; texture coordinates where the mesh came with them.
+
+    Where there are obstacles, they and the cloth are objects (``o``), the cloth first.
+    """
     texture, faces = _texture_and_faces(states)
+    moving = {label: states.places(obstacle) for label, obstacle in states.obstacles.items()}
     for number, (time, position) in enumerate(zip(states.times, states.positions, strict=True)):
-        points = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in position.tolist())
-        text = f"# state {states.chosen[number]}, t = {time!r} s; m\n{points}{texture}{faces}"
-        (folder / f"{name}_{number:04d}.obj").write_text(text, encoding="utf-8")
+        text = [f"# state {states.chosen[number]}, t = {time!r} s; m\n", "o cloth\n" if moving else ""]
+        text += [_points(position), texture, faces]
+        before = len(position)
+        for label, places in moving.items():
+            x = next(places)
+            text += [f"o {label}\n", _points(x), _faces(states.obstacles[label].triangles + before + 1)]
+            before += len(x)
+        (folder / f"{name}_{number:04d}.obj").write_text("".join(text), encoding="utf-8")
+
+
+def _points(x: NDArray[np.float64]) -> str:
+    return "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in x.tolist())
+
+
+def _faces(corners: NDArray[np.int64]) -> str:
+    return "".join(f"f {a} {b} {c}\n" for a, b, c in corners.tolist())
 
 
 def _texture_and_faces(states: ExportedStates) -> tuple[str, str]:
@@ -27,7 +45,7 @@ def _texture_and_faces(states: ExportedStates) -> tuple[str, str]:
     run = states.run
     corners = run.triangles + 1
     if run.corner_uv is None:
-        return "", "".join(f"f {a} {b} {c}\n" for a, b, c in corners.tolist())
+        return "", _faces(corners)
     if run.uv is not None:
         uv, places = run.uv, corners
     else:
@@ -41,7 +59,8 @@ def _texture_and_faces(states: ExportedStates) -> tuple[str, str]:
 def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>_0000.ply``, …: binary, double precision, with the fields on vertices.
 
-    Texture coordinates are ``s`` and ``t``; a texture with seams is left out.
+    Texture coordinates are ``s`` and ``t``; a texture with seams is left out. Obstacles have files of their
+    own, ``<name>-<obstacle>_0000.ply``, ….
     """
     import meshio
 
@@ -59,3 +78,7 @@ def write_ply(states: ExportedStates, folder: Path, name: str) -> None:
                 data |= {f"{field}_{axis}": rows[:, i] for i, axis in enumerate("xyz")}
         mesh = meshio.Mesh(position, [("triangle", triangles)], point_data=data)
         meshio.write(folder / f"{name}_{number:04d}.ply", mesh, binary=True)
+    for label, obstacle in states.obstacles.items():
+        cells = [("triangle", obstacle.triangles.astype(np.int32))]
+        for number, x in enumerate(states.places(obstacle)):
+            meshio.write(folder / f"{name}-{label}_{number:04d}.ply", meshio.Mesh(x, cells), binary=True)

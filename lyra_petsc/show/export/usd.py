@@ -14,12 +14,14 @@ from lyra_petsc.show.export.exported_states import ExportedStates, turned_up
 
 ROOT = "/run"
 MESH = f"{ROOT}/cloth"
+OBSTACLE = (0.6, 0.63, 0.66)
 
 
 def write_usd(states: ExportedStates, folder: Path, name: str) -> None:
     """Write ``<name>.usdc``, single precision; metres, seconds times ``timeCodesPerSecond``.
 
     Up is the direction against gravity. Velocities are the mesh's, other fields primvars of their names.
+    Obstacles are meshes beside the cloth.
 
     Raises
     ------
@@ -39,7 +41,7 @@ def write_usd(states: ExportedStates, folder: Path, name: str) -> None:
 
 
 def _fill(stage: Any, states: ExportedStates) -> None:
-    from pxr import Gf, Sdf, UsdGeom, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     run = states.run
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -62,11 +64,7 @@ def _fill(stage: Any, states: ExportedStates) -> None:
     stage.SetStartTimeCode(codes[0])
     stage.SetEndTimeCode(codes[-1])
 
-    mesh = UsdGeom.Mesh.Define(stage, MESH)
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(run.triangles), 3))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(run.triangles.astype(np.int32).ravel()))
-    mesh.CreateSubdivisionSchemeAttr("none")
-    mesh.CreateDoubleSidedAttr(True)
+    mesh = _mesh(stage, MESH, run.triangles)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     if run.corner_uv is not None:
         uv, place = run.uv, UsdGeom.Tokens.vertex
@@ -75,13 +73,40 @@ def _fill(stage: Any, states: ExportedStates) -> None:
         st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, place)
         st.Set(Vt.Vec2fArray.FromNumpy(uv.astype(np.float32)))
 
-    points, extent = mesh.CreatePointsAttr(), mesh.CreateExtentAttr()
-    for code, position in zip(codes, states.positions, strict=True):
-        single = np.ascontiguousarray(position, dtype=np.float32)
-        points.Set(Vt.Vec3fArray.FromNumpy(single), code)
-        extent.Set(Vt.Vec3fArray.FromNumpy(np.stack([single.min(axis=0), single.max(axis=0)])), code)
+    for moment, position in zip(codes, states.positions, strict=True):
+        _put(mesh, position, moment)
     for field in states.fields:
         _sample(mesh, primvars, states, field, codes)
+    for label, obstacle in states.obstacles.items():
+        mesh = _mesh(stage, f"{ROOT}/{label}", obstacle.triangles)
+        mesh.GetPrim().SetDisplayName(obstacle.name)
+        mesh.CreateDisplayColorAttr([Gf.Vec3f(*OBSTACLE)])
+        mesh.CreateDisplayOpacityAttr([obstacle.opacity])
+        moments = codes[:1] if obstacle.still else codes
+        for moment, position in zip(moments, states.places(obstacle), strict=False):
+            _put(mesh, position, Usd.TimeCode.Default() if obstacle.still else moment)
+
+
+def _mesh(stage: Any, place: str, triangles: NDArray[np.int64]) -> Any:
+    """A mesh without points, seen from both sides."""
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, place)
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr("none")
+    mesh.CreateDoubleSidedAttr(True)
+    return mesh
+
+
+def _put(mesh: Any, x: NDArray[np.float64], code: Any) -> None:
+    """The points (n, 3) [m] of a mesh at a time code."""
+    from pxr import Vt
+
+    single = np.ascontiguousarray(x, dtype=np.float32)
+    mesh.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(single), code)
+    corners = np.stack([single.min(axis=0), single.max(axis=0)])
+    mesh.CreateExtentAttr().Set(Vt.Vec3fArray.FromNumpy(corners), code)
 
 
 def _sample(mesh: Any, primvars: Any, states: ExportedStates, field: str, codes: list[float]) -> None:

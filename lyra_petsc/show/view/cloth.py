@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the windows)
@@ -16,12 +16,16 @@ from lyra_petsc.show.render.camera import PerspectiveCamera
 from lyra_petsc.show.render.sheet_geometry import vertex_normals
 from lyra_petsc.show.view.page_content import Colours
 
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
+
 Array = NDArray[np.float64]
 
 BACKGROUND = (0.955, 0.96, 0.97)
 PLAIN = (0.77, 0.34, 0.28)
 EDGES = (0.15, 0.15, 0.18)
 HELD, WIND, MARK = (0.19, 0.2, 0.23), (0.43, 0.56, 0.68), (0.9, 0.0, 0.5)
+OBSTACLE = (0.6, 0.63, 0.66)
 
 
 class Cloth:
@@ -56,6 +60,7 @@ class Cloth:
         self._renderer.SetBackground(*BACKGROUND)
         self._renderer.AddActor(actor)
         self._held, self._wind, self._mark = (self._add(color) for color in (HELD, WIND, MARK))
+        self._obstacles: list[tuple[ObstacleSurface, vtkPolyData, vtkActor]] = []
         self.window = vtkRenderWindow()
         self.window.AddRenderer(self._renderer)
 
@@ -72,6 +77,39 @@ class Cloth:
         look.SetLineWidth(4.0)
         self._renderer.AddActor(actor)
         return data
+
+    def set_obstacles(self, obstacles: list[ObstacleSurface]) -> None:
+        """Replace the obstacles; they have no positions until `show_obstacles`."""
+        for _, _, actor in self._obstacles:
+            self._renderer.RemoveActor(actor)
+        self._obstacles = []
+        for obstacle in obstacles:
+            data, mapper, actor = vtkPolyData(), vtkPolyDataMapper(), vtkActor()
+            data.SetPoints(vtkPoints())
+            data.SetPolys(_triangles(obstacle.triangles))
+            mapper.SetInputData(data)
+            actor.SetMapper(mapper)
+            look = actor.GetProperty()
+            look.SetColor(*OBSTACLE)
+            look.SetOpacity(obstacle.opacity)
+            if not obstacle.round:
+                look.SetInterpolationToFlat()
+            self._renderer.AddActor(actor)
+            self._obstacles.append((obstacle, data, actor))
+
+    def show_obstacles(self, time: float) -> None:
+        """Show the obstacles where they are at a time [s]."""
+        for obstacle, data, _ in self._obstacles:
+            if obstacle.still and data.GetNumberOfPoints():
+                continue
+            x = obstacle.positions(time)
+            data.GetPoints().SetData(_as_vtk(x.astype(np.float32)))
+            data.GetPoints().Modified()
+            if obstacle.round:
+                normals = _as_vtk(vertex_normals(x, obstacle.triangles).astype(np.float32))
+                normals.SetName("Normals")
+                data.GetPointData().SetNormals(normals)
+            data.Modified()
 
     def show_held(self, positions: Array, edges: NDArray[np.int64]) -> None:
         """Show held vertices (n, 3) [m] and the edges (k, 2) between them; none to hide them."""
@@ -101,11 +139,9 @@ class Cloth:
     def set_mesh(self, triangles: NDArray[np.int64]) -> None:
         """Replace the triangles; the vertices have no positions until the next `show`."""
         self._triangles = triangles
-        cells = vtkCellArray()
-        cells.SetData(3, _as_vtk(triangles.ravel()))
         self._data.Initialize()
         self._data.SetPoints(vtkPoints())
-        self._data.SetPolys(cells)
+        self._data.SetPolys(_triangles(triangles))
 
     def show(self, positions: Array, colours: Colours | None, *, on_triangles: bool = False) -> None:
         """Set positions and colours.
@@ -151,6 +187,12 @@ class Cloth:
         camera.SetFocalPoint(*view.target)
         camera.SetViewUp(*view.up)
         camera.SetViewAngle(view.angle)
+
+
+def _triangles(corners: NDArray[np.int64]) -> vtkCellArray:
+    cells = vtkCellArray()
+    cells.SetData(3, _as_vtk(corners.ravel()))
+    return cells
 
 
 def _put(data: vtkPolyData, places: Array, edges: NDArray[np.int64], *, points: bool = True) -> None:

@@ -8,7 +8,7 @@ import time as clock
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,14 @@ from lyra_petsc.output.run_folder import in_use
 from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.render_plan import scene_shown
-from lyra_petsc.show.render.scene_drawing import Bounds, wind_arrows
+from lyra_petsc.show.render.scene_drawing import Bounds, near_points, wind_arrows
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
 from lyra_petsc.show.view.access import Access
 from lyra_petsc.show.view.cloth import Cloth
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 
@@ -139,6 +142,7 @@ class Page:
         self._pressed: tuple[float, float] | None = None
         self._positions = run.positions[0]
         self._held: HeldVertices | None = None
+        self._obstacles: list[ObstacleSurface] | None = None
         self._find_handles()
         self._unit = "" if run.scene.time.analysis == "static" else "s"
         self._figures: dict[str, dict[str, Any]] = {}
@@ -313,6 +317,7 @@ class Page:
         else:
             self.cloth.show(positions, colours, on_triangles=on_triangles)
             self._positions = positions
+            self.cloth.show_obstacles(float(run.times[index]))
             self._show_around(index)
         state.bar = self._palette.bar() if self._palette else None
         state.frame, state.playing = index, self._player.playing
@@ -341,6 +346,19 @@ class Page:
         with suppress(LyraError):  # then without them
             self._held = HeldVertices(self._run) if self._run.scene.handles else None
 
+    def _find_obstacles(self) -> None:
+        """The obstacles, planes as squares where the motion now is."""
+        self._obstacles = []
+        if not self._run.scene.obstacles:
+            self.cloth.set_obstacles([])
+            return
+        from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
+
+        with suppress(LyraError):  # then without them
+            self._obstacles = obstacle_surfaces(self._run, self._bounds.middle, self._bounds.size)
+        self.cloth.set_obstacles(self._obstacles)
+        self.cloth.show_obstacles(float(self._run.times[max(self._shown, 0)]))
+
     def _show_wind(self) -> Array:
         """Show arrows along the wind, or hide them; (n, 3) where they begin and end [m]."""
         wind, feet, arrow = self._run.scene.wind, np.empty((0, 3)), np.zeros(3)
@@ -363,6 +381,11 @@ class Page:
         n, whole = len(fit.normals), reaches.max(axis=0)
         self._bounds = Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
         reach = fit.most(reaches[:, :n])
+        if self._obstacles is None:
+            self._find_obstacles()
+        times = run.times[content.sample(len(run), MOTION_STATES)]
+        near = near_points(self._obstacles or (), self._bounds, times)
+        reach = np.maximum(reach, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
         arrows = self._show_wind()
         if len(arrows):
             reach = np.maximum(reach, (arrows @ fit.normals.T).max(axis=0))
@@ -436,6 +459,7 @@ class Page:
             self.cloth.set_mesh(self._triangles)
             self._probe = None
             self._find_handles()
+            self._obstacles = None
             self._offer_quantities()
             self.fit()
             self._again()

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from written_run import REST, TRIANGLES, position, scene, stress, velocity, written
+from written_run import POST, REST, TRIANGLES, met, position, scene, stress, velocity, written
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.obj_file import read_obj
@@ -308,3 +308,86 @@ def test_json_of_a_glb_holds_no_empty_values(tmp_path):
     text = json.dumps(json.loads(raw[20 : 20 + length]))
     assert "null" not in text
     assert "[]" not in text
+
+
+def read_objects(to, folder):
+    """Of each obstacle in an export of two states: its points (2, n, 3) and its triangles (m, 3)."""
+    if to == "obj":
+        found = {}
+        for file in sorted(folder.glob("*.obj")):
+            _, cloth, *others = file.read_text().split("\no ")
+            assert cloth.startswith("cloth\nv ")
+            before = len(REST)
+            for text in others:
+                name, *lines = text.splitlines()
+                rows = {kind: [line.split()[1:] for line in lines if line[0] == kind] for kind in "vf"}
+                x, faces = (np.array(rows[kind], dtype=float) for kind in "vf")
+                found.setdefault(name, ([], faces.astype(int) - before - 1))[0].append(x)
+                before += len(x)
+        return {name: (np.array(x), faces) for name, (x, faces) in found.items()}
+    if to == "npz":
+        data = np.load(folder / "run.npz")
+        assert dict(zip(data["names"], data["units"], strict=True))["obstacle_ball"] == "m"
+        names = [name.removeprefix("obstacle_") for name in data if name.startswith("obstacle_")]
+        return {name: (data[f"obstacle_{name}"], data[f"triangles_of_{name}"]) for name in names}
+    if to == "ply":
+        meshio = pytest.importorskip("meshio")
+        found = {}
+        for file in sorted(folder.glob("run-*.ply")):
+            mesh = meshio.read(file)
+            name = file.stem.removeprefix("run-")[:-5]
+            found.setdefault(name, ([], mesh.cells_dict["triangle"]))[0].append(mesh.points)
+        return {name: (np.array(x), faces) for name, (x, faces) in found.items()}
+    if to == "vtkhdf":
+        read = pytest.importorskip("vtkhdf_reader").read
+        steps = {file.stem.removeprefix("run-"): read(file) for file in folder.glob("run-*")}
+        return {name: (np.array([x for _, x, _, _ in each]), each[0][2]) for name, each in steps.items()}
+    if to == "gltf":
+        gltf, read = read_glb(folder / "run.glb")
+        found, moving = {}, {channel.target.node for channel in gltf.animations[0].channels}
+        assert 0 in moving
+        for number, node in enumerate(gltf.nodes[1:], 1):
+            (primitive,) = gltf.meshes[node.mesh].primitives
+            assert gltf.materials[primitive.material].name.endswith("obstacle")
+            x = [read(primitive.attributes.POSITION)]
+            assert (number in moving) == bool(primitive.targets)
+            x.append(x[0] + (read(primitive.targets[0]["POSITION"]) if primitive.targets else 0))
+            found[node.name] = np.array(x), read(primitive.indices).reshape(-1, 3)
+        return found
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    stage, found = Usd.Stage.Open(str(folder / "run.usdc")), {}
+    for prim in stage.GetDefaultPrim().GetChildren()[1:]:
+        mesh = UsdGeom.Mesh(prim)
+        x = [np.array(mesh.GetPointsAttr().Get(code)) for code in (0.0, 1.0)]
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+        found[prim.GetName()] = np.array(x), faces
+    return found
+
+
+@pytest.mark.parametrize("to", ["obj", "ply", "npz", "vtkhdf", "gltf", "usd"])
+def test_obstacles_are_objects_of_their_own(tmp_path, to):
+    """A ball that moves 1.5 m along x and a triangle that stands still; the cloth is as without them."""
+    export_run(met(tmp_path / "run"), to, tmp_path / "out", times="0,0.5")
+    found = read_objects(to, tmp_path / "out")
+    assert set(found) == {"ball", "post"}
+    x, faces = found["ball"]
+    assert len(x) == 2
+    for points, centre in zip(x, ([0, 3.6, 0], [1.5, 3.6, 0]), strict=True):
+        np.testing.assert_allclose(np.linalg.norm(points - centre, axis=1), 0.3, rtol=0, atol=1e-6)
+    a, b, c = np.moveaxis(x[1][faces], 1, 0)
+    assert (np.cross(a, b) * c).sum() / 6.0 == pytest.approx(4 / 3 * np.pi * 0.3**3, rel=0.01)
+    x, faces = found["post"]
+    np.testing.assert_allclose(x, [POST.points] * 2, rtol=1e-6)
+    np.testing.assert_array_equal(faces, POST.triangles)
+
+
+def test_names_of_obstacles_in_files_are_different(tmp_path):
+    ball = {"sphere": {"center": [0, 0, 0], "radius": 1}}
+    names = ["cloth", "a b", "a_b", "2/1", "ü"]
+    done = export_run(met(tmp_path / "run", dict.fromkeys(names, ball)), "obj", every=99)
+    lines = (done.folder / done.files[0]).read_text().splitlines()
+    objects = [line[2:] for line in lines if line.startswith("o ")]
+    assert objects == ["cloth", "cloth_", "a_b", "a_b_", "_2_1", "_"]
+    assert done.files == ("run_0000.obj",)

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from PIL import Image
-from written_run import written
+from written_run import met, written
+from written_run import ring as ring_mesh
 
 from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.show.render import opengl
 from lyra_petsc.show.render.draw import draw
@@ -269,3 +271,58 @@ def test_a_state_that_one_rank_cannot_read_ends_all(comm, shared_tmp):
     with pytest.raises(InputError, match=r"states-0000\.h5"):
         draw(comm, plan, lambda done, count: None)
     assert not (shared_tmp / "f.mp4").exists()
+
+
+def grey(image: np.ndarray, x: float, y: float) -> bool:
+    """Whether an obstacle is seen at a point of the plane z = 0."""
+    red, green, blue = image[pixel(x, y)]
+    return bool(max(red, green, blue) < 1.35 * min(red, green, blue) and max(red, green, blue) < 200)
+
+
+def test_obstacles_are_where_they_are_at_each_time(tmp_path):
+    """A ball that moves 1.5 m to the right in 0.5 s, and a mesh, which is in the run's own folder."""
+    run = met(tmp_path / "run")
+    start, end = (picture(run, tmp_path, at=at) for at in ("0", "0.5"))
+    for image, here, there in ((start, 0.0, 1.5), (end, 1.5, 0.0)):
+        assert grey(image, here, 3.6)
+        assert grey(image, here + 0.2, 3.6)
+        assert not grey(image, there, 3.6)
+        assert grey(image, 3.5, 0.2)  # the mesh, half a square, stands still
+        assert not grey(image, 3.9, 0.9)
+
+
+def test_planes_and_containers_hide_no_sheet(tmp_path):
+    plane = {"plane": {"point": [0, 0, 2], "normal": [0, 0, -1]}}
+    hull = {"box": {"min": [-9, -9, -9], "max": [9, 9, 4]}, "inside": True}
+    plain = picture(met(tmp_path / "plain", obstacles={}), tmp_path)
+    for number, (kind, least) in enumerate(((plane, 0.3), (hull, 0.05))):
+        image = picture(met(tmp_path / f"{number}", obstacles={"one": kind}), tmp_path)
+        there = pixel(0.5, 1.5)
+        assert image[there][0] > 1.2 * image[there][1:].max()  # red through it
+        change = np.abs(image - plain).max(axis=2)
+        assert change[there] > least * 255 * 0.3
+        assert change[pixel(1.5, 1.5)] > 5  # where the sheet has its hole
+
+
+def test_obstacles_are_in_the_picture(tmp_path):
+    """A ball beside the sheet is seen whole without a camera of the scene's; a far one takes little room."""
+    images = []
+    for number, x in enumerate((4.0, 400.0, None)):
+        ball = {"ball": {"sphere": {"center": [x, 1.5, 0], "radius": 0.5}}} if x is not None else {}
+        run = met(tmp_path / f"{number}", obstacles=ball)
+        images.append(picture(run, tmp_path, settings=("render.camera.direction=[0,0,1]",)))
+    near, _, none = images
+    dark = np.abs(near - none).max(axis=2)
+    assert (dark > 30).sum() > 100
+    red = [(image[:, :, 0] > 1.5 * image[:, :, 1]).sum() for image in images]
+    assert red[0] < red[2]
+    assert 0.3 * red[2] < red[1] < red[2]
+    edge = near[:, [0, -1]].reshape(-1, 3)
+    assert (np.ptp(edge, axis=1) < 30).all()
+
+
+def test_a_run_without_the_mesh_of_an_obstacle_is_damaged(tmp_path):
+    run = met(tmp_path / "run")
+    write_mesh(run, ring_mesh(), MPI.COMM_SELF)
+    with pytest.raises(InputError, match="does not hold the mesh of obstacle 'post'"):
+        picture(run, tmp_path)

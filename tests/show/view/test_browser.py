@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from written_run import Writer, written
+from written_run import MET, Writer, met, written
 
 pytestmark = pytest.mark.slow
 
@@ -161,6 +161,28 @@ def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
 
     assert seen.complaints() == []
     assert seen.asked_elsewhere(page.url) == []
+
+
+def test_obstacles_are_shown_and_move(serve, browser, tmp_path):
+    """A ball behind the sheet that moves to the right, a post that stays, and a plane seen through."""
+    above = {"plane": {"point": [0, 0, 5], "normal": [0, 0, -1]}}
+    run = met(tmp_path / "run", MET | {"above": above})
+    looks = ("position=[1.5,1.5,12]", "target=[1.5,1.5,0]")
+    served = serve(run, *(word for look in looks for word in ("--set", f"render.camera.{look}")))
+    seen = Seen(browser, served.url)
+
+    def ball():
+        """Mean column of what is dark grey in the upper part of the picture, over its width."""
+        picture = seen.picture()
+        top = picture[: len(picture) // 6]
+        found = (np.ptp(top, axis=2) < 22) & (top.max(axis=2) < 175)
+        return float(np.flatnonzero(found.any(axis=0)).mean()) / top.shape[1] if found.any() else 0.0
+
+    seen.until(lambda: 0.49 < ball() < 0.6)  # the newest state, as the run goes on
+    assert seen.picture()[2, 2].max() < 225  # the background through the plane
+    seen.element("first").click()
+    seen.until(lambda: 0.2 < ball() < 0.4)
+    assert seen.complaints() == []
 
 
 def test_hand_and_eye(serve, browser, tmp_path):
