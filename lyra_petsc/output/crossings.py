@@ -8,13 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.crossings import have_common_vertex, mutual_crossings, self_crossings
-from lyra_petsc.mesh.obstacles import Body, Container, made
+from lyra_petsc.mesh.obstacles import Body, Container
 from lyra_petsc.mesh.overlaps import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.xdmf import MESH_FILE
-from lyra_petsc.terms.motion import Motion
+from lyra_petsc.output.run_obstacles import run_obstacles
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -56,16 +54,9 @@ class RunCrossings:
 
     def __init__(self, run: StoredRun) -> None:
         self._run = run
-        obstacles = run.scene.obstacles or {}
-        meshes = {name for name, obstacle in obstacles.items() if obstacle.mesh is not None}
-        stored = run.mesh.obstacles if meshes else {}
-        if missing := meshes - stored.keys():
-            raise InputError(
-                f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE
-            )
+        boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
         self._overlaps = {
-            one.name: _overlap(one, run.triangles, is_box=obstacles[one.name].box is not None)
-            for one in made(run.scene, stored, Motion)
+            one.name: _overlap(one, run.triangles, is_box=one.name in boxes) for one in run_obstacles(run)
         }
 
     def of(self, state: int) -> StateCrossings:
