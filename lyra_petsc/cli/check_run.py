@@ -1,4 +1,4 @@
-"""``check`` of a run's folder: triangles that cross in its states."""
+"""``check`` of a run's folder: what crosses in its states."""
 
 from __future__ import annotations
 
@@ -8,16 +8,22 @@ from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 
+from lyra_petsc.mesh.overlaps import Overlaps
 from lyra_petsc.output.agreement import on_each
-from lyra_petsc.output.crossings import state_crossings
+from lyra_petsc.output.crossings import RunCrossings
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.parallel import on_root
 
-NAMED = 3
-"""Pairs of a state that are named."""
+Ints = NDArray[np.int64]
 
-ROW = "{:>5} {:>11} {:>16} {:>17}  {}"
+NAMED = 3
+"""Pairs of a state that are named, and at least as many obstacles."""
+
+PAIRS = "{:>5} {:>11} {:>16} {:>17}  "
+INSIDE = "{:>11} {:>8} {:>12}  "
+"""Columns of the table; the second where the scene has obstacles."""
 
 
 def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
@@ -29,12 +35,12 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     folder : Path
         Of the run, which may go on.
     crossings : bool
-        Crossings are a failure also without contact in the scene.
+        Crossings of sheets are a failure also where the scene has no contact of sheets with themselves.
 
     Returns
     -------
     int
-        Exit code: 1 if anything crosses in a run with contact, or with ``crossings``.
+        Exit code: 1 if anything crosses that contact rules out, or with ``crossings`` at all.
 
     Raises
     ------
@@ -42,51 +48,65 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
         If it is not the folder of a run, or is damaged.
     """
     run = on_root(comm, lambda: StoredRun(folder))
-    time, contact = on_root(comm, lambda: _kind(run))
+    scene = on_root(comm, lambda: run.scene)
+    look = on_each(comm, lambda: RunCrossings(run))
+    row = PAIRS + (INSIDE if scene.obstacles else "")
+    time = "load factor" if scene.time.analysis == "static" else "time [s]"
+    heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
     _say(comm, f"{folder}: {len(run)} states; pairs of triangles that cross, with")
-    _say(comm, ROW.format("state", time, "no common vertex", "one common vertex", "first pairs"))
-    counts: list[int] = []
+    _say(comm, row.format("state", time, *heads) + "first")
+    rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_each(comm, partial(_of_state, run, begin + comm.rank))
+        found = on_each(comm, partial(_of_state, look, begin + comm.rank, len(run)))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
-                counts.append(one.pairs + one.corner_pairs)
-                times = f"{run.times[state]:g}"
-                _say(comm, ROW.format(state, times, one.pairs, one.corner_pairs, one.first))
-    crossed = sum(count > 0 for count in counts)
-    if crossed:
-        most = f"most in state {int(np.argmax(counts))}: {max(counts)} pairs"
-        _say(comm, f"crossings in {crossed} of {len(run)} states, {most}")
-    else:
-        _say(comm, f"no crossings in {len(run)} states")
-    if not contact:
-        remedy = "" if crossings else "; --crossings makes a crossing exit code 1"
-        _say(comm, f"the scene has no contact{remedy}")
-    return int(crossed > 0 and (contact or crossings))
+                rows.append(one.counts)
+                _say(comm, row.format(state, f"{run.times[state]:g}", *one.counts) + one.first)
+    counts = np.array(rows)
+    pairs, inside = counts[:, :2].sum(axis=1), counts[:, 2:].sum(axis=1)
+    _say(comm, _summary("crossings", pairs, "pairs"))
+    if scene.obstacles:
+        _say(comm, _summary("parts of sheets in obstacles", inside, "vertices, edges and triangles"))
+    judged = crossings or (scene.contact is not None and scene.contact.self)
+    if not judged:
+        _say(comm, "the scene has no contact of sheets; --crossings makes a crossing exit code 1")
+    return int(inside.any() or (judged and pairs.any()))
 
 
 class _Found(NamedTuple):
-    """What is told of a state: how many pairs cross without and with a common vertex, and the first."""
+    """What is told of a state: the numbers of its row, and what is named."""
 
-    pairs: int
-    corner_pairs: int
+    counts: tuple[int, ...]
     first: str
 
 
-def _kind(run: StoredRun) -> tuple[str, bool]:
-    """What the times of a run's states are, and whether its scene has contact."""
-    static = run.scene.time.analysis == "static"
-    return "load factor" if static else "time [s]", getattr(run.scene, "contact", None) is not None
-
-
-def _of_state(run: StoredRun, state: int) -> _Found | None:
+def _of_state(look: RunCrossings, state: int, end: int) -> _Found | None:
     """What crosses in a state; None beyond the last one."""
-    if state >= len(run):
+    if state >= end:
         return None
-    found = state_crossings(run, state)
-    first = np.concatenate([found.pairs[:NAMED], found.corner_pairs[:NAMED]])[:NAMED]
-    named = ", ".join(f"{one}-{other}" for one, other in first.tolist())
-    return _Found(len(found.pairs), len(found.corner_pairs), named)
+    found = look.of(state)
+    inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
+    in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else (0, 0, 0)
+    pairs = np.concatenate([found.pairs[:NAMED], found.corner_pairs[:NAMED]])[:NAMED]
+    first = [f"{one}-{other}" for one, other in pairs.tolist()]
+    first += [_where(name, overlap) for name, overlap in found.overlaps.items() if len(overlap.triangles)]
+    return _Found((len(found.pairs), len(found.corner_pairs), *in_all), ", ".join(first[: 2 * NAMED]))
+
+
+def _where(name: str, overlap: Overlaps) -> str:
+    """An obstacle, and the first that is in it."""
+    if len(overlap.vertices):
+        return f"{name}: vertex {overlap.vertices[0]}"
+    return f"{name}: triangle {overlap.triangles[0]}"
+
+
+def _summary(what: str, counts: Ints, of: str) -> str:
+    if not counts.any():
+        return f"no {what} in {len(counts)} states"
+    most = int(counts.argmax())
+    return (
+        f"{what} in {(counts > 0).sum()} of {len(counts)} states, most in state {most}: {counts[most]} {of}"
+    )
 
 
 def _say(comm: MPI.Comm, line: str) -> None:

@@ -104,7 +104,7 @@ def run(
 def check(
     comm: Any, path: Path | None, settings: tuple[str, ...], trust_mesh: bool, schema: bool, crossings: bool
 ) -> int:
-    """Check SCENE and print what a run would do; runs nothing. Of RUN, count the triangles that cross."""
+    """Check SCENE and print what a run would do; runs nothing. Of RUN, count what crosses in its states."""
     from lyra_petsc.parallel import on_root
 
     if crossings and path is None:

@@ -199,7 +199,7 @@ def _search(
 ) -> tuple[Any, Any]:
     """The pairs of a query and a triangle of the tree that cross or are undecided, and which are decided.
 
-    ``within``: queries and triangles are the same; each pair is looked at once, none with a common edge.
+    ``within``: queries and triangles are the same; each pair is looked at once.
     """
     pairs, decided, count = np.empty((64, 2), np.int64), np.empty(64, np.bool_), 0
     leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
@@ -223,8 +223,6 @@ def _search(
                 if (within and j <= i) or _apart(least, most, low[place], high[place]):
                     continue
                 d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
-                if (a in (d, e, f)) + (b in (d, e, f)) + (c in (d, e, f)) > 1:
-                    continue
                 found = _crossing(points, a, b, c, d, e, f)
                 if found == 0:
                     continue

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.schema import Cuboid, Keyframe, Obstacle, Scene, coefficients
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

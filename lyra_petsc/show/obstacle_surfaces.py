@@ -9,13 +9,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import TriangleSurface
-from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Body, Container, axis_of, box_corners, made
+from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Body, Container, axis_of, box_corners
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.xdmf import MESH_FILE
+from lyra_petsc.output.run_obstacles import run_obstacles
 from lyra_petsc.scene.schema import Obstacle
-from lyra_petsc.terms.motion import Motion
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -78,19 +76,19 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
     scene = run.scene
     if not scene.obstacles:
         return []
-    meshes = {name for name, obstacle in scene.obstacles.items() if obstacle.mesh is not None}
-    stored = run.mesh.obstacles if meshes else {}
-    if missing := meshes - stored.keys():
-        raise InputError(f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE)
     shown = []
-    for one, obstacle in zip(made(scene, stored, Motion), scene.obstacles.values(), strict=True):
+    for one, obstacle in zip(run_obstacles(run), scene.obstacles.values(), strict=True):
         still = one.motion is None
         if obstacle.plane is not None:
             assert isinstance(one, Container)
             place = partial(_square, one, _tangents(one.normals[0]), middle, 0.5 * PLANE_SIZE * size)
             shown.append(ObstacleSurface(one.name, _SQUARE, place, still, True, PLANE_OPACITY))
             continue
-        surface = stored[one.name] if obstacle.mesh is not None else shape_surface(obstacle)
+        if obstacle.mesh is not None:
+            assert isinstance(one, Body)
+            surface = TriangleSurface(one.points, one.triangles)
+        else:
+            surface = shape_surface(obstacle)
         place = partial(_carried, one, surface.points)
         opacity = CONTAINER_OPACITY if obstacle.inside else 1.0
         smooth = obstacle.shape in ("sphere", "capsule")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from launch import lyra
 from mpi4py import MPI
-from written_run import scene
 
 from lyra_petsc.cli.check_run import check_run
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.mesh import Mesh
+from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
 from lyra_petsc.output.atomic import replace_text
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
@@ -32,15 +32,34 @@ ALL[5:] = [[1, 0, 9], [1.5, 0.25, -9], [1.5, -0.25, -9]]
 """And the third through both."""
 
 
-@pytest.fixture
-def folder(shared_tmp: Path) -> Path:
-    """A run with five states, of which two have crossings."""
-    comm, path = MPI.COMM_SELF, shared_tmp / "run"
+BASE = {
+    "mesh": {"grid": {"width": 1, "height": 1, "nx": 1, "ny": 1}},
+    "material": {"density": 0.1, "membrane": {"c11": 1, "c22": 1, "c12": 0, "c33": 1}},
+    "time": {"end": 1.0, "step": 0.1},
+}
+OBSTACLES = {
+    "floor": {"plane": {"point": [0, 0, -0.25], "normal": [0, 0, 3]}},
+    "ball": {
+        "sphere": {"center": [1, 0, -19], "radius": 0.5},
+        "motion": [{"time": 0.1 * k, "translate": [0, 0, z]} for k, z in ((1, 0), (2, 19), (3, 0))],
+    },
+    "wall": {"mesh": {"file": "wall.obj"}},
+    "room": {"box": {"min": [-5, -5, -5], "max": [5, 5, 7]}, "inside": True},
+    "bowl": {"sphere": {"center": [0, 0, 0], "radius": 8}, "inside": True},
+    "crate": {"box": {"min": [1.9, -0.1, 0.9], "max": [2.1, 0.1, 1.1]}},
+}
+WALL = TriangleSurface(np.array([[0, 0.25, 5.25], [2, 0.25, 5.25], [1, 0.25, 9]]), np.array([[0, 1, 2]]))
+
+
+def written(path: Path, **keys: object) -> Path:
+    """A run with five states, of which two have crossings, and keys of its scene."""
+    comm = MPI.COMM_SELF
     if MPI.COMM_WORLD.rank == 0:
         path.mkdir()
-        uv = REST[TRIANGLES][..., :2]
-        write_mesh(path, Mesh(REST, REST, TRIANGLES, uv, np.ones(3, dtype=bool), has_uv=False), comm)
-        replace_text(path / "scene.yaml", dump_scene(scene()))
+        mesh = Mesh(REST, REST, TRIANGLES, REST[TRIANGLES][..., :2], np.ones(3, dtype=bool), has_uv=False)
+        mesh.obstacles.update({"wall": WALL} if "obstacles" in keys else {})
+        write_mesh(path, mesh, comm)
+        replace_text(path / "scene.yaml", dump_scene(Scene.model_validate({**BASE, **keys})))
         orders = [FileOrder(comm, np.arange(n), n) for n in (len(REST), len(TRIANGLES))]
         states = StateWriter(path, *orders, n_triangles=len(TRIANGLES))
         for i, x in enumerate((REST, DOWN, REST, ALL, REST)):
@@ -49,9 +68,15 @@ def folder(shared_tmp: Path) -> Path:
     return path
 
 
+@pytest.fixture
+def folder(shared_tmp: Path) -> Path:
+    """A run without contact."""
+    return written(shared_tmp / "run")
+
+
 TABLE = """\
 run: 5 states; pairs of triangles that cross, with
-state    time [s] no common vertex one common vertex  first pairs
+state    time [s] no common vertex one common vertex  first
     0           0                0                 0
     1         0.1                0                 1  0-1
     2         0.2                0                 0
@@ -59,29 +84,55 @@ state    time [s] no common vertex one common vertex  first pairs
     4         0.4                0                 0
 crossings in 2 of 5 states, most in state 3: 3 pairs
 """
-NO_CONTACT = "the scene has no contact"
-REMEDY = "; --crossings makes a crossing exit code 1"
+NO_CONTACT = "the scene has no contact of sheets; --crossings makes a crossing exit code 1\n"
 
 
 @pytest.mark.parallel
 @pytest.mark.quick
-@pytest.mark.parametrize(("contact", "asked", "code"), [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 1)])
+@pytest.mark.parametrize(
+    ("contact", "asked", "code"),
+    [
+        (None, False, 0),
+        (None, True, 1),
+        ({}, False, 1),
+        ({"self": False}, False, 0),
+        ({"self": False}, True, 1),
+    ],
+)
 def test_crossings_are_counted_on_any_number_of_ranks(
     comm: MPI.Comm,
-    folder: Path,
+    shared_tmp: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    contact: int,
+    contact: object,
     asked: int,
     code: int,
 ) -> None:
-    if contact:
-        monkeypatch.setattr(Scene, "contact", {}, raising=False)
-    monkeypatch.chdir(folder.parent)
+    written(shared_tmp / "run", **({} if contact is None else {"contact": contact}))
+    monkeypatch.chdir(shared_tmp)
     assert check_run(comm, Path("run"), crossings=bool(asked)) == code
     said = capsys.readouterr().out
-    end = "" if contact else NO_CONTACT + ("" if asked else REMEDY) + "\n"
-    assert said == (TABLE + end if comm.rank == 0 else "")
+    assert said == (TABLE + ("" if code else NO_CONTACT) if comm.rank == 0 else "")
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("alone", [False, True])
+def test_obstacles(comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixture[str], alone: bool) -> None:
+    """Of the second state a vertex is below the floor; the ball comes to the third one and leaves."""
+    run = written(shared_tmp / "run", contact={"self": not alone}, obstacles=OBSTACLES)
+    assert check_run(comm, run) == 1
+    said = [line.split(maxsplit=7) for line in capsys.readouterr().out.splitlines()]
+    if comm.rank == 0:
+        assert [" ".join(row[2:]) for row in said[2:7]] == [
+            "0 0 1 2 2 wall: triangle 2, crate: vertex 3",
+            "0 1 1 3 3 0-1, floor: vertex 3, wall: triangle 2, crate: triangle 1",
+            "0 0 1 5 4 ball: triangle 0, wall: triangle 2, crate: vertex 3",
+            "2 1 9 12 5 0-2, 1-2, 0-1, floor: vertex 3, room: vertex 5, bowl: vertex 5",
+            "0 0 1 2 2 wall: triangle 2, crate: vertex 3",
+        ]
+        assert " ".join(said[8]).startswith(
+            "parts of sheets in obstacles in 5 of 5 states, most in state 3: 26"
+        )
 
 
 @pytest.mark.parallel
@@ -95,10 +146,10 @@ def test_a_damaged_state_is_told_by_all_ranks(comm: MPI.Comm, folder: Path) -> N
 
 def test_the_verb(folder: Path) -> None:
     told = lyra(["check", "run"], folder.parent)
-    assert (told.code, told.out) == (0, TABLE + NO_CONTACT + REMEDY + "\n")
+    assert (told.code, told.out) == (0, TABLE + NO_CONTACT)
     for ranks in (1, 2):
         judged = lyra(["check", "run", "--crossings"], folder.parent, ranks=ranks)
-        assert (judged.code, judged.out) == (1, TABLE + NO_CONTACT + "\n")
+        assert (judged.code, judged.out) == (1, TABLE)
     for words, why in (
         (["run", "--set", "time.end=1"], "run: for the folder of a run there is no option but --crossings"),
         (["run", "--schema"], "run: for the folder of a run there is no option but --crossings"),
@@ -113,9 +164,8 @@ def test_the_verb(folder: Path) -> None:
 
 
 def test_a_run_of_the_program_without_crossings(tmp_path: Path) -> None:
-    square = scene().model_dump_json()  # which falls nowhere
-    (tmp_path / "scene.json").write_text(square)
+    (tmp_path / "scene.json").write_text(json.dumps(BASE))
     assert lyra(["run", "scene.json", "--out", "run"], tmp_path).code == 0
     checked = lyra(["check", "run", "--crossings"], tmp_path)
     assert checked.code == 0, checked.err
-    assert "no crossings in" in checked.out
+    assert checked.out.endswith("no crossings in 26 states\n")

@@ -58,12 +58,11 @@ def cross_in_numbers(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def brute(points: np.ndarray, triangles: np.ndarray) -> list[list[int]]:
-    """All pairs without a common edge that cross."""
+    """All pairs that cross."""
     return [
         [i, j]
         for i, j in itertools.combinations(range(len(triangles)), 2)
-        if len({*triangles[i]} & {*triangles[j]}) < 2
-        and cross_in_numbers(points[triangles[i]], points[triangles[j]])
+        if cross_in_numbers(points[triangles[i]], points[triangles[j]])
     ]
 
 
@@ -99,6 +98,19 @@ def test_soups_of_triangles_on_integers(size: int) -> None:
         found += len(expected)
         assert self_crossings(points, triangles).tolist() == expected
     assert found > 20
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0, 1e4])
+def test_soups_of_triangles_within_rounding_of_where_they_touch(offset: float) -> None:
+    found = 0
+    for seed in range(10):
+        points, triangles = soup(seed, 2, 12, 25)
+        points = 0.1 * points + offset
+        points += np.spacing(points) * np.random.default_rng(seed).integers(-1, 2, points.shape)
+        expected = brute(points, triangles)
+        found += len(expected)
+        assert self_crossings(points, triangles).tolist() == expected
+    assert found > 200
 
 
 def test_more_triangles_than_a_leaf_and_more_pairs_than_room_at_first() -> None:

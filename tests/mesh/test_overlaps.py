@@ -25,7 +25,7 @@ def turned() -> np.ndarray:
     return np.asarray(axes * np.linalg.det(axes))
 
 
-def cloud(triangle: np.ndarray, n: int = 60) -> np.ndarray:
+def cloud(triangle: np.ndarray, n: int = 40) -> np.ndarray:
     """Points of a triangle on a lattice, its edges and corners included."""
     i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     i, j = i[i + j <= n] / n, j[i + j <= n] / n
@@ -72,13 +72,13 @@ def scattered(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray]:
 def test_balls_and_capsules_against_points_within_triangles(axis: list[list[float]]) -> None:
     ends = np.array(axis)
     judged = np.zeros((2, 3, 2))
-    for seed in range(4):
+    for seed in range(2):
         points, triangles = scattered(seed, 1.0)
         found = in_ball(points, triangles, ends, 0.4)
         judged[0] += compare(found, points, triangles, lambda x: 0.4 - from_axis(x, ends))
         found = out_of_ball(points, triangles, ends, 1.8)
         judged[1] += compare(found, points, triangles, lambda x: from_axis(x, ends) - 1.8)
-    assert (judged > 3).all()
+    assert (judged > 1).all()
 
 
 def test_boxes_against_points_within_triangles() -> None:
@@ -96,16 +96,18 @@ def test_boxes_against_points_within_triangles() -> None:
         points *= 0.25
         found = beyond_planes(points, triangles, on_planes, normals)
         judged[1] += compare(found, points, triangles, lambda x: -depth(x))
-    assert (judged > 3).all()
+    assert (judged > 1).all()
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e3])
-def test_spheres_that_touch_and_that_do_not(shift: float) -> None:
-    triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]]) + shift
-    over = np.array([[0.0, 0, 1]]) + shift
+@pytest.mark.parametrize("turn", [np.eye(3), turned()])
+def test_spheres_that_touch_and_that_do_not(turn: np.ndarray, shift: float) -> None:
+    triangle = np.array([[-1.0, -1, 0], [2, -1, 0], [-1, 2, 0]]) @ turn.T + shift
+    over = np.array([[0.0, 0, 1]]) @ turn.T + shift
     assert counts(in_ball(triangle, ONE, over, 1.0)) == (0, 0, 0)
     assert counts(in_ball(triangle, ONE, over, 1.0 + 1e-9)) == (0, 0, 1)
     assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) - 1e-9)) == (0, 0, 1)
+    assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5))) == (0, 0, 1)
     assert counts(in_ball(triangle, ONE, over, np.sqrt(1.5) + 1e-9)) == (0, 1, 1)
     assert counts(in_ball(triangle, ONE, over, np.sqrt(3.0) + 1e-9)) == (1, 3, 1)
     assert counts(out_of_ball(triangle, ONE, over, np.sqrt(6.0))) == (0, 0, 0)

@@ -6,13 +6,16 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.show.obstacle_surfaces import ObstacleSurface, obstacle_surfaces
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 
@@ -80,6 +83,8 @@ class ExportedStates:
         """The run's obstacles, by names of letters, digits and underscores, each another, none ``cloth``."""
         if not self.run.scene.obstacles:
             return {}
+        from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
+
         boxes = [(x.min(axis=0), x.max(axis=0)) for x in self.positions]
         low, high = np.min([a for a, _ in boxes], axis=0), np.max([b for _, b in boxes], axis=0)
         named: dict[str, ObstacleSurface | None] = {"cloth": None}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
 from lyra_petsc.show.render.camera import Fit, upwards
 from lyra_petsc.show.render.colour_quantities import PERCENTILES, ColourQuantity, quantity
 from lyra_petsc.show.render.image_files import contact_sheet, film_writer, half_size, write_png
 from lyra_petsc.show.render.render_plan import RenderPlan, run_line_of_sight
 from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, near_points, wind_arrows
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -82,10 +85,12 @@ def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
     reaches, values = (np.concatenate(comm.allgather(part)) for part in (reaches, values))
     n, whole = len(fit.normals), reaches.max(axis=0)
     reach, bounds = fit.most(reaches[:, :n]), Bounds(axes, -whole[n + 3 :], whole[n : n + 3])
-    obstacles = on_each(comm, lambda: obstacle_surfaces(plan.run, bounds.middle, bounds.size))
-    near = on_each(comm, lambda: near_points(obstacles, bounds, plan.run.times[plan.motion]))
-    reach = np.maximum(reach, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
-    bounds = bounds.around(near)
+    obstacles: list[ObstacleSurface] = []
+    if plan.scene.obstacles:
+        obstacles = on_each(comm, lambda: _obstacles(plan, bounds))
+        near = near_points(obstacles, bounds, plan.run.times[plan.motion])
+        reach = np.maximum(reach, (near @ axes @ fit.normals.T).max(axis=0, initial=-np.inf))
+        bounds = bounds.around(near)
     limits = (0.0, 1.0) if shown is None else shown.limits(values, plan.limits)
     wind = None
     if plan.options.wind and plan.scene.wind is not None:
@@ -95,6 +100,12 @@ def _fitted_drawing(comm: MPI.Comm, plan: RenderPlan) -> SceneDrawing:
         reach = np.maximum(reach, (ends @ fit.normals.T).max(axis=0))
     view = fit.view(reach)
     return on_each(comm, lambda: SceneDrawing(plan, view, bounds, shown, limits, wind, obstacles))
+
+
+def _obstacles(plan: RenderPlan, bounds: Bounds) -> list[ObstacleSurface]:
+    from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces  # of use for nothing else
+
+    return obstacle_surfaces(plan.run, bounds.middle, bounds.size)
 
 
 def _shown(plan: RenderPlan) -> ColourQuantity | None:

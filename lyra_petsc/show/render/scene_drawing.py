@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
 from lyra_petsc.show.render.opengl import import_pyvista
 from lyra_petsc.show.render.render_plan import RenderPlan, decimals
 from lyra_petsc.show.render.sheet_geometry import HeldVertices, split_at_seams, vertex_normals
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

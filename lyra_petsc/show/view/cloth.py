@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the windows)
@@ -12,10 +12,12 @@ from vtkmodules.vtkCommonCore import vtkLogger, vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
 
-from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 from lyra_petsc.show.render.camera import PerspectiveCamera
 from lyra_petsc.show.render.sheet_geometry import vertex_normals
 from lyra_petsc.show.view.page_content import Colours
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 

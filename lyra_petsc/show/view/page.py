@@ -8,7 +8,7 @@ import time as clock
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from trame_vtk.modules.vtk.serializers import SynchronizationContext
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import StoredRun, read_history
 from lyra_petsc.output.run_folder import in_use
-from lyra_petsc.show.obstacle_surfaces import ObstacleSurface, obstacle_surfaces
 from lyra_petsc.show.render.camera import Fit, line_of_sight, upwards
 from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.render_plan import scene_shown
@@ -30,6 +29,9 @@ from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
 from lyra_petsc.show.view.access import Access
 from lyra_petsc.show.view.cloth import Cloth
+
+if TYPE_CHECKING:
+    from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
 Array = NDArray[np.float64]
 
@@ -347,6 +349,11 @@ class Page:
     def _find_obstacles(self) -> None:
         """The obstacles, planes as squares where the motion now is."""
         self._obstacles = []
+        if not self._run.scene.obstacles:
+            self.cloth.set_obstacles([])
+            return
+        from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces
+
         with suppress(LyraError):  # then without them
             self._obstacles = obstacle_surfaces(self._run, self._bounds.middle, self._bounds.size)
         self.cloth.set_obstacles(self._obstacles)

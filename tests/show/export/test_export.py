@@ -2,10 +2,11 @@
 
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
-from written_run import position, written
+from written_run import met, position, written
 
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.show.export import obj_and_ply
@@ -121,3 +122,24 @@ def test_a_full_disk(tmp_path, to):
         assert list(disk.iterdir()) == []
     finally:
         subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def test_what_has_no_obstacles_does_not_import_them(tmp_path):
+    """Neither to set a scene up nor to export its run; with some they are."""
+    code = """
+import sys
+from lyra_petsc.mesh.build import mesh_of
+from lyra_petsc.show.export.export_run import export_run
+from lyra_petsc.output.read_run import StoredRun
+import lyra_petsc.show.render.draw
+mesh_of(StoredRun(sys.argv[1]).scene)
+export_run(sys.argv[1], "obj")
+print("lyra_petsc.mesh.obstacles" in sys.modules)
+"""
+    ball = {"ball": {"sphere": {"center": [0, 0, 0], "radius": 1}}}
+    for run, expected in (
+        (written(tmp_path / "without"), "False"),
+        (met(tmp_path / "with", obstacles=ball), "True"),
+    ):
+        done = subprocess.run([sys.executable, "-c", code, run], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
