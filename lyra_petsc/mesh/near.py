@@ -14,6 +14,13 @@ MOST_CELLS = 1 << 22
 
 
 @cached()
+def _cell(place, origin, size, n):  # type: ignore[no-untyped-def]
+    """Which of n cells a coordinate is in, or nearest to."""
+    # of a plane that is one but for rounding, farther cells than whole numbers can count
+    return int(min(max((place - origin) / size, 0.0), n - 1.0))
+
+
+@cached()
 def _pairs(low, high, other_low, other_high, origin, size, n, same, first, items, out):  # type: ignore[no-untyped-def]
     """Overlapping pairs into out (m, 2), of which only as many are written as fit; how many there are.
 
@@ -24,8 +31,8 @@ def _pairs(low, high, other_low, other_high, origin, size, n, same, first, items
     lo, hi, other = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     for a in range(len(low)):
         for k in range(3):
-            lo[k] = min(max(int((low[a, k] - origin[k]) / size[k]), 0), n[k] - 1)
-            hi[k] = min(max(int((high[a, k] - origin[k]) / size[k]), 0), n[k] - 1)
+            lo[k] = _cell(low[a, k], origin[k], size[k], n[k])
+            hi[k] = _cell(high[a, k], origin[k], size[k], n[k])
         for i in range(lo[0], hi[0] + 1):
             for j in range(lo[1], hi[1] + 1):
                 for k in range(lo[2], hi[2] + 1):
@@ -41,7 +48,7 @@ def _pairs(low, high, other_low, other_high, origin, size, n, same, first, items
                         if apart:
                             continue
                         for m in range(3):
-                            other[m] = min(max(int((other_low[b, m] - origin[m]) / size[m]), 0), n[m] - 1)
+                            other[m] = _cell(other_low[b, m], origin[m], size[m], n[m])
                         if (
                             i == max(lo[0], other[0])
                             and j == max(lo[1], other[1])
@@ -57,12 +64,12 @@ def _pairs(low, high, other_low, other_high, origin, size, n, same, first, items
 def _cells(low, high, origin, size, n, first, items, fill):  # type: ignore[no-untyped-def]
     """Count the boxes of each cell into first (cells + 1,), or put them into ``items`` from there on."""
     for b in range(len(low)):
-        lo0 = min(max(int((low[b, 0] - origin[0]) / size[0]), 0), n[0] - 1)
-        lo1 = min(max(int((low[b, 1] - origin[1]) / size[1]), 0), n[1] - 1)
-        lo2 = min(max(int((low[b, 2] - origin[2]) / size[2]), 0), n[2] - 1)
-        hi0 = min(max(int((high[b, 0] - origin[0]) / size[0]), 0), n[0] - 1)
-        hi1 = min(max(int((high[b, 1] - origin[1]) / size[1]), 0), n[1] - 1)
-        hi2 = min(max(int((high[b, 2] - origin[2]) / size[2]), 0), n[2] - 1)
+        lo0 = _cell(low[b, 0], origin[0], size[0], n[0])
+        lo1 = _cell(low[b, 1], origin[1], size[1], n[1])
+        lo2 = _cell(low[b, 2], origin[2], size[2], n[2])
+        hi0 = _cell(high[b, 0], origin[0], size[0], n[0])
+        hi1 = _cell(high[b, 1], origin[1], size[1], n[1])
+        hi2 = _cell(high[b, 2], origin[2], size[2], n[2])
         for i in range(lo0, hi0 + 1):
             for j in range(lo1, hi1 + 1):
                 for k in range(lo2, hi2 + 1):

@@ -1,0 +1,80 @@
+"""Overlapping boxes against a comparison of all with all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.near import overlapping
+
+Array = NDArray[np.float64]
+
+SIZES: dict[str, float | list[float]] = {
+    "small": 0.05,
+    "large": 0.5,
+    "long and thin": [3.0, 0.01, 0.1],
+    "points": 0.0,
+    "of very different size": [0.0, 1e-3, 30.0],
+}
+
+
+def boxes(rng: np.random.Generator, n: int, size: float | list[float]) -> tuple[Array, Array]:
+    low = rng.normal(size=(n, 3))
+    return low, low + rng.random((n, 3)) * size
+
+
+def brute(low: Array, high: Array, other_low: Array, other_high: Array) -> NDArray[np.bool_]:
+    apart = (low[:, None] > other_high) | (high[:, None] < other_low)
+    return np.asarray(~apart.any(axis=2))
+
+
+def as_set(pairs: NDArray[np.int64]) -> set[tuple[int, int]]:
+    found = [(int(a), int(b)) for a, b in pairs]
+    assert len(found) == len(set(found)), "pairs are named once"
+    return set(found)
+
+
+@pytest.mark.parametrize("n", [1, 50, 300])
+@pytest.mark.parametrize("size", SIZES)
+def test_against_brute_force(n: int, size: str) -> None:
+    rng = np.random.default_rng(n)
+    low, high = boxes(rng, n, SIZES[size])
+    others = boxes(rng, n + 7, SIZES[size])
+    assert as_set(overlapping(low, high, others)) == as_set(np.argwhere(brute(low, high, *others)))
+    mutual = np.argwhere(np.triu(brute(low, high, low, high), 1))
+    assert as_set(overlapping(low, high)) == as_set(mutual)
+
+
+@pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
+def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
+    """Cells are then thinner than any distance by more than whole numbers can tell."""
+    rng = np.random.default_rng(5)
+    low = rng.random((400, 3)) * [1.0, 1.0, thickness]
+    high = low + rng.random((400, 3)) * [0.05, 0.05, 0.0]
+    mine = rng.random((60, 3)) * [1.0, 1.0, 0.2]
+    found = overlapping(mine - 0.1, mine + 0.1, (low, high))
+    assert as_set(found) == as_set(np.argwhere(brute(mine - 0.1, mine + 0.1, low, high)))
+    assert len(found) > 60
+
+
+def test_one_box_among_many_is_far_away() -> None:
+    low = np.vstack([np.random.default_rng(2).random((500, 3)), [[1e6, -1e6, 1e6]]])
+    high = low + 0.05
+    assert as_set(overlapping(low, high)) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
+
+
+def test_what_touches_overlaps() -> None:
+    low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
+    assert overlapping(low, high).tolist() == [[0, 1]]
+
+
+def test_more_pairs_than_there_is_room_for_at_first() -> None:
+    low = np.zeros((200, 3))
+    assert len(overlapping(low, low + 1.0)) == 200 * 199 // 2
+
+
+@pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
+def test_none(n: tuple[int, int]) -> None:
+    mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
+    assert overlapping(mine, mine, (others, others)).shape == (0, 2)
