@@ -49,5 +49,6 @@ CASES: Registry[VerificationCase] = Registry(
         "coiling-strip": "cantilevers",
         "cloth-overhang": "cantilevers",
         "strip-vibration": "hinges",
+        "incline": "contacts",
     },
 )
