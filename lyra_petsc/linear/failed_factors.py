@@ -1,6 +1,7 @@
 """A factorisation that failed is forgotten, as PETSc would report its failure ever after.
 
-So it does for incomplete factors, block Jacobi and MUMPS, whatever the matrix becomes. MUMPS estimates its
+So it does for incomplete factors, MUMPS, and all that holds another solver (block Jacobi, redundant factors),
+whatever the matrix becomes. MUMPS estimates its
 workspace before it factors; on several ranks the order of events decides what it needs, and its margin of
 20 % is not always enough (MUMPS users' guide, ICNTL(14) and INFOG(1) = -8, -9, -17, -20).
 """
@@ -9,7 +10,9 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-MADE_OF_FACTORS = frozenset({"lu", "cholesky", "ilu", "icc", "bjacobi", "asm"})
+MADE_OF_FACTORS = frozenset(
+    {"lu", "cholesky", "ilu", "icc", "bjacobi", "asm", "gasm", "redundant", "telescope", "ksp"}
+)
 """Preconditioners that options alone make again; multigrid would lose its levels."""
 
 LACKS_ROOM = (-8, -9, -17, -20)

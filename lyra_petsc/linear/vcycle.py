@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.linear import failed_factors
 from lyra_petsc.linear import gauss_seidel as sweeps
 from lyra_petsc.linear.hierarchy import Hierarchy, Level
 from lyra_petsc.linear.matrix import AssembledMatrix
@@ -187,6 +188,7 @@ class Coarsest:
 
     def set(self, values: Array, free: Array) -> None:
         """Take new block rows (n_blocks, 3, 3); collective."""
+        failed_factors.forget(self._ksp)
         self.matrix.set(values)
         self._ksp.setOperators(self.matrix.mat)
 

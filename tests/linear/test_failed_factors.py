@@ -9,13 +9,18 @@ from petsc4py import PETSc
 from physics import gathered, grid, scene_of
 
 from lyra_petsc.linear.failed_factors import MARGIN, forget
+from lyra_petsc.linear.hierarchy import Level
+from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
+from lyra_petsc.linear.presets import PRESETS
+from lyra_petsc.linear.vcycle import Coarsest
+from lyra_petsc.mesh.points import Points
 from lyra_petsc.stepping.simulation import SteppedScene
 
 FAILED = PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
 WORKSPACE = "mat_mumps_icntl_14"
 
 
-@pytest.mark.parametrize("kind", ["ilu", "bjacobi", "cholesky"])
+@pytest.mark.parametrize("kind", ["ilu", "bjacobi", "gasm", "cholesky", "redundant", "telescope", "ksp"])
 def test_a_better_matrix_has_factors_again(kind: str) -> None:
     mat = PETSc.Mat().createBAIJ(((12, 12), (12, 12)), 3, nnz=4, comm=PETSc.COMM_SELF)
 
@@ -46,6 +51,25 @@ def test_a_better_matrix_has_factors_again(kind: str) -> None:
     pc = ksp.getPC()
     assert not forget(ksp)
     assert ksp.getPC() == pc
+
+
+@pytest.mark.parallel
+def test_the_coarsest_level_is_solved_again(comm: MPI.Comm) -> None:
+    for name, value in PRESETS["multigrid"].items():
+        if name.startswith("mg_coarse_"):
+            PETSc.Options().setValue(name, value)
+    points = Points(comm, 4 * np.arange(comm.size + 1), np.empty(0, dtype=np.int64))
+    level = Coarsest(Level(points, BlockPattern.of_keys(diagonal_keys(4, 4), 4, 4)))
+    found = []
+    for stiffness in (0.0, 2.0):
+        level.set(np.tile(stiffness * np.eye(3), (4, 1, 1)), np.ones((4, 3)))
+        level.b[:] = 1.0
+        level.solve()
+        found.append(level.x.copy())
+    level.destroy()
+    points.destroy()
+    assert not np.isfinite(found[0]).any()
+    np.testing.assert_allclose(found[1], 0.5)
 
 
 def test_petscs_multigrid_keeps_its_levels() -> None:
