@@ -139,7 +139,7 @@ class Newton:
             return False
         before = y.copy()
         y.setArray(-way.ravel())
-        downwards = residual.dot(y) > 0.0
+        downwards = bool(residual.dot(y) > 0.0)
         if not downwards:
             before.copy(y)
         before.destroy()
