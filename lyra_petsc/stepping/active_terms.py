@@ -26,9 +26,9 @@ class ActiveTerms:
     ----------
     elastic, viscous, loads : list of Term
         By kind.
-    sheet, constraints, moving, limiting : list of Elastic
-        Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move
-        and those that limit the length of Newton's steps.
+    sheet, constraints, moving, limiting, edged : list of Elastic
+        Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
+        those that limit the length of Newton's steps, and those with unknowns on edges.
     coarse : dict of Elastic → Elastic
         Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
     frozen : dict of Term
@@ -44,6 +44,7 @@ class ActiveTerms:
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.moving = [term for term in self.sheet if term.registration.moving]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
+        self.edged = [term for term in self.elastic if term.registration.edge_state]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)
 
@@ -69,6 +70,5 @@ class ActiveTerms:
 
     def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
-        for term in self.elastic:
-            if term.registration.edge_state:
-                term.accept(x, (frozen or self.frozen)[term])
+        for term in self.edged:
+            term.accept(x, (frozen or self.frozen)[term])

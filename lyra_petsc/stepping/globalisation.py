@@ -51,6 +51,11 @@ class Globalisation:
             self._equations.new_iterate(None)
         return self._returns
 
+    @property
+    def trusts(self) -> bool:
+        """Whether the next step is taken in full."""
+        return self._watchdog.trusts
+
     def search_along(self, slope: float) -> None:
         """The next trial points lie along a direction in which the energy falls by ``slope`` [W]."""
         self._slope = slope

@@ -120,6 +120,8 @@ class Newton:
             self.more_linear += self._ksp.getIterationNumber()
             changed = True
             useless = self._useless(residual, y)
+        if self.globalisation.trusts:
+            changed |= self._follow_triangles(x, residual, y)
         if self._equations.active.limiting:
             fraction = self._equations.largest_step(self._array(x), -self._array(y))
             y.scale(fraction)
@@ -129,6 +131,19 @@ class Newton:
         self._from, self._length = x.copy(), y.norm()
         self.globalisation.search_along(residual.dot(y))
         return changed
+
+    def _follow_triangles(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Let directors follow their triangles in a step y that is taken in full; whether any does."""
+        way = -self._array(y)
+        if not self._equations.follow_triangles(self._array(x), way):
+            return False
+        before = y.copy()
+        y.setArray(-way.ravel())
+        downwards = bool(residual.dot(y) > 0.0)
+        if not downwards:
+            before.copy(y)
+        before.destroy()
+        return downwards
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

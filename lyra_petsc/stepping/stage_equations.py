@@ -141,7 +141,7 @@ class StageEquations:
         their area nothing else is left.
         """
         least = np.zeros((self.points.n_local, 3))
-        for term in self.active.limiting:
+        for term in self.active.edged:
             least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
         found: Array = least[: self.points.n_owned].max(axis=1)
         return found
@@ -290,10 +290,9 @@ class StageEquations:
         whether any did, and the vertices' forces are others; collective.
         """
         found: dict[Term, Any] = {}
-        for term in () if self._at_end else self.active.limiting:
-            if term.registration.edge_state:
-                nearer = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
-                found |= {} if nearer is None else {term: nearer}
+        for term in () if self._at_end else self.active.edged:
+            nearer = term.nearer(self._xs, self.active.frozen[term], self.prescribed.mask)
+            found |= {} if nearer is None else {term: nearer}
         if not self.points.comm.allreduce(len(found), MPI.MAX):
             return False
         self.active.frozen = self.active.frozen | found
@@ -302,20 +301,23 @@ class StageEquations:
         self.objective.forget()
         return True
 
-    def open_directors(self, v: Array) -> None:
-        """Let no unknown of an edge at velocities v (n_owned, 3) make the energy infinite, where it need not;
-        collective.
+    def follow_triangles(self, v: Array, way: Array) -> bool:
+        """Let unknowns of edges that go far on the way from v by ``way`` (n_owned, 3) [m/s] turn with their
+        triangles; whether any does; collective.
+
+        On the tangent at v the vertices go beside their circles, and directors far beyond.
         """
-        if not self.active.limiting or np.isfinite(self.objective(v)[0]):
-            return
-        x, _ = self.evaluate_at(v)
-        for term in self.active.limiting:
-            if term.registration.edge_state:
-                places, values = term.opened(x, self.active.frozen[term])
-                own = places < v.size
-                own[own] = self.prescribed.free.ravel()[places[own]]
-                places = places[own]
-                v.reshape(-1)[places] = (values[own] - self._xh.ravel()[places]) / self.stage.reach
+        if not self.active.edged:
+            return False
+        x, ahead = self._ahead(v, way)
+        changed = 0
+        for term in self.active.edged:
+            places, values = term.followed(x, ahead, self.active.frozen[term])
+            own = places < way.size
+            own[own] = self.prescribed.free.ravel()[places[own]]
+            way.reshape(-1)[places[own]] = values[own] / self.stage.reach
+            changed += int(own.any())
+        return bool(self.points.comm.allreduce(changed, MPI.MAX))
 
     @property
     def edges_lag(self) -> bool:
@@ -378,21 +380,24 @@ class StageEquations:
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        x = self.evaluate_at(v)[0]
-        ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
-        self.points.update_ghosts(ahead)
+        x, ahead = self._ahead(v, way)
         fraction = min(t.largest_step(x, ahead, self.active.frozen[t]) for t in self.active.limiting)
         fraction = min(fraction, self.discretisation.largest_step(x, ahead))
         return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
+
+    def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
+        """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
+        x = self.evaluate_at(v)[0]
+        ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
+        self.points.update_ghosts(ahead)
+        return x, ahead
 
     def may_move(self) -> bool:
         """Whether what is prescribed in the step can go where it shall, while all else stays; collective."""
         here = self.velocity_of_staying()
         there = here.copy()
         self.prescribe(there)
-        x = self.evaluate_at(here)[0]
-        ahead = fitted((there - here) * self.stage.reach, len(here), self.points.n_local)
-        self.points.update_ghosts(ahead)
+        x, ahead = self._ahead(here, there - here)
         free = all(term.lets_pass(x, ahead, self.active.frozen[term]) for term in self.active.limiting)
         free &= self.discretisation.largest_step(x, ahead) == 1.0
         return not self.points.comm.allreduce(int(not free), MPI.MAX)
@@ -504,7 +509,7 @@ class StageEquations:
             remembered.forget()
         reach = self.stage.reach
         inertia = self.stage.sigma * self.mass
-        if self.active.limiting:
+        if self.active.edged:
             inertia += reach * self._least
         blocks = self.prescribed.blocks
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):

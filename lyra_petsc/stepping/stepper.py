@@ -148,7 +148,7 @@ class Stepper:
         )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
-        if equations.discretisation.changes or (equations.active.limiting and self._iterates):
+        if equations.discretisation.changes or (equations.active.edged and self._iterates):
             snes.setUpdate(self._update)
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
@@ -253,7 +253,12 @@ class Stepper:
         ended = outcome.norm, outcome.left, outcome.at_roundoff
         if velocity is not None:
             if not self._iterates:
-                equations.open_directors(velocity)
+                staying = equations.velocity_of_staying()
+                way = velocity - staying
+                if equations.follow_triangles(staying, way):
+                    velocity = staying + way
+                equations.evaluate_at(velocity)
+                equations.turn_frames()
             equations.accept(velocity)
             if before is not None:
                 assert rate_before is not None
@@ -393,10 +398,7 @@ class Stepper:
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
         first_guess(self._equations, guess)
-        if self._iterates:
-            if self._equations.integrator.order == 1:  # others make energy where directors jump
-                self._equations.open_directors(guess)
-        else:
+        if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations
             ahead = self._extrapolation.to(equations.t1, equations.t0, equations.v[: len(guess)])

@@ -3,14 +3,14 @@
 An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per
 triangle of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
 
-    κ = −Σ_i (tan α_i − tan ᾱ_i) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
+    κ = −Σ_i (T(α_i) − T(ᾱ_i)) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
     energy = ½ A (κ − κ̄)ᵀ D (κ − κ̄)
 
 κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is
-the material's rest curvature and D its stiffness [N·m]. As κ is linear in the three tangents the energy is a
-quadratic form of theirs. The director's angle has no mass: it is where moments balance, which makes edges of
-one, two or more triangles alike. A triangle's stencil is its own corners and edges. tan keeps folds below
-180°.
+the material's rest curvature and D its stiffness [N·m]. T is the tangent of angles up to 45° and grows less
+beyond, where other edges than its own feel less of it (``midedge_shape``). As κ is linear in the three T the
+energy is a quadratic form of theirs. The director's angle has no mass: it is where moments balance, which
+makes edges of one, two or more triangles alike. A triangle's stencil is its own corners and edges.
 
 Sources: constant curvatures from rotations of the edges are Morley's plate (Aeronautical Quarterly 19 (1968)
 149-169); on curved sheets Grinspun, Gingold, Reisman & Zorin, Computing discrete shape operators on general
@@ -31,7 +31,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
-from lyra_petsc.terms.hinge_energy import GONE, fading_limit
+from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.midedge_shape import (
     Frames,
     carried,
@@ -39,6 +39,7 @@ from lyra_petsc.terms.midedge_shape import (
     directors,
     some_perpendicular,
     tangents,
+    tangents_at,
     unit,
 )
 from lyra_petsc.terms.remembered import Remembered
@@ -50,22 +51,15 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
-STEEPEST = np.radians(89.0)
-"""Angle of a director at rest or at the start from which on a scene is refused."""
+STEEPEST = np.radians(89.95)
+"""Angle of a director at rest or at the start from which on a scene is refused: rounding would tell which way
+it is folded."""
 
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
 
-LARGEST_TURN = 0.5
-"""Angle [rad] by which a Newton iteration may turn a director."""
-
-CLOSER = 0.2
-"""Part of the smallest cos α that a Newton iteration must leave."""
-
-HALVINGS = 20
-
-FLATTEST = np.cos(np.radians(88.0))
-"""cos α below which a director that no moments have balanced is put midway between its triangles."""
+LARGEST_TURN = 1.0
+"""Angle [rad] by which a Newton iteration may turn a director against its triangles."""
 
 
 class Edges(NamedTuple):
@@ -145,35 +139,38 @@ class MidEdge(Elastic):
         found.tangent[far] = tangent[far]
         return found
 
-    def opened(self, x: Array, frozen: Frames) -> tuple[Ints, Array]:
-        # midway between the triangles, where these are not folded onto each other
-        edges, n_edges = self.of_edges.of_triangles, len(self.of_edges.places)
-        a, b, c = (x[self.stencil[:, k]] for k in range(3))
-        normal = np.cross(b - a, c - a)
-        live = np.sum(normal * normal, axis=1) > GONE * self._constants[2]
-        number, normal = edges[live], unit(normal[live])
-
-        def smallest(director: Array) -> Array:
-            cosine = np.einsum("eik,ek->ei", director[number], normal)
-            least = np.full(n_edges, np.inf)
-            np.minimum.at(least, number, cosine)
-            return least
-
-        shape = self._computed(x, frozen)
-        before = smallest(shape[:, :3])
-        if not (before < FLATTEST).any():
+    def followed(self, x: Array, way: Array, frozen: Frames) -> tuple[Ints, Array]:
+        places, _, length, edges = self.of_edges
+        linear = way.ravel()[places] / length
+        far = np.abs(linear) > LARGEST_TURN
+        if not far.any():
             return np.empty(0, dtype=np.int64), np.empty(0)
-        total = np.zeros((n_edges, 3))
-        np.add.at(total, number.ravel(), np.repeat(normal, 3, axis=0))
-        tangent = self._tangents(x)
-        middle = unit(total - np.sum(total * tangent, axis=1, keepdims=True) * tangent)
-        row = np.flatnonzero((before < FLATTEST) & (smallest(middle) > np.maximum(before, 0.0)))
-        across = carried(Frames(frozen.tangent[row], frozen.across[row]), tangent[row])
-        sine = np.sum(np.cross(tangent[row], across) * middle[row], axis=1)
-        angle = np.arctan2(sine, np.sum(across * middle[row], axis=1))
-        places, length = self.of_edges.places[row], self.of_edges.length[row]
-        turns = np.round((x.ravel()[places] / length - angle) / (2.0 * np.pi))
-        return places, length * (angle + 2.0 * np.pi * turns)
+        chosen = np.flatnonzero(far[edges].any(axis=1))
+        number, sign = edges[chosen], self.elements.data["sign"][chosen]
+        y = x + way
+        y.ravel()[places] = x.ravel()[places]  # unknowns as they were
+        before, after = self._computed(x, frozen)[number], self._computed(y, frozen)[number]
+        corners, moved = x[self.stencil[chosen]], way[self.stencil[chosen]]
+        angle, normal, square, e = _angles(corners, before[:, :, :3])
+        turned, _, left, _ = _angles(corners + moved, after[:, :, :3])
+        height = np.sum(moved * normal[:, None, :], axis=2)
+        size = np.sqrt(square)[:, None] * np.linalg.norm(e, axis=2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
+            expected += np.sum(before[:, :, 3:6] * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
+            turn = np.remainder(turned - angle + np.pi, 2.0 * np.pi) - np.pi
+        weight = np.minimum(np.minimum(square, left) / self._constants[2][chosen], 1.0)[:, None]
+        weight = np.where(np.isfinite(turn) & np.isfinite(expected), weight, 0.0)
+
+        def mean(values: Array) -> Array:
+            values = np.where(weight > 0.0, weight * sign * values, 0.0)
+            sums = np.bincount(number.ravel(), values.ravel(), len(places))
+            found: Array = np.divide(sums, total, out=np.zeros(len(places)), where=total > 0.0)[far]
+            return found
+
+        total = np.bincount(number.ravel(), weight.ravel(), len(places))
+        bends = np.clip(linear[far] + mean(expected), -LARGEST_TURN, LARGEST_TURN)
+        return places[far], length[far] * (bends - mean(turn))
 
     def anew(self, x: Array) -> Array:
         """Take frames that know nothing but the shape; unknowns (n,) of directors amid their triangles."""
@@ -273,23 +270,6 @@ class MidEdge(Elastic):
         scale: Array = trace * size / data["height"] ** 2
         return scale
 
-    def largest_step(self, x: Array, way: Array, frozen: Frames) -> float:
-        places, _, length, edges = self.of_edges
-        turn = np.abs(way.ravel()[places] / length).max(initial=0.0)
-        fraction = min(1.0, LARGEST_TURN / turn) if turn > 0.0 else 1.0
-        limit = self._constants[2]
-
-        def smallest(at: Array) -> float:
-            shape = self._computed(at, frozen)
-            return float(midedge_energy.smallest_cosine(at, self.stencil, edges, shape, limit))
-
-        least = CLOSER * smallest(x)
-        for _ in range(HALVINGS):
-            if smallest(x + fraction * way) >= least:
-                break
-            fraction *= 0.5
-        return fraction
-
     def curvatures(self, x: Array, frozen: Frames) -> Array:
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
         found = np.empty((self.n_elements, 3))
@@ -303,6 +283,16 @@ def normals_of(x: Array, triangles: AnyInts) -> Array:
     """Unit normals (n, 3) of triangles (n, 3)."""
     a, b, c = (x[triangles[:, k]] for k in range(3))
     return unit(np.cross(b - a, c - a))
+
+
+def _angles(corners: Array, director: Array) -> tuple[Array, Array, Array, Array]:
+    """α (n, 3) of directors (n, 3, 3) of triangles (n, 3, 3); normals, |2A|² [m⁴], edges (n, 3, 3)."""
+    edges = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
+    normal = np.cross(edges[:, 1], edges[:, 2])
+    square = np.sum(normal * normal, axis=1)
+    normal = unit(normal)
+    side = np.sum(director * np.cross(unit(edges), normal[:, None, :]), axis=2)
+    return np.arctan2(side, np.sum(director * normal[:, None, :], axis=2)), normal, square, edges
 
 
 def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) -> Array:
@@ -327,7 +317,7 @@ def elements(rest: RestShape) -> Elements:
     Raises
     ------
     InputError
-        Where a triangle lies at 90° to a director, at rest or at the start.
+        Where a shape is folded by 180°, at rest or at the start.
     """
     chosen = np.flatnonzero(rest.bends_by("midedge"))
     mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
@@ -351,8 +341,9 @@ def elements(rest: RestShape) -> Elements:
     if surface.any():
         director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges)
         _mirror(director, rest, triangles, number, mesh.rest)
-        at_rest[surface] = _tangents_of(mesh.rest, triangles[surface], director[number[surface]])
-        _check(at_rest, number, edges, rest, "rest shape")
+        angle = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
+        _check(angle, number[surface], edges, rest, "rest shape")
+        at_rest[surface] = tangents_at(angle)
         smooth = np.abs(at_rest).max(axis=1) < CREASED
         rest.notes += _coarse(
             rest,
@@ -366,7 +357,7 @@ def elements(rest: RestShape) -> Elements:
     director = mean_directors(mesh.positions, triangles, number, n_edges)
     _mirror(director, rest, triangles, number, mesh.positions)
     director = director[number]
-    _check(_tangents_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
+    _check(_angles_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
     ends: Array = mesh.positions[edges[number]]
     data = {
         "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
@@ -434,26 +425,20 @@ def _mirror(director: Array, rest: RestShape, triangles: Ints, number: Ints, x: 
         director[edges] = np.where(towards < 0.0, -inside, inside)
 
 
-def _tangents_of(x: Array, triangles: Ints, director: Array) -> Array:
-    """tan α (n, 3) of directors (n, 3, 3) on the edges opposite the corners of triangles (n, 3)."""
-    normal = normals_of(x, triangles)[:, None, :]
-    along = unit(x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]])
-    outward = np.cross(along, np.broadcast_to(normal, along.shape))
-    height = np.sum(director * normal, axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        found: Array = np.where(height > 0.0, np.sum(director * outward, axis=2) / height, np.inf)
-    return found
+def _angles_of(x: Array, triangles: Ints, director: Array) -> Array:
+    """α (n, 3) [rad] of directors (n, 3, 3) on the edges opposite the corners of triangles (n, 3)."""
+    return _angles(x[triangles], director)[0]
 
 
-def _check(tangent: Array, number: Ints, edges: Ints, rest: RestShape, what: str) -> None:
+def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape, what: str) -> None:
     """Refuse edges at which a shape is folded by nearly 180°."""
-    steep = np.flatnonzero(~(np.abs(tangent.ravel()) < np.tan(STEEPEST)))
+    steep = np.flatnonzero(~(np.abs(angle.ravel()) < STEEPEST))
     if len(steep):
         a, b = edges[number.ravel()[steep[0]]]
         raise InputError(
-            f"the {what} is folded by 178° or more at the edge of vertices {a} and {b}, where bending_model: "
-            "midedge has no moment; open the fold (or, where several sheets meet, turn one over), or take "
-            "bending_model: hinge",
+            f"the {what} is folded by 179.9° or more at the edge of vertices {a} and {b}, and bending_model: "
+            "midedge cannot tell to which side; open the fold (or, where several sheets meet, turn one over), "
+            "or take bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
         )

@@ -1,8 +1,10 @@
 """The energy of bending by directors on edges, its gradient and Hessian: pure functions on arrays.
 
-Per triangle, with the tangents of ``midedge_shape`` and constants K (3 × 3) and f̄::
+Per triangle, with the tangents T and S of ``midedge_shape`` and constants K (3 × 3) and T̄::
 
-    energy = ½ w fᵀ K f,   f_i = tan α_i − f̄_i
+    energy = w (½ Σ_i K_ii (T_i − T̄_i)² + Σ_{i<j} K_ij (S_i − S̄_i) (S_j − S̄_j))
+
+With angles up to 45° that is ½ w fᵀ K f of f = T − T̄.
 
 w is 1 but for triangles that have lost nine tenths of their area, with which it vanishes as in
 ``hinge_energy``: they have hardly a normal. Of director angles φ, normal n, area A and barycentric
@@ -30,55 +32,58 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
-from lyra_petsc.terms.midedge_shape import edges_of, row, tangent_of
+from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
 
 
 @kernel(inline="always")
-def _moments(stiffness, e, f0, f1, f2):  # type: ignore[no-untyped-def]
-    """K f of triangle e."""
-    k00, k01, k02 = stiffness[e, 0], stiffness[e, 1], stiffness[e, 2]
-    k11, k12, k22 = stiffness[e, 3], stiffness[e, 4], stiffness[e, 5]
+def _own(stiffness, rest, e, t0, t1, t2):  # type: ignore[no-untyped-def]
+    """K_ii (T_i − T̄_i) of triangle e, and the differences."""
+    f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+    return stiffness[e, 0] * f0, stiffness[e, 3] * f1, stiffness[e, 5] * f2, f0, f1, f2
+
+
+@kernel(inline="always")
+def _others(stiffness, rest, e, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """Σ_j≠i K_ij (S_j − S̄_j) of triangle e, and the differences."""
+    h0, h1, h2 = (
+        s0 - fading_tangent(rest[e, 0]),
+        s1 - fading_tangent(rest[e, 1]),
+        s2 - fading_tangent(rest[e, 2]),
+    )
+    k01, k02, k12 = stiffness[e, 1], stiffness[e, 2], stiffness[e, 4]
+    return k01 * h1 + k02 * h2, k01 * h0 + k12 * h2, k02 * h0 + k12 * h1, h0, h1, h2
+
+
+@kernel(inline="always")
+def _twice(own, others):  # type: ignore[no-untyped-def]
+    """Twice the energy, of what these two return."""
     return (
-        k00 * f0 + k01 * f1 + k02 * f2,
-        k01 * f0 + k11 * f1 + k12 * f2,
-        k02 * f0 + k12 * f1 + k22 * f2,
+        own[0] * own[3]
+        + own[1] * own[4]
+        + own[2] * own[5]
+        + others[0] * others[3]
+        + others[1] * others[4]
+        + others[2] * others[5]
     )
 
 
 @kernel()
 def energies(x, stencil, edges, shape, stiffness, rest, limit, out):  # type: ignore[no-untyped-def]
-    """Energy [J] of the first len(out) triangles; infinite where a director lies at 90° or beyond."""
+    """Energy [J] of the first len(out) triangles; infinite where an edge is too far from its frame."""
     for e in range(out.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
             out[e] = 0.0
             continue
-        t0, h0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        t1, h1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        t2, h2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        if not min(h0, h1, h2) > 0.0:
-            out[e] = np.inf
-            continue
-        f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
-        g0, g1, g2 = _moments(stiffness, e, f0, f1, f2)
-        out[e] = 0.5 * (f0 * g0 + f1 * g1 + f2 * g2)
+        t0, _, _, s0, _, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        t1, _, _, s1, _, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        t2, _, _, s2, _, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        out[e] = 0.5 * _twice(_own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2))
         if square < limit[e]:
             out[e] *= fade(square, limit[e])[0]
-
-
-@kernel()
-def smallest_cosine(x, stencil, edges, shape, limit):  # type: ignore[no-untyped-def]
-    """The smallest cos α of all directors in triangles that have not lost their area; 1 without any."""
-    found = 1.0
-    for e in range(stencil.shape[0]):
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        _, _, _, normal, square = edges_of(x0, x1, x2)
-        if square > GONE * limit[e]:
-            inverse = 1.0 / math.sqrt(square)
-            for i in range(3):
-                found = min(found, inverse * dot(row(shape, edges[e, i], 0), normal))
-    return found
+        if not out[e] < np.inf:
+            out[e] = np.inf
 
 
 @kernel()
@@ -92,20 +97,19 @@ def add_gradient(  # type: ignore[no-untyped-def]
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
             continue
-        t0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        t1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        t2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
-        p0, p1, p2 = _moments(stiffness, e, f0, f1, f2)
+        t0, a0, _, s0, b0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        t1, a1, _, s1, b1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        t2, a2, _, s2, b2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
+        p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
         if square < limit[e]:
             weight, slope, _ = fade(square, limit[e])
-            energy = slope * (f0 * p0 + f1 * p1 + f2 * p2)  # 2 · ½
+            energy = slope * _twice(own, others)  # 2 · ½
             p0, p1, p2 = weight * p0, weight * p1, weight * p2
             for c, edge in ((0, e0), (1, e1), (2, e2)):
                 turned = cross(normal, edge)
                 for i in range(3):
                     out[stencil[e, c], i] += energy * turned[i]
-        p0, p1, p2 = p0 * (1.0 + t0 * t0), p1 * (1.0 + t1 * t1), p2 * (1.0 + t2 * t2)
         q0, q1, q2 = p0 / math.sqrt(dot(e0, e0)), p1 / math.sqrt(dot(e1, e1)), p2 / math.sqrt(dot(e2, e2))
         pull = (
             q0 * e0[0] + q1 * e1[0] + q2 * e2[0],
@@ -114,12 +118,12 @@ def add_gradient(  # type: ignore[no-untyped-def]
         )
         n = scaled(1.0 / square, normal)  # over 2A
         w0, w1, w2 = -dot(e0, pull), -dot(e1, pull), -dot(e2, pull)
-        a0, a1, a2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
+        g0, g1, g2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
         for i in range(3):
-            s0, s1, s2 = p0 * a0[i], p1 * a1[i], p2 * a2[i]
-            out[stencil[e, 0], i] += w0 * n[i] + s1 - s2
-            out[stencil[e, 1], i] += w1 * n[i] + s2 - s0
-            out[stencil[e, 2], i] += w2 * n[i] + s0 - s1
+            r0, r1, r2 = p0 * g0[i], p1 * g1[i], p2 * g2[i]
+            out[stencil[e, 0], i] += w0 * n[i] + r1 - r2
+            out[stencil[e, 1], i] += w1 * n[i] + r2 - r0
+            out[stencil[e, 2], i] += w2 * n[i] + r0 - r1
         flat[places[e, 0]] += sign[e, 0] * p0 / length[e, 0]
         flat[places[e, 1]] += sign[e, 1] * p1 / length[e, 1]
         flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
@@ -137,12 +141,11 @@ def triangle_hessian(x, e, blend, stencil, edges, sign, shape, stiffness, rest, 
         return False
     inverse = 1.0 / math.sqrt(square)  # 1 / 2A
     n = scaled(inverse, normal)
-    t0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-    t1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-    t2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-    f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
-    m0, m1, m2 = _moments(stiffness, e, f0, f1, f2)
-    a0, a1, a2 = 1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2
+    t0, a0, c0, s0, b0, d0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+    t1, a1, c1, s1, b1, d1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+    t2, a2, c2, s2, b2, d2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+    own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
+    p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
     exact = 1.0 - blend
     # ∇α_i
     s00, s11, s22, s01, s02, s12 = (
@@ -173,11 +176,11 @@ def triangle_hessian(x, e, blend, stencil, edges, sign, shape, stiffness, rest, 
         )
     for i in range(3):
         g[i, 9 + i] = sign[e, i] / length[e, i]
-    # ∇f K ∇fᵀ, and what tan adds as it bends
-    k00 = a0 * (a0 * stiffness[e, 0] + exact * 2.0 * t0 * m0)
-    k11 = a1 * (a1 * stiffness[e, 3] + exact * 2.0 * t1 * m1)
-    k22 = a2 * (a2 * stiffness[e, 5] + exact * 2.0 * t2 * m2)
-    k01, k02, k12 = a0 * a1 * stiffness[e, 1], a0 * a2 * stiffness[e, 2], a1 * a2 * stiffness[e, 4]
+    # ∇f K ∇fᵀ, and what T and S add as they bend
+    k00 = a0 * a0 * stiffness[e, 0] + exact * (own[0] * c0 + others[0] * d0)
+    k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)
+    k22 = a2 * a2 * stiffness[e, 5] + exact * (own[2] * c2 + others[2] * d2)
+    k01, k02, k12 = b0 * b1 * stiffness[e, 1], b0 * b2 * stiffness[e, 2], b1 * b2 * stiffness[e, 4]
     for b in range(9):
         g0, g1, g2 = g[0, b], g[1, b], g[2, b]
         w[0, b] = k00 * g0 + k01 * g1 + k02 * g2
@@ -193,32 +196,31 @@ def triangle_hessian(x, e, blend, stencil, edges, sign, shape, stiffness, rest, 
     h[10, 10], h[10, 11], h[11, 11] = q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
     if exact > 0.0:
         # Σ_i p_i ∂²α_i
-        p0, p1, p2 = exact * m0 * a0, exact * m1 * a1, exact * m2 * a2
-        c0, c1, c2 = p0 * r0, p1 * r1, p2 * r2
+        m0, m1, m2 = exact * p0, exact * p1, exact * p2
+        q0, q1, q2 = m0 * r0, m1 * r1, m2 * r2
         area = math.sqrt(square)
-        _turn(spin0, row(shape, edges[e, 0], 6), e0, n, 0.5 * area * c0 / s00, p0, sign[e, 0], 0, w)
-        _turn(spin1, row(shape, edges[e, 1], 6), e1, n, 0.5 * area * c1 / s11, p1, sign[e, 1], 1, w)
-        _turn(spin2, row(shape, edges[e, 2], 6), e2, n, 0.5 * area * c2 / s22, p2, sign[e, 2], 2, w)
-        b0, b1, b2 = (
+        _turn(spin0, row(shape, edges[e, 0], 6), e0, n, 0.5 * area * q0 / s00, m0, sign[e, 0], 0, w)
+        _turn(spin1, row(shape, edges[e, 1], 6), e1, n, 0.5 * area * q1 / s11, m1, sign[e, 1], 1, w)
+        _turn(spin2, row(shape, edges[e, 2], 6), e2, n, 0.5 * area * q2 / s22, m2, sign[e, 2], 2, w)
+        u0, u1, u2 = (
             scaled(inverse, cross(n, e0)),
             scaled(inverse, cross(n, e1)),
             scaled(inverse, cross(n, e2)),
         )
         v0, v1, v2 = (
-            c0 * s00 + c1 * s01 + c2 * s02,
-            c0 * s01 + c1 * s11 + c2 * s12,
-            c0 * s02 + c1 * s12 + c2 * s22,
+            q0 * s00 + q1 * s01 + q2 * s02,
+            q0 * s01 + q1 * s11 + q2 * s12,
+            q0 * s02 + q1 * s12 + q2 * s22,
         )
-        _add_own(h, 0, n, v0, b0, 1, 2, w)
-        _add_own(h, 3, n, v1, b1, 2, 0, w)
-        _add_own(h, 6, n, v2, b2, 0, 1, w)
-        _add_pair(h, 0, 3, n, v0, v1, b0, b1, 2, w)
-        _add_pair(h, 0, 6, n, v0, v2, b0, b2, 1, w)
-        _add_pair(h, 3, 6, n, v1, v2, b1, b2, 0, w)
+        _add_own(h, 0, n, v0, u0, 1, 2, w)
+        _add_own(h, 3, n, v1, u1, 2, 0, w)
+        _add_own(h, 6, n, v2, u2, 0, 1, w)
+        _add_pair(h, 0, 3, n, v0, v1, u0, u1, 2, w)
+        _add_pair(h, 0, 6, n, v0, v2, u0, u2, 1, w)
+        _add_pair(h, 3, 6, n, v1, v2, u1, u2, 0, w)
     if square < limit[e]:
-        energy = 0.5 * (f0 * m0 + f1 * m1 + f2 * m2)
-        pulls = m0 * a0, m1 * a1, m2 * a2
-        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, pulls, g, h)
+        energy = 0.5 * _twice(own, others)
+        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, (p0, p1, p2), g, h)
     return True
 
 

@@ -1,4 +1,4 @@
-"""Directors of edges, and the tangents of the angles that they have with the normals of their triangles.
+"""Directors of edges, and the tangents T of the angles that they have with the normals of their triangles.
 
 A director d is a unit vector perpendicular to its edge, at the angle φ in a frame that follows the edge: the
 direction a₀ that it had on an edge of direction t₀, carried by the smallest rotation to the present direction
@@ -12,6 +12,10 @@ In a triangle with unit normal n, counter-clockwise edges e_i = |e_i| t_i opposi
 normals m_i = t_i × n in its plane, α_i is the angle about t_i from n to the director of the edge::
 
     tan α_i = (d_i · m_i) / (d_i · n)
+
+Up to 45° T(α) = S(α) = tan α. Beyond, T goes on along its tangent, ± (1 + 2 (|α| − π/4)) to 180°, and S,
+which couples the edges, returns to 0 there: no mesh resolves folds of more than 90° at one edge, and
+triangles that turn over, which lose their normal for a moment, must be able to pass their directors.
 """
 
 from __future__ import annotations
@@ -28,6 +32,12 @@ from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+LEFT = 0.75 * math.pi
+"""Angle from 45° to 180° [rad]."""
+
+QUADRATIC, CUBIC = -(3.0 + 4.0 * LEFT) / LEFT**2, (2.0 + 2.0 * LEFT) / LEFT**3
+"""Of S as a polynomial of the angle beyond 45°, which ends at 180° with its derivative."""
 
 FARTHEST = -0.8
 """Cosine of the angle by which an edge may turn from its frame: at −1 there is no smallest rotation."""
@@ -141,20 +151,55 @@ def edges_of(x0, x1, x2):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
-    """tan α of a director on an edge of a triangle with this normal N; d · N [m²]."""
-    height = dot(d, normal)
-    return dot(d, cross(e, normal)) / (math.sqrt(dot(e, e)) * height), height
+    """T, T', T'', S, S', S'' at α of a director on an edge of a triangle with this normal N."""
+    height, side = dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
+    if abs(side) < height:
+        t = side / height
+        slope = 1.0 + t * t
+        bend = 2.0 * t * slope
+        return t, slope, bend, t, slope, bend
+    return _beyond(side, height)
+
+
+@kernel()
+def _beyond(side, height):  # type: ignore[no-untyped-def]
+    """The same beyond 45°; NaN without a director or a normal."""
+    if side == 0.0 and height == 0.0:
+        return np.nan, np.nan, np.nan, np.nan, np.nan, np.nan
+    sign = math.copysign(1.0, side)
+    x = math.atan2(abs(side), height) - 0.25 * math.pi
+    slope, bend = 2.0 + x * (2.0 * QUADRATIC + x * 3.0 * CUBIC), 2.0 * QUADRATIC + 6.0 * CUBIC * x
+    return sign * (1.0 + 2.0 * x), 2.0, 0.0, sign * _fading(x), slope, sign * bend
+
+
+@kernel(inline="always")
+def _fading(x):  # type: ignore[no-untyped-def]
+    """S at the angle x beyond 45°."""
+    return 1.0 + x * (2.0 + x * (QUADRATIC + x * CUBIC))
+
+
+@kernel(inline="always")
+def fading_tangent(t):  # type: ignore[no-untyped-def]
+    """S at the angle at which T is t."""
+    if abs(t) < 1.0:
+        return t
+    return math.copysign(_fading(0.5 * (abs(t) - 1.0)), t)
+
+
+def tangents_at(angle: Array) -> Array:
+    """T of angles α [rad], of any shape."""
+    size = np.abs(angle)
+    beyond = 1.0 + 2.0 * (size - 0.25 * np.pi)
+    found: Array = np.copysign(np.where(size < 0.25 * np.pi, np.tan(size), beyond), angle)
+    return found
 
 
 @kernel()
 def tangents(x, stencil, edges, shape, out):  # type: ignore[no-untyped-def]
-    """tan α_i of triangles (E, 3) into out (E, 3); NaN in those where a director lies at 90° or beyond."""
+    """T(α_i) of triangles (E, 3) into out (E, 3)."""
     for e in range(stencil.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, _ = edges_of(x0, x1, x2)
-        f0, h0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        f1, h1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        f2, h2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        out[e, 0], out[e, 1], out[e, 2] = f0, f1, f2
-        if not min(h0, h1, h2) > 0.0:
-            out[e, :] = np.nan
+        out[e, 0] = tangent_of(row(shape, edges[e, 0], 0), e0, normal)[0]
+        out[e, 1] = tangent_of(row(shape, edges[e, 1], 0), e1, normal)[0]
+        out[e, 2] = tangent_of(row(shape, edges[e, 2], 0), e2, normal)[0]

@@ -116,7 +116,6 @@ REGISTRY: list[Registration] = [
         "bending_energy",
         damped=True,
         bends=True,
-        limits_step=True,
         edge_state=("frame",),
         coarse="bending",
     ),

@@ -258,8 +258,11 @@ class Elastic(Term):
         """
         return None
 
-    def opened(self, x: Array, frozen: Any) -> tuple[Ints, Array]:
-        """Places of edges whose unknowns make the energy infinite, or nearly, and better ones, (n,)."""
+    def followed(self, x: Array, way: Array, frozen: Any) -> tuple[Ints, Array]:
+        """Places of edges whose unknowns go far on the way (n_local, 3) [m] from x, and better ways, (n,).
+
+        The same to first order.
+        """
         return np.empty(0, dtype=np.int64), np.empty(0)
 
     def history(self, x: Array, frozen: Any) -> Mapping[str, float]:

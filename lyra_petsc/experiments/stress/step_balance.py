@@ -77,7 +77,7 @@ def energy(terms: Terms, x: Array) -> float:
 
 
 def force_along(
-    comm: MPI.Comm, n: int, terms: Terms, x0: Array, dx: Array, *, enough: float
+    comm: MPI.Comm, n: int, terms: Terms, turned: Terms, x0: Array, dx: Array, *, enough: float
 ) -> tuple[float, bool]:
     """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether hinges had their part taken from energies; collective.
 
@@ -88,6 +88,8 @@ def force_along(
     n : int
         Owned vertices of this rank.
     terms : mapping of Elastic to what it froze for the step
+    turned : mapping of Elastic
+        Of those whose frames turned within the step, the frames in which it began.
     x0, dx : (n_local, 3)
         Where the way begins, and the way [m].
     enough : float
@@ -102,7 +104,8 @@ def force_along(
     exact = integral(smooth, 1, 2)
     if not comm.allreduce(len(bent)):
         return exact, False
-    if comm.allreduce(_widest_turn(bent, x0, dx), op=MPI.MAX) < WIDEST_TURN:
+    widest = math.inf if turned else _widest_turn(bent, x0, dx)
+    if comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN:
         panels, before = 1, integral(bent, 1, 5)
         while panels < MOST_PANELS:
             panels *= 2
@@ -110,7 +113,7 @@ def force_along(
             if abs(now - before) <= max(enough, EPSILON * abs(now)):
                 return exact + now, False
             before = now
-    return exact + float(comm.allreduce(energy(bent, x0 + dx) - energy(bent, x0))), True
+    return exact + float(comm.allreduce(energy(bent, x0 + dx) - energy({**bent, **turned}, x0))), True
 
 
 def _panels(terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
@@ -226,6 +229,13 @@ class Accountant:
         system = self._system
         self._x, self._v = system.x.copy(), system.v.copy()
         self._energy = energy(self._shell, system.x)
+        self._frames: Terms = {term: term.frames for term in self._elastic if isinstance(term, MidEdge)}
+
+    @property
+    def _turned(self) -> Terms:
+        """Terms whose frames have turned since the step began, in those of its beginning."""
+        now = self._system.active.frozen
+        return {term: frames for term, frames in self._frames.items() if now[term] is not frames}
 
     def balance(self, report: StepReport) -> StepBalance:
         """The balance of the step just accepted, which started from the state looked at last."""
@@ -245,11 +255,7 @@ class Accountant:
         planes = {term: frozen for term, frozen in self._shell.items() if term.registration.moving}
         pushed = gradient(planes, x1)[:n]
         slowed = self._damping(planes, v1)[:n]
-        at_start = {
-            term: system.damping.frozen.get(term, each) if isinstance(term, MidEdge) else each
-            for term, each in self._shell.items()
-        }
-        energy_now, energy_then = energy(self._shell, x1), energy(at_start, x0)
+        energy_now, energy_then = energy(self._shell, x1), energy({**self._shell, **self._turned}, x0)
         turned = energy_then - self._energy
         mass = system.mass[:, None]
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
@@ -277,7 +283,7 @@ class Accountant:
         # positions are rounded, too: x' − x is Δt v' only to their last digit
         noise = EPSILON * (energy_noise + powers + forces * reach + kinetic0 + kinetic1 + heights)
         tolerance = float(solved + noise)
-        along, jumped = force_along(comm, n, self._shell, x0, dx, enough=0.1 * tolerance)
+        along, jumped = force_along(comm, n, self._shell, self._turned, x0, dx, enough=0.1 * tolerance)
         bracket = along - inner
         change = kinetic1 - kinetic0 + elastic + turn + fallen1 - fallen0
         work = outer + turn
@@ -427,7 +433,7 @@ class StageAccountant(Accountant):
             # clamps push from outside, and cannot be told from the sheet's own forces here
             gap = gap - parts["internal"] - parts.get("damping", 0.0)
         change, noise, forces, way, *gaps = system.points.summed(
-            energy(self._shell, x1) - energy(self._shell, x0),
+            energy(self._shell, x1) - energy({**self._shell, **self._turned}, x0),
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
             float(np.sum((x1 - x0)[:n] ** 2)),
@@ -437,7 +443,8 @@ class StageAccountant(Accountant):
         left = self._left(parts, reach, dt)
         unsolved = (left["residual"] + left["floor"]) * math.sqrt(system.points.n_global)
         tolerance = EPSILON * (noise + forces * reach) + left["floor"] * math.sqrt(way)
-        along, jumped = force_along(comm, n, self._shell, x0, x1 - x0, enough=0.1 * tolerance)
+        moved = x1 - x0
+        along, jumped = force_along(comm, n, self._shell, self._turned, x0, moved, enough=0.1 * tolerance)
         return StepBalance(
             change=change,
             bracket=along,

@@ -1,4 +1,4 @@
-"""Sheets that bend by directors on edges: stiff, at large steps, folded, twisted, crushed."""
+"""Sheets that bend by directors on edges: stiff, at large steps, folded, twisted, crushed, crumpled."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 
 Array = NDArray[np.float64]
 
-FOLD = np.radians(177.0)
-"""Of a crease; from 178° on a start is refused."""
+FOLD = np.radians(179.0)
+"""Of a crease."""
 
-TURNS, PART = 2.0, 0.02
-"""Of a twist, and of the length that is left of a crushed strip."""
+PART, CRUMPLED = 0.02, 0.3
+"""Of the length of a crushed strip, and of a crumpled sheet's width, what is left."""
 
-STEPS = 80
+STEPS, FEW, LONG = 80, 20, 0.02
+"""Numbers of steps, and Δt [s] of the few."""
 
 
 def _as_it_is(content: Content) -> Content:
@@ -54,10 +55,12 @@ def _folded(x: Array, spacing: float) -> Array:
     return y
 
 
-def _strip(setting: Setting, bench: Bench, frames: list[dict[str, Any]]) -> Content:
-    """A strip clamped at both ends, one of which moves; stiffer than the base scene's sheet."""
+def _strip(setting: Setting, bench: Bench, frames: list[dict[str, Any]], stiffer: bool) -> Content:
+    """A strip of the base scene's sheet, or a stiffer one, clamped at both ends, one of which moves."""
     grid = {"width": 1.0, "height": 0.3, "nx": 40, "ny": 12, "pattern": "alternating"}
-    content = scale(by_directors(setting.content()), stretching=8.0, bending=10.0)
+    content = by_directors(setting.content())
+    if stiffer:
+        content = scale(content, stretching=8.0, bending=10.0)
     content["mesh"] = {"grid": grid, "transform": {"translate": [0.0, -0.15, 0.0]}}
     content["handles"] = [{"group": "right", "clamp": True}]
     content = move(content, frames)
@@ -65,12 +68,24 @@ def _strip(setting: Setting, bench: Bench, frames: list[dict[str, Any]]) -> Cont
     return content
 
 
-def _turned(part: float) -> dict[str, Any]:
-    turn = {"axis": [1.0, 0.0, 0.0], "degrees": 360.0 * TURNS * part}
-    return {"time": part * STEPS * STEP, "rotate": turn}
+def _crumpled(setting: Setting, bench: Bench) -> Content:
+    """The sheet, whose four sides come together."""
+    content = by_directors(setting.content())
+    content["handles"] = [{"group": side} for side in ("left", "right", "bottom", "top")]
+    return move(content, [{"time": 0.0}, {"time": STEPS * STEP, "scale": [CRUMPLED, CRUMPLED, 1.0]}])
 
 
-TWIST = [_turned(k / 16.0) for k in range(17)]
+def _twist(degrees: float, seconds: float, parts: int) -> list[dict[str, Any]]:
+    """Keyframes."""
+    return [
+        {
+            "time": seconds * k / parts,
+            "rotate": {"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts},
+        }
+        for k in range(parts + 1)
+    ]
+
+
 CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": STEPS * STEP, "scale": [PART, 1.0, 1.0]}]
 
 directors = family(
@@ -85,12 +100,18 @@ directors = family(
         for ms in (5, 40)
     ),
     StressCase("directors-bending-1e6", "bending × 1e6", partial(_changed, scale, bending=1e6)),
-    StressCase("directors-folded", "a crease of 177°, no handle", partial(_changed, release), shape=_folded),
-    *(
-        StressCase(f"directors-{name}", words, partial(_strip, frames=frames), steps=STEPS, own=True)
-        for name, words, frames in (
-            ("twist", "a strip twisted by 720°", TWIST),
-            ("crush", "a strip crushed to 2 %", CRUSH),
-        )
+    StressCase("directors-folded", "a crease of 179°, no handle", partial(_changed, release), shape=_folded),
+    StressCase(
+        "directors-twist", "a stiff strip twisted by 720°", steps=STEPS, own=True,
+        scene=partial(_strip, frames=_twist(720.0, STEPS * STEP, 16), stiffer=True),
     ),
+    StressCase(
+        "directors-twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", steps=FEW, step=LONG, own=True,
+        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False),
+    ),
+    StressCase(
+        "directors-crush", "a stiff strip crushed to 2 %", steps=STEPS, own=True,
+        scene=partial(_strip, frames=CRUSH, stiffer=True),
+    ),
+    StressCase("directors-crumpled", "all sides come together to 0.3", _crumpled, steps=STEPS, own=True),
 )  # fmt: skip
