@@ -21,7 +21,7 @@ from lyra_petsc.cli.run import tell_unused
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Launcher, Outcome, passed_of
-from lyra_petsc.experiments.results import Results, View, aligned
+from lyra_petsc.experiments.results import CaseObserver, Results, View, aligned
 from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
 
@@ -74,7 +74,7 @@ def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | No
     return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_words())
 
 
-class Terminal:
+class Terminal(CaseObserver[Any, Any]):
     """Shows the progress of cases on the terminal; on rank 0 only.
 
     Parameters

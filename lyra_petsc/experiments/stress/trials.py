@@ -15,10 +15,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, problem_of
-from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, load_record, save_record
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, read_record, save_record
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
     LITTLE_LOST,
@@ -261,12 +260,12 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
         If the launched program refuses what it was asked for.
     """
     with tempfile.TemporaryDirectory(prefix="lyra-stress-") as folder:
-        code, heard = launcher([*asked, "--only", case.name, "--job", folder], watch)
+        code, words = launcher([*asked, "--only", case.name, "--job", folder], watch)
         outcome = restore(Path(folder), case)
     if outcome is None:
         if code == InputError.exit_code:
-            raise InputError(last_words(heard, code))
-        record = Record(case.steps, stopped=last_words(heard, code))
+            raise InputError(words)
+        record = Record(case.steps, stopped=words)
         outcome = StressOutcome(case, of_physics(record), record=record)
     return outcome
 
@@ -279,10 +278,8 @@ def save(outcome: StressOutcome, folder: Path) -> None:
 
 def restore(folder: Path, case: StressCase) -> StressOutcome | None:
     """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
-    try:
-        return StressOutcome(case, **vars(load_record(folder / OUTCOME_FILE, Told)))
-    except (OSError, ValueError):
-        return None
+    told = read_record(folder / OUTCOME_FILE, Told)
+    return StressOutcome(case, **vars(told)) if told is not None else None
 
 
 PICTURES = 6
