@@ -36,7 +36,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     as_it_is,
 )
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
-from lyra_petsc.show.report.plots import Curve, over_time, surface
+from lyra_petsc.show.report.plots import Series, over_time, surface
 
 Array = NDArray[np.float64]
 
@@ -481,10 +481,10 @@ def _figures(report: Report, outcome: StressOutcome) -> None:
         )  # fmt: skip
     if len(record.times) > 1:
         times = [0.0, *record.times]
-        curves = [Curve("kinetic + potential", times, [record.start_energy, *record.energies])]
+        curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
         if record.balances and record.integrator == "beuler":
             work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
-            curves.append(Curve("energy at the start + work done", times, list(work)))
+            curves.append(Series("energy at the start + work done", times, list(work)))
         report.figure(
             over_time(
                 curves, name=f"{PLOTS}/{case.name}-energy", caption=f"{case.name}: energy over time",

@@ -496,7 +496,7 @@ def _convergence(
         Series(label, [extent(row, axis) for row in group], [row.shown(quantity.name) for row in group])
         for label, group in families(rows, axis).items()
     ]
-    if not any(len(line.shown()) > 1 for line in lines):
+    if not any(len(line.shown.x) > 1 for line in lines):
         return []
     label = {"time.step": "Δt [s] (mean)", "mesh": "h [m] (mean edge)"}.get(axis.path, axis.key)
     drawing = convergence(

@@ -7,16 +7,14 @@ strip: wider strips resist with their membrane against the lateral curvature tha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import Measured, isotropic
-from lyra_petsc.experiments.verification.rods import Cantilever
+from lyra_petsc.experiments.verification.answers import isotropic
 
 MEMBRANE = 1e6
 """C L²/B: as of a strip with a thickness of 0.0035 L. The exact shapes take its stretch into account."""
@@ -39,23 +37,6 @@ def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> di
         "time": {"analysis": "static"},
         **more,
     }
-
-
-def tip(trial: Trial, n: float) -> tuple[float, float]:
-    """Mean (x, −z) of the two vertices of the free end over L: reach and drop."""
-    along = round(n)
-    x, _, z = trial.x[[along, 2 * along + 1]].mean(axis=0)
-    return float(x), float(-z)
-
-
-def compared(trial: Trial, n: float, exact: Cantilever, words: str) -> Sequence[Measured]:
-    """Drop and reach of the tip, both errors relative to the way the tip went."""
-    reach, drop = tip(trial, n)
-    way = float(np.hypot(exact.drop, 1.0 - exact.reach))
-    return [
-        Measured(f"drop / L, {words}", drop, exact.drop, scale=way),
-        Measured(f"reach / L, {words}", reach, exact.reach, scale=way),
-    ]
 
 
 Array = NDArray[np.float64]
