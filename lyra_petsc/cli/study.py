@@ -8,7 +8,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.cli.experiments import case_launcher, command, watched
+from lyra_petsc.cli.experiments import case_launcher, command, watched, words_of
 from lyra_petsc.cli.progress import StudyProgress
 from lyra_petsc.cli.run import petsc_speaks, tell_unused
 from lyra_petsc.errors import SolverError
@@ -77,17 +77,14 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
 
 def _words(plan: Plan) -> list[str]:
     """What repeats the study from the beginning."""
-    request, words = plan.request, [plan.request.scene]
-    for text in request.settings:
-        words += ["--set", text]
+    request, varied = plan.request, []
     for axis in plan.axes:
         values = ",".join(f"{value!r}" if isinstance(value, float) else value for value in axis.values)
-        words += ["--vary", f"{axis.key}={values}"]
-    words += ["--reference", request.reference]
-    words += ["--quantities", request.quantities] if request.quantities else []
-    words += ["--repeats", str(request.repeats)]
-    words += ["--ranks", str(request.ranks)] if request.ranks is not None else []
-    return [*words, *(["--trust-mesh"] if request.trust_mesh else [])]
+        varied.append(f"{axis.key}={values}")
+    options = {"--set": request.settings, "--vary": varied}
+    for name in ("reference", "quantities", "repeats", "ranks"):
+        options[f"--{name}"] = getattr(request, name)
+    return [request.scene, *words_of(options | {"--trust-mesh": request.trust_mesh})]
 
 
 def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:

@@ -337,22 +337,16 @@ def barycentric(places: Array, corners: Array) -> Array:
 
 def _on_sides(places: Array, corners: Array) -> Array:
     """Weights of the nearest place on the three sides."""
-    best = np.full(len(places), np.inf)
-    weights = np.zeros((len(places), 3))
-    for k in range(3):
-        start, side = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
-        along = np.clip(_dot(places - start, side) / _dot(side, side), 0.0, 1.0)
-        distance = np.linalg.norm(start + along[:, None] * side - places, axis=1)
-        nearer = distance < best
-        best[nearer] = distance[nearer]
-        weights[nearer] = 0.0
-        weights[nearer, k] = 1.0 - along[nearer]
-        weights[nearer, (k + 1) % 3] = along[nearer]
+    sides, ways = np.roll(corners, -1, axis=1) - corners, places[:, None] - corners
+    along = np.clip(_dot(ways, sides) / _dot(sides, sides), 0.0, 1.0)
+    side = np.linalg.norm(along[:, :, None] * sides - ways, axis=2).argmin(axis=1)
+    rows, weights = np.arange(len(side)), np.zeros((len(side), 3))
+    weights[rows, side], weights[rows, (side + 1) % 3] = 1.0 - along[rows, side], along[rows, side]
     return weights
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ni,ni->n", a, b))
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 Errors = dict[str, float]
