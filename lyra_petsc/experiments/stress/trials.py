@@ -451,15 +451,10 @@ class Stress(View[StressOutcome]):
             report.bullets(left_out)
 
 
-def badness(outcome: StressOutcome) -> tuple[float, ...]:
+def badness(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
     """Cases that failed first, then those with the most trouble."""
     record = outcome.record
-    return (
-        float(not outcome.passed),
-        float(bool(record.stopped)),
-        float(record.rejected),
-        float(max(record.newton, default=0)),
-    )
+    return not outcome.passed, bool(record.stopped), record.rejected, max(record.newton, default=0)
 
 
 def _padded(texts: Sequence[str]) -> str:
@@ -473,21 +468,13 @@ def _figures(report: Report, outcome: StressOutcome) -> None:
     case, record = outcome.case, outcome.record
     if record.last is not None and record.triangles is not None:
         when = f"t = {seconds(record.times[-1])}" if record.times else "the start"
-        report.figure(
-            surface(
-                record.last, record.triangles, name=f"{PLOTS}/{case.name}-shape",
-                caption=f"{case.name}: {case.title}, {when}",
-            )
-        )  # fmt: skip
+        words, name = f"{case.name}: {case.title}, {when}", f"{PLOTS}/{case.name}-shape"
+        report.figure(surface(record.last, record.triangles, name=name, caption=words))
     if len(record.times) > 1:
         times = [0.0, *record.times]
         curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
         if record.balances and record.integrator == "beuler":
             work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
             curves.append(Series("energy at the start + work done", times, list(work)))
-        report.figure(
-            over_time(
-                curves, name=f"{PLOTS}/{case.name}-energy", caption=f"{case.name}: energy over time",
-                y_label="energy [J]",
-            )
-        )  # fmt: skip
+        words, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
+        report.figure(over_time(curves, name=name, caption=words, y_label="energy [J]"))

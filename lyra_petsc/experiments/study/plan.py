@@ -83,7 +83,7 @@ class Axis:
 
     key: str
     path: str
-    values: tuple[Value, ...]
+    values: tuple[Value, ...] = ()
 
     @property
     def numeric(self) -> bool:
@@ -556,15 +556,15 @@ class Plan:
         further = f"output.every={self.every!r}", *overrides(self.base, chosen)
         return (*self.request.settings, *LEAN, *further)
 
-    def scene(self, combination: Combination) -> Scene:
-        """The scene of a combination.
+    def scene(self, case: StudyCase) -> Scene:
+        """The scene of a case.
 
         Raises
         ------
         InputError
             If its settings do not go together.
         """
-        return scene_of(self.request.scene, combination.overrides, trust_mesh=self.request.trust_mesh)
+        return scene_of(self.request.scene, case.overrides, trust_mesh=self.request.trust_mesh)
 
 
 def make_plan(request: Request) -> Plan:

@@ -105,15 +105,9 @@ def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
     """Mark the rows that no other beats in both run time and error."""
     able = _able(rows, quantity)
-    for row in able:
-        error = row.at_most(quantity)
-        row.on_front = not any(
-            other is not row
-            and other.run <= row.run
-            and other.at_most(quantity) <= error
-            and (other.run < row.run or other.at_most(quantity) < error)
-            for other in able
-        )
+    costs = [(row.run, row.at_most(quantity)) for row in able]
+    for row, mine in zip(able, costs, strict=True):
+        row.on_front = not any(one[0] <= mine[0] and one[1] <= mine[1] and one != mine for one in costs)
 
 
 def _able(rows: Sequence[StudyRow], quantity: str) -> list[StudyRow]:
@@ -448,24 +442,17 @@ def _work(
     plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
-    lines = [
-        Series(
-            label,
-            [row.run for row in group],
-            [row.shown(name) for row in group],
-            [min(row.result.run_seconds) for row in group],
-            [max(row.result.run_seconds) for row in group],
-            [_point(row, axis) for row in group],
-        )
-        for label, group in families(rows, axis).items()
-    ]
+    lines = []
+    for label, group in families(rows, axis).items():
+        times = [row.result.run_seconds for row in group]
+        points = [row.run for row in group], [row.shown(name) for row in group]
+        labels = [_point(row, axis) for row in group]
+        lines.append(Series(label, *points, [*map(min, times)], [*map(max, times)], labels))
     hidden = [row for row in rows if row.passed and name in row.unresolved]
-    main = quantity == plan.quantities[0]
-    star = next((row for row in rows if row.recommended), None)
-    place = None
-    if star is not None and main:
-        at = SAFETY * star.own[name] if name in star.unresolved else star.errors[name]
-        place = (star.run, at)
+    main, place, stars = quantity == plan.quantities[0], None, ""
+    for star in (row for row in rows if row.recommended and main):
+        stars = f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
+        place = star.run, SAFETY * star.own[name] if name in star.unresolved else star.errors[name]
     return work_precision(
         lines,
         name=("work-precision" if main else f"work-precision-{_file(name)}") + mark,
@@ -475,9 +462,7 @@ def _work(
         front=[(row.run, row.shown(name)) for row in rows if row.on_front] if main else (),
         bounds=[(row.run, SAFETY * row.own[name]) for row in hidden],
         recommended=place,
-        recommendation=f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
-        if star is not None
-        else "",
+        recommendation=stars,
         floor=_floor(known, quantity),
         floor_label=BELOW,
     )

@@ -34,22 +34,21 @@ from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, f
 from lyra_petsc.experiments.study.plan import (
     AUTO_STEPS,
     MEAN_SQUARE,
+    Axis,
     Combination,
     Physics,
     Plan,
     StudyCase,
     Value,
-    mesh_overrides,
+    in_words,
     overrides,
     scene_of,
-    time_overrides,
 )
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.show.report.document import seconds
 
 NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
 """Keys in which the scene of a run to compare with may differ without a note."""
@@ -126,8 +125,7 @@ def choose_references(plan: Plan) -> dict[Physics, Reference]:
     groups = list(dict.fromkeys(combination.physics for combination in plan.combinations))
 
     def scene(physics: Physics) -> Scene:
-        request = plan.request
-        return scene_of(request.scene, physical_overrides(plan, physics), trust_mesh=request.trust_mesh)
+        return plan.scene(StudyCase("", "", physical_overrides(plan, physics)))
 
     if kind == "auto" and not colon:
         return {physics: _automatic(scene(physics)) for physics in groups}
@@ -259,21 +257,16 @@ def make_family(
         common += overrides(plan.base, [(axis, axis.values[0]) for axis in fixed])
 
     def level(h: float | None, step: float | None) -> StudyCase:
-        further, words, name, weight = list(common), [], ["reference"], 1.0
+        chosen: list[tuple[Axis, Value]] = []
         if step is not None:
-            chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
-            further += [f"time.integrator={integrator}", f"time.step={step!r}"]
-            further += time_overrides(plan.base, chosen)
-            words += [integrator, f"Δt {seconds(step, 6)}"]
-            name += [integrator, f"dt{step:.6g}"]
-            weight /= step
+            chosen += [(Axis("integrator", "time.integrator"), integrator), (Axis("dt", "time.step"), step)]
         if h is not None:
-            further += mesh_overrides(plan.base, h)
-            words.append(f"h {h:g} m")
-            name.append(f"h{h:.6g}")
-            weight *= h**-2
-        title = ", ".join(words) or "tightest tolerances"
-        return StudyCase("-".join(name) + number, title, tuple(further), weight)
+            chosen.append((Axis("mesh", "mesh"), h))
+        sizes = [f"dt{step:.6g}" if step is not None else "", f"h{h:.6g}" if h is not None else ""]
+        name = "-".join(filter(None, ["reference", integrator, *sizes])) + number
+        title = in_words((axis.key, value) for axis, value in chosen) or "tightest tolerances"
+        weight = (h or 1.0) ** -2 / (step or 1.0)
+        return StudyCase(name, title, (*common, *overrides(plan.base, chosen)), weight)
 
     def chain(order: int, *sizes: tuple[float | None, float | None]) -> Chain:
         return Chain(tuple(level(*size) for size in sizes), order)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import isotropic
+from lyra_petsc.experiments.verification.answers import grid, isotropic, scene
 
 MEMBRANE = 1e6
 """C L²/B: as of a strip with a thickness of 0.0035 L. The exact shapes take its stretch into account."""
@@ -30,13 +30,9 @@ def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> di
     """
     along = round(n)
     material = {"density": DENSITY, "membrane": isotropic(membrane), "bending": 1.0}
-    return {
-        "mesh": {"grid": {"width": 1.0, "height": 1.0 / along, "nx": along, "ny": 1, "pattern": pattern}},
-        "material": material | more.pop("material", {}),
-        "handles": [{"group": "left", "clamp": True}],
-        "time": {"analysis": "static"},
-        **more,
-    }
+    held = [{"group": "left", "clamp": True}]
+    mesh = grid(1.0, 1.0 / along, along, 1, pattern)
+    return scene(mesh, material | more.pop("material", {}), handles=held, **more)
 
 
 Array = NDArray[np.float64]
@@ -72,10 +68,7 @@ def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]
     start = np.column_stack(
         [cos * along[:, 0] - sin * along[:, 1], vertices[:, 1], sin * along[:, 0] + cos * along[:, 1]]
     )
-    return {
-        "mesh": bench.mesh(start, triangles, rest=vertices[:, :2]),
-        "material": {"density": e * STIFFNESS / (G * LENGTH), "membrane": isotropic(STIFFNESS)},
-        "gravity": [0, 0, -G],
-        "handles": [{"nodes": [0, n, n + 1, 2 * n + 1]}, {"box": [[-9, -9, -9], [9, 9, 9]], "axes": ["y"]}],
-        "time": {"analysis": "static"},
-    }
+    mesh = bench.mesh(start, triangles, rest=vertices[:, :2])
+    material = {"density": e * STIFFNESS / (G * LENGTH), "membrane": isotropic(STIFFNESS)}
+    held = [{"nodes": [0, n, n + 1, 2 * n + 1]}, {"box": [[-9, -9, -9], [9, 9, 9]], "axes": ["y"]}]
+    return scene(mesh, material, gravity=[0, 0, -G], handles=held)

@@ -65,7 +65,7 @@ class Facts:
     @property
     def static(self) -> bool:
         """Whether it seeks an equilibrium: time is the load factor then."""
-        return self.run.scene.time.analysis == "static"
+        return self.run.scene.time.static
 
     @cached_property
     def outcome(self) -> str:
@@ -451,8 +451,7 @@ def plain_pictures(run: StoredRun) -> list[Drawing]:
 
 def state_caption(run: StoredRun, i: int) -> str:
     """What a picture of state ``i`` shows."""
-    static = run.scene.time.analysis == "static"
-    return f"Load factor {run.times[i]:g}" if static else f"t = {run.times[i]:g} s"
+    return f"Load factor {run.times[i]:g}" if run.scene.time.static else f"t = {run.times[i]:g} s"
 
 
 def _overview(page: Report, facts: Facts) -> None:

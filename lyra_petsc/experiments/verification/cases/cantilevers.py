@@ -22,6 +22,7 @@ from lyra_petsc.experiments.verification.answers import (
     at_finest,
     case,
     isotropic,
+    scene,
 )
 from lyra_petsc.experiments.verification.cases.hinges import expected
 from lyra_petsc.experiments.verification.flat_plates import KINDS, plate_material, strip_mesh
@@ -87,13 +88,10 @@ def directed(bench: Bench, n: float, loads: Loads) -> Iterator[tuple[Strip, floa
 def _directed(
     bench: Bench, kind: str, n: float, width: float, length: float = 1.0, **more: Any
 ) -> dict[str, Any]:
-    return {
-        "mesh": strip_mesh(bench, kind, n, width, length),
-        "material": plate_material(MEMBRANE),
-        "handles": [{"group": "left", "clamp": True}],
-        "time": {"analysis": "static"},
-        **more,
-    }
+    given: dict[str, Any] = {"material": plate_material(MEMBRANE)} | more
+    return scene(
+        strip_mesh(bench, kind, n, width, length), handles=[{"group": "left", "clamp": True}], **given
+    )
 
 
 def _tip(trial: Trial) -> tuple[float, float]:
