@@ -14,7 +14,7 @@ from lyra_petsc.cli.run import petsc_speaks, tell_unused
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.case import save_record
 from lyra_petsc.experiments.results import Results
-from lyra_petsc.experiments.study.jobs import STUDY, Job, Result, Watch, launched, run_case
+from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
 from lyra_petsc.experiments.study.study_report import Study
 from lyra_petsc.experiments.study.work import Work, choose_references
@@ -58,17 +58,11 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
         folder = directory.path
         directory.clean()
         on_root(comm, lambda: save_record(folder / REQUEST_FILE, plan.request))
-
-        def run(job: Job, watch: Watch, warm: bool) -> Result:
-            if launcher is not None:
-                # every process warms up by itself
-                return launched(launcher, job, watch, directory.descriptor)
-            return run_case(comm, job, watch, warm=warm)
-
+        lock = directory.descriptor if launcher is not None else -1
         with StudyProgress(comm, obey, len(plan.combinations), plain=petsc_speaks()) as progress:
             for note in [*plan.notes, *([directory.note] if directory.note else [])]:
                 progress.note(note)
-            view = Study(Work(comm, plan, chosen, folder, run, progress))
+            view = Study(Work(comm, plan, chosen, folder, progress, launcher, lock))
             again = command(comm, "study", _words(plan))
             results = Results(comm, folder, view, ranks=view.ranks, command=again, force=True)
             results.run(view.cases(), view.work.run)

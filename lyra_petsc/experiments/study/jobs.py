@@ -6,13 +6,11 @@ repeat, the wall time from all.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -158,12 +156,6 @@ def read_result(folder: Path, fingerprint: str) -> Result | None:
     """The result of a finished case, or None if there is none for this fingerprint."""
     found = read_record(folder / RESULT_FILE, Result)
     return found if found is not None and found.fingerprint == fingerprint else None
-
-
-def fingerprint(*parts: Sequence[str] | str) -> str:
-    """A short digest of texts."""
-    text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 CASES = "cases"

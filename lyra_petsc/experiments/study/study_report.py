@@ -643,17 +643,12 @@ def all_versions() -> dict[str, str]:
 
 def busy(ranks: int) -> list[str]:
     """A note where other processes leave too few cores of this machine idle for so many ranks."""
-    cores = os.cpu_count() or 1
-    try:
+    cores, load = os.cpu_count() or 1, -math.inf
+    with suppress(OSError):
         load = os.getloadavg()[0]
-    except OSError:
-        return []
-    if load + ranks <= cores + 0.5:
-        return []
-    return [
-        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
-        "run times may be larger and spread more than on an idle one"
-    ]
+    words = "run times may be larger and spread more than on an idle one"
+    note = f"the machine was busy when this began (load {load:.1f} on {cores} cores): {words}"
+    return [note] if load + ranks > cores + 0.5 else []
 
 
 def machine() -> str:

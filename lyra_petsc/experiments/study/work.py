@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import math
 import statistics
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -26,11 +27,11 @@ from petsc4py import PETSc
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.experiments.case import Outcome, Verdict
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict
 from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
 from lyra_petsc.experiments.study import comparison
 from lyra_petsc.experiments.study.comparison import Errors, History, RestSurface, Samples
-from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, fingerprint, read_result
+from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, launched, read_result, run_case
 from lyra_petsc.experiments.study.plan import (
     AUTO_STEPS,
     MEAN_SQUARE,
@@ -395,9 +396,6 @@ def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -
 ROUND_OFF = 1e-13
 """Own error of an exact reference."""
 
-Runner = Callable[[Job, Callable[[float], None], bool], Result]
-"""Runs a job: (job, watch, warm) → result; collective."""
-
 
 class Observer(Protocol):
     """Who wants to know how far a study is, and may end it."""
@@ -477,51 +475,55 @@ def mark_unresolved(row: StudyRow) -> None:
     row.unresolved |= {name for name, error in row.errors.items() if error < SAFETY * row.own.get(name, 0.0)}
 
 
+def fingerprint(*parts: Sequence[str] | str) -> str:
+    """A short digest of texts."""
+    text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
 T = TypeVar("T")
 Runs = Generator[StudyCase, None, T]
 """Cases to run, and what is made of their results."""
 
 
+@dataclass
 class Work:
     """Runs and comparisons of a study; every method is collective.
 
-    Parameters
+    Attributes
     ----------
     comm : MPI.Comm
     plan : Plan
     chosen : dict of physics → Reference
     folder : Path
-    run : callable
-        How a job is run, see `Runner`.
     observer : Observer
-
-    Attributes
-    ----------
+    launcher : Launcher or None
+        What starts processes for each case; None: cases are run here.
+    lock : int
+        File descriptor that those processes keep open, see `launched`.
     rows : list of StudyRow
         The combinations that have ended.
     known : dict of physics → Reference
         References as they came out.
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        plan: Plan,
-        chosen: dict[Physics, Reference],
-        folder: Path,
-        run: Runner,
-        observer: Observer,
-    ) -> None:
-        self.comm, self.plan, self.chosen, self.folder = comm, plan, chosen, folder
-        self._run, self._observer = run, observer
-        self.rows: list[StudyRow] = []
-        self.known: dict[Physics, Reference] = {}
+    comm: MPI.Comm
+    plan: Plan
+    chosen: dict[Physics, Reference]
+    folder: Path
+    observer: Observer
+    launcher: Launcher | None = None
+    lock: int = -1
+    rows: list[StudyRow] = field(default_factory=list, init=False)
+    known: dict[Physics, Reference] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
         self._results: dict[str, Result] = {}
         self._warm: set[tuple[str, ...]] = set()
         self._done = 0.0
-        self._whole = sum(case.weight for case in plan.combinations)
-        for physics in (physics for physics, one in chosen.items() if one.kind == "finer"):
-            family = self._family(physics, self._smallest([]), integrators(plan)[0])
+        self._whole = sum(case.weight for case in self.plan.combinations)
+        for physics in (physics for physics, one in self.chosen.items() if one.kind == "finer"):
+            family = self._family(physics, self._smallest([]), integrators(self.plan)[0])
             weights = {each.name: each.weight for chain in family for each in chain.levels}
             self._whole += sum(weights.values())
 
@@ -548,21 +550,25 @@ class Work:
             return job, found, found is None and (folder / RESULT_FILE).exists()
 
         def watch(fraction: float) -> None:
-            self._observer.progress(begun + case.weight * fraction, self._whole)
+            self.observer.progress(begun + case.weight * fraction, self._whole)
 
         looked = on_root(self.comm, look)
         job, found, stale = looked
-        self._observer.case(case.title, resumed=found is not None)
+        self.observer.case(case.title, resumed=found is not None)
         if stale:
-            self._observer.note(
+            self.observer.note(
                 f"{case.title} was finished with another scene, program, options, repeats or ranks: it runs "
                 "again"
             )
         if found is None:
-            found = self._run(job, watch, case.kernels not in self._warm)
+            if self.launcher is not None:
+                # every process warms up by itself
+                found = launched(self.launcher, job, watch, self.lock)
+            else:
+                found = run_case(self.comm, job, watch, warm=case.kernels not in self._warm)
             self._warm.add(case.kernels)
             if found.problem:
-                self._observer.note(f"{case.title} failed: {found.problem}")
+                self.observer.note(f"{case.title} failed: {found.problem}")
         watch(1.0)
         self._done += case.weight
         self._results[case.name] = found
