@@ -12,7 +12,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.experiments.case import Case, load_record
@@ -294,7 +293,7 @@ def combinations(axes: Sequence[Axis]) -> list[Combination]:
 
 
 def overrides(base: Scene, chosen: Choice) -> list[str]:
-    """What ``--set`` would say to get these values of axes.
+    """What ``--set`` would say to get these values of axes, with what else of the ``time`` block must change.
 
     Raises
     ------
@@ -308,18 +307,12 @@ def overrides(base: Scene, chosen: Choice) -> list[str]:
         else:
             whole = isinstance(value, float) and value.is_integer()
             found.append(f"{axis.path}={int(value) if whole else value}")
-    return found + time_overrides(base, {axis.path: value for axis, value in chosen})
-
-
-def time_overrides(base: Scene, chosen: dict[str, Any]) -> list[str]:
-    """What else of the ``time`` block must change so that it still fits together."""
-    time, found = base.time, []
-    if "time.tolerance" in chosen and time.step != "auto":
+    time, given = base.time, {axis.path: value for axis, value in chosen}
+    if "time.tolerance" in given and time.step != "auto":
         found.append("time.step=auto")
-    if "time.step" in chosen and chosen["time.step"] != "auto" and time.tolerance is not None:
+    if given.get("time.step", "auto") != "auto" and time.tolerance is not None:
         found.append("time.tolerance=")
-    integrator = chosen.get("time.integrator")
-    if integrator not in (None, "alpha2") and "time.spectral_radius" not in chosen:
+    if given.get("time.integrator", "alpha2") != "alpha2" and "time.spectral_radius" not in given:
         found.append("time.spectral_radius=")
     return found
 
