@@ -71,20 +71,16 @@ def run_command_line(argv: Sequence[str]) -> int:
     try:
         code = verbs.main(ours, prog_name=PROGRAM, standalone_mode=False, obj=comm)
     except LyraError as error:
-        _say(comm, str(error), error.details)
-        return _leave_together(comm, error.exit_code, str(error))
+        return _leave_together(comm, error.exit_code, str(error), error.details)
     except click.exceptions.Exit as leave:
         return leave.exit_code
     except click.ClickException as error:
-        line = _in_one_line(error)
-        _say(comm, line)
-        return _leave_together(comm, InputError.exit_code, line)
+        return _leave_together(comm, InputError.exit_code, _in_one_line(error))
     except (Exception, KeyboardInterrupt) as error:
         reserve.clear()  # Open MPI without memory leaves with a code of its own
         if isinstance(error, PETSc.Error) and quoted(error):
             line = str(refused(error))
             _clear_frames(error)
-            _say(comm, line)
             return _leave_together(comm, InputError.exit_code, line)
         code = _report_unexpected(comm, error)
         _clear_frames(error)
@@ -109,10 +105,11 @@ def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
             print("\n".join(lines), file=sys.stderr, flush=True)
 
 
-def _leave_together(comm: Any, code: int, line: str) -> int:
-    """The exit code if all ranks failed together; else end the whole job."""
+def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()) -> int:
+    """Print why; the exit code if all ranks failed together, else end the whole job."""
     from lyra_petsc.parallel import all_here
 
+    _say(comm, line, details)
     if not all_here(comm):
         if comm.rank > 0:  # rank 0, which prints the messages, does not know
             with suppress(OSError):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from lyra_petsc.cli.run import tell_unused
 from lyra_petsc.cli.signals import StopRequest
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Launcher, Outcome, passed_of
-from lyra_petsc.experiments.results import Results, View, aligned
+from lyra_petsc.experiments.results import CaseObserver, Results, View, aligned
 from lyra_petsc.output.run_folder import free_name
 from lyra_petsc.parallel import on_root
 
@@ -61,6 +62,16 @@ def command(comm: MPI.Comm, verb: str, words: Sequence[str]) -> list[str]:
     return [*launcher, "python", "-m", "lyra_petsc", verb, *words, *petsc_words()]
 
 
+def words_of(options: Mapping[str, Any]) -> list[str]:
+    """Options as they are written: those of many values again and again, those without a value not at all."""
+    words = []
+    for name, given in options.items():
+        for value in given if isinstance(given, tuple | list) else [given]:
+            if value not in (None, "", False):
+                words += [name] if value is True else [name, str(value)]
+    return words
+
+
 def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | None:
     """What starts an mpirun for each case with ``--ranks``; collective.
 
@@ -74,7 +85,7 @@ def case_launcher(comm: MPI.Comm, verb: str, ranks: int | None) -> Launcher | No
     return Launcher(on_root(comm, lambda: find_launcher(ranks)), verb, petsc_words())
 
 
-class Terminal:
+class Terminal(CaseObserver[Any, Any]):
     """Shows the progress of cases on the terminal; on rank 0 only.
 
     Parameters
@@ -112,10 +123,10 @@ class Terminal:
 
     def close(self, results: Results[Any], note: str) -> None:
         """The end: a table, what passed, where results are, what is missing, options that nothing used."""
-        outcomes = results.outcomes
+        outcomes, table = results.outcomes, self._view.summary(results.outcomes)
         if self._view.heading():  # the lines of the cases are a table, too
             self.print()
-        for line in aligned(self._view.summary(outcomes), len(self._view.summary(outcomes)[0]) - 1):
+        for line in aligned(table, len(table[0]) - 1):
             self.print(line)
         total = duration(sum(outcome.seconds for outcome in outcomes))
         self.print(f"{passed_of(outcomes)}, {total} in all")
@@ -146,16 +157,10 @@ def verify(
     if listed:
         return _list(comm, CASES.all(), f"{len(CASES.modules)} cases")
     cases = [CASES.load(name) for name in dict.fromkeys(names or CASES.modules)]
-    again, view = command(comm, "verify", [*names, *(["--quick"] if quick else [])]), Verification()
-    results = Results(comm, out, view, ranks=comm.size, command=again, force=force)
-    watch = watched(comm)
-    return _run(
-        comm,
-        results,
-        cases,
-        lambda case: answers.run_case(comm, case, quick=quick, watch=watch),
-        len(CASES.modules),
-    )
+    again = command(comm, "verify", [*names, *words_of({"--quick": quick})])
+    results = Results(comm, out, Verification(), ranks=comm.size, command=again, force=force)
+    run = partial(answers.run_case, comm, quick=quick, watch=watched(comm))
+    return _run(comm, results, cases, run, len(CASES.modules))
 
 
 def stress(
@@ -210,10 +215,8 @@ def stress(
         # a base scene that does not run is refused before anything is written
         clock = trials.BaseClock(comm, setting, watch)
         setting = replace(setting, size=clock.size)
-    asked = [] if scene is None else [str(scene)]
-    asked += [word for text in settings for word in ("--set", text)]
-    asked += ["--trust-mesh"] if trust_mesh else []
-    asked += [f"--{level.name.lower()}"] if level != Scope.USUAL else []
+    asked = [*([] if scene is None else [str(scene)]), *words_of({"--set": settings})]
+    asked += words_of({"--trust-mesh": trust_mesh, "--quick": quick, "--full": full})
 
     def run(case: StressCase) -> trials.StressOutcome:
         if launcher is not None:
@@ -224,8 +227,7 @@ def stress(
         outcome = run(cases[0])
         on_root(comm, lambda: trials.save(outcome, job))
         return 0 if outcome.passed else FAILED
-    words = [*asked, *(["--only", ",".join(names)] if names else [])]
-    words += ["--ranks", str(ranks)] if ranks is not None else []
+    words = [*asked, *words_of({"--only": ",".join(names), "--ranks": ranks})]
     again, view = command(comm, "stress", words), Stress(setting, len(cases))
     results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
     return _run(comm, results, cases, run, known)

@@ -51,6 +51,7 @@ class ProgressBar:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
         self._began, self._drawn = clock(), -math.inf
+        self._first: tuple[float, float] | None = None
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
             self._bar = _bar(self._stream)
@@ -76,6 +77,13 @@ class ProgressBar:
             if fraction >= 1.0 or self._clock() - self._drawn >= REDRAW_SECONDS:
                 self._drawn = self._clock()
                 self._bar.refresh()
+
+    def _left(self, done: float, whole: float = 1.0) -> float:
+        """Seconds that the rest will take, as long as what was done since the first call; NaN at that."""
+        began, before = self._first = self._first or (self._clock(), done)
+        if done <= before:
+            return 0.0 if done >= whole else math.nan
+        return (self._clock() - began) * (whole - done) / (done - before)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
@@ -115,7 +123,6 @@ class Progress(ProgressBar):
         self._name = "t" if unit else "load"
         self._unit = f" {unit}" if unit else ""
         self._start, self._end = start, end
-        self._first: tuple[float, float] | None = None
         self._steps = 0
         self._last_shown: float | None = None
         self._fraction_shown = 0.0
@@ -143,17 +150,14 @@ class Progress(ProgressBar):
         span = self._end - self._start
         fraction = min(max((time - self._start) / span, 0.0), 1.0) if span > 0 else 1.0
         # the first step does what later ones need not, so the time left is estimated from the others
-        self._first, self._steps = self._first or (now, fraction), self._steps + 1
-        began, done = self._first
-        enough = self._steps > FEWEST_STEPS and (
-            now - began >= LEAST_SECONDS or fraction - done >= LEAST_PART
-        )
-        left = (now - began) * (1 - fraction) / (fraction - done) if enough and fraction > done else math.nan
+        left, self._steps = self._left(fraction), self._steps + 1
+        began, done = self._first or (now, fraction)
+        enough = now - began >= LEAST_SECONDS or fraction - done >= LEAST_PART
         state = (
             f"{self._name} {time:.4g} of {self._end:.4g}{self._unit}  step {step}  "
             f"Newton {newton_iterations}  linear {linear_iterations}  energy {energy:.4g} J"
         )
-        if math.isfinite(left):
+        if self._steps > FEWEST_STEPS and enough and math.isfinite(left):
             state += f"  {duration(left)} left"
         if self._bar is not None:
             self._draw(fraction, state)
@@ -183,15 +187,14 @@ class FrameProgress(ProgressBar):
 
     def __init__(self, comm: MPI.Comm, **options: Any) -> None:
         super().__init__(comm, **options)
-        self._last_line = self._began
+        self._last_line, self._first = self._began, (self._began, 0.0)
 
     def update(self, done: int, count: int) -> None:
         """Show how many of the states are drawn."""
         if not self._shown:
             return
         now = self._clock()
-        left = (now - self._began) * (count - done) / done if done else math.nan
-        text = f"{done} of {count} states drawn  {duration(left)} left"
+        text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
         self._draw(done / count, text)
         if self._bar is None and now - self._last_line >= self.LINE_SECONDS:
             self._last_line = now
@@ -215,7 +218,6 @@ class StudyProgress(ProgressBar):
     def __init__(self, comm: MPI.Comm, stop: Callable[[], None], combinations: int, **options: Any) -> None:
         super().__init__(comm, **options)
         self._stop, self._combinations = stop, combinations
-        self._first: tuple[float, float] | None = None
         self._label, self._number = "", 0
         self._last_shown = -math.inf
 
@@ -232,15 +234,11 @@ class StudyProgress(ProgressBar):
         self._stop()
         if not self._shown:
             return
-        now = self._clock()
-        # what was finished before took no time now
-        began, before = self._first = self._first or (now, done)
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
-        fresh = (done - before) / (whole - before) if whole > before else 1.0
-        left = (now - began) * (1.0 - fresh) / fresh if fresh > 0.0 else math.nan
-        state = f"{self._label}  {duration(left)} left"
+        # what was finished before took no time now
+        state = f"{self._label}  {duration(self._left(done, whole))} left"
         self._draw(fraction, state)
-        if self._bar is None and now - self._last_shown >= LINE_AT_LEAST_SECONDS:
+        if self._bar is None and self._clock() - self._last_shown >= LINE_AT_LEAST_SECONDS:
             self._line(f"{fraction:4.0%}  {state}")
 
     def note(self, text: str) -> None:

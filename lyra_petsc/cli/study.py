@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
 
-from lyra_petsc.cli.experiments import case_launcher, command, watched
+from lyra_petsc.cli.experiments import case_launcher, command, watched, words_of
 from lyra_petsc.cli.progress import StudyProgress
 from lyra_petsc.cli.run import petsc_speaks, tell_unused
-from lyra_petsc.errors import InputError, SolverError
-from lyra_petsc.experiments.case import load_record, save_record
-from lyra_petsc.experiments.study.jobs import STUDY, Job, Result, launched, report_progress, run_case
+from lyra_petsc.errors import SolverError
+from lyra_petsc.experiments.case import save_record
+from lyra_petsc.experiments.results import Results
+from lyra_petsc.experiments.study.jobs import STUDY
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, Plan, Request, make_plan, read_request
-from lyra_petsc.experiments.study.study_report import StudyOutcome, conduct
+from lyra_petsc.experiments.study.study_report import Study
 from lyra_petsc.experiments.study.work import Work, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
@@ -48,9 +47,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
     scene = said["scene"] or default_scene()
     stem = out.name if resume and said["scene"] is None and out is not None else scene.stem
     choice = choose(comm, stem, out, force=force, resume=resume, kind=STUDY)
-    base = Request(str(scene))
-    if resume:
-        base = on_root(comm, lambda: read_request(choice.path))
+    base = on_root(comm, lambda: read_request(choice.path)) if resume else Request(str(scene))
     said["scene"] = said["scene"] and str(scene)
     request = dataclasses.replace(base, **{k: given for k, given in said.items() if given not in (None, ())})
     obey = watched(comm, lambda: f"; finished combinations are kept in {folder}, --resume goes on")
@@ -61,84 +58,43 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
         folder = directory.path
         directory.clean()
         on_root(comm, lambda: save_record(folder / REQUEST_FILE, plan.request))
-
-        def run(job: Job, watch: Callable[[float], None], warm: bool) -> Result:
-            if launcher is not None:
-                # every process warms up by itself
-                return launched(launcher, job, watch, directory.descriptor)
-            return run_case(comm, job, watch, warm=warm)
-
+        lock = directory.descriptor if launcher is not None else -1
         with StudyProgress(comm, obey, len(plan.combinations), plain=petsc_speaks()) as progress:
             for note in [*plan.notes, *([directory.note] if directory.note else [])]:
                 progress.note(note)
-            outcome = conduct(comm, Work(comm, plan, chosen, folder, run, progress), _command(comm, plan))
-    _close(comm, outcome, folder)
+            view = Study(Work(comm, plan, chosen, folder, progress, launcher, lock))
+            again = command(comm, "study", _words(plan))
+            results = Results(comm, folder, view, ranks=view.ranks, command=again, force=True)
+            results.run(view.cases(), view.work.run)
+    _close(comm, view, folder)
 
 
-def _command(comm: MPI.Comm, plan: Plan) -> str:
-    """The command line that repeats the study from the beginning."""
-    request = plan.request
-    words = [request.scene]
-    for text in request.settings:
-        words += ["--set", text]
+def _words(plan: Plan) -> list[str]:
+    """What repeats the study from the beginning."""
+    request, varied = plan.request, []
     for axis in plan.axes:
         values = ",".join(f"{value!r}" if isinstance(value, float) else value for value in axis.values)
-        words += ["--vary", f"{axis.key}={values}"]
-    words += ["--reference", request.reference]
-    words += ["--quantities", request.quantities] if request.quantities else []
-    words += ["--repeats", str(request.repeats)]
-    words += ["--ranks", str(request.ranks)] if request.ranks is not None else []
-    words += ["--trust-mesh"] if request.trust_mesh else []
-    return shlex.join(command(comm, "study", words))
+        varied.append(f"{axis.key}={values}")
+    options = {"--set": request.settings, "--vary": varied}
+    for name in ("reference", "quantities", "repeats", "ranks"):
+        options[f"--{name}"] = getattr(request, name)
+    return [request.scene, *words_of(options | {"--trust-mesh": request.trust_mesh})]
 
 
-def _close(comm: MPI.Comm, outcome: StudyOutcome, folder: Path) -> None:
+def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
     """Words at the end, and the ways in which a study fails as a whole."""
+    rows = view.work.rows
+    done = sum(row.passed for row in rows)
     if comm.rank == 0:
-        for advice in outcome.advice.values():
+        for advice in view.advice.values():
             for one in advice:
                 print(one.words)
-        done = len(outcome.rows) - len(outcome.failed)
-        print(f"{done} of {len(outcome.rows)} combinations done, {len(outcome.failed)} failed")
+        print(f"{done} of {len(rows)} combinations done, {len(rows) - done} failed")
         print(f"report       {folder / 'report.html'}", flush=True)
         tell_unused([])
-    if not any(row.result.done for row in outcome.rows):
-        raise SolverError(
-            f"all {len(outcome.rows)} combinations failed; the first: {outcome.rows[0].result.problem}",
-            collective=True,
-        )
-    lost = [known for known in outcome.known.values() if known.kind == "none"]
-    if lost:
-        raise SolverError(
-            f"{lost[0].words} ({'; '.join(lost[0].notes)}); run times are in {folder / 'study.csv'}",
-            collective=True,
-        )
-
-
-def run_job(comm: MPI.Comm, path: Path) -> None:
-    """``study --job FILE``: one case of a study that was started with ``--ranks``; collective.
-
-    Raises
-    ------
-    InputError
-        If the file is no job.
-    Interrupted
-        A signal.
-    """
-    obey = watched(comm)
-
-    def read() -> Job:
-        try:
-            return load_record(path, Job)
-        except (OSError, ValueError):
-            raise InputError("is no job of a study", file=path, key="--job") from None
-
-    job = on_root(comm, read)
-    tell: Callable[[float], None] = report_progress(Path(job.folder))
-
-    def watch(fraction: float) -> None:
-        obey()
-        if comm.rank == 0:
-            tell(fraction)
-
-    run_case(comm, job, watch, warm=True)
+    if not done:
+        words = f"all {len(rows)} combinations failed; the first: {rows[0].result.problem}"
+        raise SolverError(words, collective=True)
+    for lost in (known for known in view.work.known.values() if known.kind == "none"):
+        words = f"{lost.words} ({'; '.join(lost.notes)}); run times are in {folder / 'study.csv'}"
+        raise SolverError(words, collective=True)

@@ -162,12 +162,14 @@ def study(comm: Any, /, job: Path | None, **asked: Any) -> None:
     from lyra_petsc.extras import require
 
     require("study")
-    from lyra_petsc.cli.study import run_job
-    from lyra_petsc.cli.study import study as study_scene
-
     if job is not None:
-        run_job(comm, job)
+        from lyra_petsc.cli.experiments import watched
+        from lyra_petsc.experiments.study.jobs import run_job
+
+        run_job(comm, job, watched(comm))
     else:
+        from lyra_petsc.cli.study import study as study_scene
+
         study_scene(comm, **asked)
 
 

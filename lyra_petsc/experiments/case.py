@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainValidator, TypeAdapter
 
-from lyra_petsc.api.mpirun import run_launched
+from lyra_petsc.api.mpirun import last_words, run_launched
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.atomic import replace_text
 
@@ -118,6 +118,14 @@ def load_record(path: Path, kind: type[T]) -> T:
     return TypeAdapter(kind).validate_json(path.read_bytes())
 
 
+def read_record(path: Path, kind: type[T]) -> T | None:
+    """The record in a file; None if there is none, or it is damaged."""
+    try:
+        return load_record(path, kind)
+    except (OSError, ValueError):
+        return None
+
+
 @dataclass(frozen=True)
 class Registry(Generic[T]):
     """Names on the command line, in their order, and the modules that define what they stand for.
@@ -176,6 +184,7 @@ class Launcher:
     petsc: Sequence[str]
 
     def __call__(self, words: Sequence[str], watch: Watch, keep_open: Sequence[int] = ()) -> tuple[int, str]:
-        """Run the verb with these words; exit code and what was said on stderr, see `run_launched`."""
+        """Run the verb with these words; exit code and last words on stderr, see `run_launched`."""
         program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
-        return run_launched([*program, *words, *self.petsc], watch, keep_open)
+        code, heard = run_launched([*program, *words, *self.petsc], watch, keep_open)
+        return code, last_words(heard, code)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -156,36 +156,29 @@ class Body:
         from lyra_petsc.terms import bending
 
         found = bending.elements(self.rest)
-        if len(found.stencil) == 0:
-            return False
         angles = bending.dihedral_angles(self.mesh.positions, found.stencil)
-        return bool(np.abs(angles - found.data["rest_angle"]).max() > 1e-7)
+        return bool(np.abs(angles - found.data["rest_angle"]).max(initial=0.0) > 1e-7)
 
     # -- assumptions that solutions share ----------------------------------------------------------------
 
     def forced(self) -> list[str]:
         """What moves the sheet beside gravity, wind and its own velocity, in words."""
-        scene, found = self.scene, []
-        if scene.time.analysis == "static":
-            found.append("a static analysis")
-        if scene.handles:
-            found.append("handles")
-        if scene.loads:
-            found.append("loads")
-        if scene.initial is not None and scene.initial.noise > 0.0:
-            found.append("initial.noise")
-        if scene.initial is not None and any(scene.initial.angular_velocity):
-            found.append("initial.angular_velocity")
-        return found
+        scene, initial = self.scene, self.scene.initial
+        return _holding(
+            {
+                "a static analysis": scene.time.static,
+                "handles": scene.handles,
+                "loads": scene.loads,
+                "initial.noise": initial is not None and initial.noise > 0.0,
+                "initial.angular_velocity": initial is not None and any(initial.angular_velocity),
+            }
+        )
 
     def strained(self) -> list[str]:
         """Why the start shape is not free of stress, in words."""
-        found = []
-        if np.abs(self.stretch - 1.0).max() > SAME:
-            found.append("a start shape that is stretched")
-        if self.is_bent:
-            found.append("a start shape that is bent, or a rest curvature")
-        return found
+        stretched = np.abs(self.stretch - 1.0).max() > SAME
+        bent = {"a start shape that is bent, or a rest curvature": self.is_bent}
+        return _holding({"a start shape that is stretched": stretched} | bent)
 
     @property
     def has_wind(self) -> bool:
@@ -194,8 +187,50 @@ class Body:
         return wind is not None and (wind.density > 0.0 or wind.drag > 0.0)
 
 
+@dataclass(frozen=True)
+class Solution:
+    """An exact solution.
+
+    Attributes
+    ----------
+    name : str
+    title : str
+        In words, for reports.
+    obstacles : callable
+        What of a scene contradicts its assumptions, in words; empty if it holds.
+    motion : callable
+        The motion, for a scene without obstacles.
+    """
+
+    name: str
+    title: str
+    obstacles: Callable[[Body], list[str]]
+    motion: Callable[[Body], ExactMotion]
+
+
+SOLUTIONS: dict[str, Solution] = {}
+"""By name."""
+
+Motion = Callable[[Body], ExactMotion]
+
+
+def _solution(name: str, title: str, obstacles: Callable[[Body], list[str]]) -> Callable[[Motion], Motion]:
+    """A decorator of the function that makes the motion."""
+
+    def add(motion: Motion) -> Motion:
+        SOLUTIONS[name] = Solution(name, title, obstacles, motion)
+        return motion
+
+    return add
+
+
 def _translation(body: Body, path: Callable[[float], tuple[Array, Array]]) -> ExactMotion:
     return Translation(body.mass, body.gravity, body.potential, path)
+
+
+def _holding(said: Mapping[str, object]) -> list[str]:
+    """The words that hold."""
+    return [words for words, holds in said.items() if holds]
 
 
 def free_fall_obstacles(body: Body) -> list[str]:
@@ -203,6 +238,7 @@ def free_fall_obstacles(body: Body) -> list[str]:
     return [*body.forced(), *(["wind"] if body.has_wind else []), *body.strained()]
 
 
+@_solution("free-fall", "free fall, x = X + v t + g t²/2", free_fall_obstacles)
 def free_fall(body: Body) -> ExactMotion:
     """A sheet that falls or flies freely without deforming: x = X + v₀ t + g t²/2."""
     return _translation(body, partial(_freely, body.start_velocity, body.gravity))
@@ -214,21 +250,16 @@ def _freely(start: Array, g: Array, t: float) -> tuple[Array, Array]:
 
 def _in_still_air(body: Body, drag: str) -> list[str]:
     """What contradicts a fall through still air; ``drag`` is the key of the wind that brakes it."""
-    found, wind = body.forced(), body.scene.wind
-    if not body.gravity.any():
-        found.append("no gravity")
-    if body.start_velocity.any():
-        found.append("initial.velocity")
-    if not body.has_wind:
-        found.append("no air (wind with velocity [0, 0, 0])")
-    elif wind is not None and any(wind.velocity):
-        found.append("wind that is not still")
-    if wind is not None and getattr(wind, drag) == 0.0:
-        found.append(f"wind.{drag} 0")
-    densities = body.rest.per_triangle("density")
-    if np.ptp(densities) > SAME * densities.max():
-        found.append("materials of different densities")
-    return found + body.strained()
+    wind, densities = body.scene.wind, body.rest.per_triangle("density")
+    air = {
+        "no gravity": not body.gravity.any(),
+        "initial.velocity": body.start_velocity.any(),
+        "no air (wind with velocity [0, 0, 0])": not body.has_wind,
+        "wind that is not still": body.has_wind and wind is not None and any(wind.velocity),
+        f"wind.{drag} 0": wind is not None and getattr(wind, drag) == 0.0,
+        "materials of different densities": np.ptp(densities) > SAME * densities.max(),
+    }
+    return [*body.forced(), *_holding(air), *body.strained()]
 
 
 def _cosines(body: Body) -> Array:
@@ -243,6 +274,7 @@ def flat_fall_obstacles(body: Body) -> list[str]:
     return _in_still_air(body, "density") + ([] if level else ["a sheet that is not flat and level"])
 
 
+@_solution("terminal-fall", "level sheet falling in still air, v = vt tanh(g t/vt)", flat_fall_obstacles)
 def flat_fall(body: Body) -> ExactMotion:
     """A level sheet released at rest: v = vt tanh(g t / vt), vt = √(ρ_sheet g / ρ_air).
 
@@ -271,6 +303,9 @@ def edge_fall_obstacles(body: Body) -> list[str]:
     return _in_still_air(body, "drag") + ([] if upright else ["a sheet that is not upright"])
 
 
+@_solution(
+    "edge-fall", "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))", edge_fall_obstacles
+)
 def edge_fall(body: Body) -> ExactMotion:
     """An upright flat sheet released at rest: v = vt (1 − exp(−g t / vt)), vt = ρ_sheet g / drag.
 
@@ -331,29 +366,27 @@ def breathing_obstacles(body: Body) -> list[str]:
     """What of a scene contradicts a breathing triangle, in words."""
     if body.mesh.n_triangles != 1:
         return [f"{body.mesh.n_triangles} triangles instead of one"]
-    found = body.forced()
-    if body.gravity.any():
-        found.append("gravity")
-    if body.has_wind:
-        found.append("wind")
-    if body.start_velocity.any():
-        found.append("initial.velocity")
     shell = body.rest.shells[int(body.rest.shell_of[0])]
-    if abs(shell.c11 - shell.c22) > SAME * shell.c11:
-        found.append("c11 and c22 that differ")
-    if shell.damping > 0.0:
-        found.append("damping")
-    sides = np.linalg.norm(body.mesh.triangle_uv[0] - np.roll(body.mesh.triangle_uv[0], -1, axis=0), axis=1)
-    if np.ptp(sides) > SAME * sides.max():
-        found.append("a triangle that is not equilateral")
-    stretch = body.stretch[0]
-    if np.ptp(stretch) > SAME * stretch.max():
-        found.append("a start that is not stretched alike in all directions")
-    elif not 0.0 < stretch[0] < math.sqrt(2.0) or abs(stretch[0] - 1.0) < SAME:
-        found.append("a start stretched by a factor that is 1, or √2 or more")
-    return found
+    corners, stretch = body.mesh.triangle_uv[0], body.stretch[0]
+    sides = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+    uneven = np.ptp(stretch) > SAME * stretch.max()
+    open_ended = not 0.0 < stretch[0] < math.sqrt(2.0) or abs(stretch[0] - 1.0) < SAME
+    held = {
+        "gravity": body.gravity.any(),
+        "wind": body.has_wind,
+        "initial.velocity": body.start_velocity.any(),
+        "c11 and c22 that differ": abs(shell.c11 - shell.c22) > SAME * shell.c11,
+        "damping": shell.damping > 0.0,
+        "a triangle that is not equilateral": np.ptp(sides) > SAME * sides.max(),
+        "a start that is not stretched alike in all directions": uneven,
+        "a start stretched by a factor that is 1, or √2 or more": open_ended and not uneven,
+    }
+    return [*body.forced(), *_holding(held)]
 
 
+@_solution(
+    "breathing-triangle", "equilateral triangle oscillating in its plane, Jacobi's dn", breathing_obstacles
+)
 def breathing(body: Body) -> ExactMotion:
     """The oscillation of the triangle."""
     shell = body.rest.shells[int(body.rest.shell_of[0])]
@@ -368,53 +401,6 @@ def breathing(body: Body) -> ExactMotion:
         rate=(shell.c11 + shell.c12) / (shell.density * radius2),
         stiffness=area * (shell.c11 + shell.c12),
     )
-
-
-@dataclass(frozen=True)
-class Solution:
-    """An exact solution.
-
-    Attributes
-    ----------
-    name : str
-    title : str
-        In words, for reports.
-    obstacles : callable
-        What of a scene contradicts its assumptions, in words; empty if it holds.
-    motion : callable
-        The motion, for a scene without obstacles.
-    """
-
-    name: str
-    title: str
-    obstacles: Callable[[Body], list[str]]
-    motion: Callable[[Body], ExactMotion]
-
-
-SOLUTIONS = {
-    solution.name: solution
-    for solution in (
-        Solution("free-fall", "free fall, x = X + v t + g t²/2", free_fall_obstacles, free_fall),
-        Solution(
-            "terminal-fall",
-            "level sheet falling in still air, v = vt tanh(g t/vt)",
-            flat_fall_obstacles,
-            flat_fall,
-        ),
-        Solution(
-            "edge-fall",
-            "upright sheet falling edge-on in still air, v = vt (1 - exp(-g t/vt))",
-            edge_fall_obstacles,
-            edge_fall,
-        ),
-        Solution(
-            "breathing-triangle",
-            "equilateral triangle oscillating in its plane, Jacobi's dn",
-            breathing_obstacles,
-            breathing,
-        ),
-    )
-}
 
 
 def exact_motion(name: str, body: Body) -> ExactMotion:

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from mpi4py import MPI
 
@@ -47,26 +47,29 @@ class View(ABC, Generic[O]):
         Of the page.
     pictures : str
         What the page lacks without the packages that draw.
-    columns : tuple of str
+    columns : sequence of str
         Of the CSV.
+    ready : bool
+        Whether there is something to write.
     """
 
     verb: ClassVar[str]
-    title: ClassVar[str]
-    pictures: ClassVar[str]
-    columns: ClassVar[tuple[str, ...]]
+    title: str
+    pictures: str = ""
+    columns: Sequence[str]
+    ready: bool = True
 
     def heading(self) -> str:
         """What the terminal shows before the first case; empty: nothing."""
         return ""
 
-    @abstractmethod
     def lines(self, outcome: O) -> Iterable[Line]:
         """What the terminal shows when a case has ended."""
+        return ()
 
-    @abstractmethod
     def summary(self, outcomes: Sequence[O]) -> list[Sequence[str]]:
         """The table that the terminal shows at the end, its headings first."""
+        return []
 
     def ended(self, outcomes: Sequence[O]) -> None:
         """Another case has ended: what no later use has of the outcomes so far may be freed."""
@@ -75,20 +78,46 @@ class View(ABC, Generic[O]):
     def rows(self, outcome: O) -> Iterable[Mapping[str, Any]]:
         """Its lines of the CSV, by the columns."""
 
-    @abstractmethod
+    def cell(self, value: Any) -> Any:
+        """A value of the CSV as a text or a number: empty for what is not a number."""
+        return "" if value != value else value
+
     def told(self, outcome: O) -> dict[str, Any]:
         """What the JSON file holds of a case beside its name, title and verdicts."""
+        return {}
 
     def facts(self, outcomes: Sequence[O]) -> dict[str, Any]:
         """What the JSON file holds beside the cases, the verdict on all, ranks and versions."""
         return {}
 
+    def content(self, outcomes: Sequence[O], ranks: int, command: Sequence[str]) -> dict[str, Any]:
+        """The JSON file."""
+        run = _run(outcomes)
+        return self.facts(outcomes) | {
+            "passed": all(outcome.passed for outcome in run),
+            "ranks": ranks,
+            "versions": versions(),
+            "cases": [
+                {"name": outcome.case.name, "title": outcome.case.title, **self.told(outcome)}
+                | {"verdicts": {name: asdict(verdict) for name, verdict in outcome.verdicts.items()}}
+                for outcome in run
+            ],
+        }
+
     @abstractmethod
     def page(self, report: Report, outcomes: Sequence[O], summary: str, *, drawn: bool) -> None:
         """Fill the page; ``summary`` says how many cases passed, ``drawn`` whether there can be pictures."""
 
+    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+        """Add what made the page, and write it; what is missing for its pictures, in words. On one rank."""
+        return close(report, folder, versions(), command, pictures=self.pictures)
 
-class CaseObserver(Protocol[C, O]):  # type: ignore[misc]
+
+def _run(outcomes: Sequence[O]) -> list[O]:
+    return [outcome for outcome in outcomes if not outcome.left_out]
+
+
+class CaseObserver(Generic[C, O]):
     """Receives the cases as they run."""
 
     def begin(self, case: C) -> None:
@@ -141,7 +170,7 @@ class Results(Generic[O]):
         if folder is not None:
             on_root(comm, lambda: _create(folder, force=force))
 
-    def run(self, cases: Sequence[C], run: Callable[[C], O], show: CaseObserver[C, O]) -> str:
+    def run(self, cases: Iterable[C], run: Callable[[C], O], show: CaseObserver[C, O] | None = None) -> str:
         """Run the cases; what the page lacks and how to get it, empty if nothing.
 
         Raises
@@ -151,6 +180,7 @@ class Results(Generic[O]):
         OutputError
             On every rank, if something could not be written.
         """
+        show = show or CaseObserver()
         try:
             for case in cases:
                 show.begin(case)
@@ -158,6 +188,7 @@ class Results(Generic[O]):
                 show.end(self.outcomes[-1])
                 self.view.ended(self.outcomes)
                 self.write()
+            self.write()
         except Interrupted:
             self.finish()
             raise
@@ -165,22 +196,20 @@ class Results(Generic[O]):
 
     def write(self) -> None:
         """Write the tables of what came of the cases so far."""
-        if self.folder is None:
+        view = self.view
+        if self.folder is None or not view.ready:
             return
-        view, path = self.view, self.folder / f"{self.view.verb}.csv"
-        run = [outcome for outcome in self.outcomes if not outcome.left_out]
-        rows = [row for outcome in run for row in view.rows(outcome)]
-        on_root(self._comm, lambda: replace_text(path, csv_text(view.columns, rows)))
-        content = view.facts(self.outcomes) | {
-            "passed": all(outcome.passed for outcome in run),
-            "ranks": self._ranks,
-            "versions": versions(),
-            "cases": [
-                {"name": outcome.case.name, "title": outcome.case.title, **view.told(outcome)}
-                | {"verdicts": {name: asdict(verdict) for name, verdict in outcome.verdicts.items()}}
-                for outcome in run
-            ],
-        }
+        path, outcomes = self.folder / f"{view.verb}.csv", self.outcomes
+
+        def table() -> None:
+            rows = [row for outcome in _run(outcomes) for row in view.rows(outcome)]
+            lines = [view.columns, *([view.cell(row.get(name)) for name in view.columns] for row in rows)]
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(lines)
+            replace_text(path, text.getvalue())
+
+        on_root(self._comm, table)
+        content = view.content(outcomes, self._ranks, self._command)
         write_summary(path.with_suffix(".json"), content, self._comm)
 
     def finish(self) -> str:
@@ -188,13 +217,13 @@ class Results(Generic[O]):
         return on_root(self._comm, self._page)
 
     def _page(self) -> str:
-        if self.folder is None:
+        if self.folder is None or not self.view.ready:
             return ""
         report = Report(self.view.title)
         on = f"{self._ranks} rank{'s' if self._ranks > 1 else ''}"
         summary = f"{passed_of(self.outcomes)} on {on}."
         self.view.page(report, self.outcomes, summary, drawn=not lacking())
-        return close(report, self.folder, versions(), self._command, pictures=self.view.pictures)
+        return self.view.close(report, self.folder, self._command)
 
 
 def _create(folder: Path, *, force: bool) -> None:
@@ -204,19 +233,3 @@ def _create(folder: Path, *, force: bool) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made ({error.strerror})", key=f"--out {folder}") from None
-
-
-def _plain(value: Any) -> Any:
-    """A cell: empty for what is not a number."""
-    return "" if value != value else value
-
-
-def csv_text(
-    columns: Sequence[str], rows: Iterable[Mapping[str, Any]], cell: Callable[[Any], Any] = _plain
-) -> str:
-    """A table as CSV; ``cell`` turns a value, None where a row has none, into a text or a number."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([cell(row.get(name)) for name in columns] for row in rows)
-    return text.getvalue()

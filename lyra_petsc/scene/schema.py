@@ -959,6 +959,11 @@ class Time(Block):
         return self.integrator or "static"
 
     @property
+    def static(self) -> bool:
+        """Whether an equilibrium is sought: time is the load factor then."""
+        return self.analysis == "static"
+
+    @property
     def adaptive(self) -> bool:
         """Whether the step length follows a tolerance."""
         return self.step == "auto"

@@ -15,10 +15,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, problem_of
-from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, load_record, save_record
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, read_record, save_record
 from lyra_petsc.experiments.results import Line, View
 from lyra_petsc.experiments.stress.step_balance import (
     LITTLE_LOST,
@@ -37,7 +36,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     as_it_is,
 )
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
-from lyra_petsc.show.report.plots import Curve, over_time, surface
+from lyra_petsc.show.report.plots import Series, over_time, surface
 
 Array = NDArray[np.float64]
 
@@ -261,12 +260,12 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
         If the launched program refuses what it was asked for.
     """
     with tempfile.TemporaryDirectory(prefix="lyra-stress-") as folder:
-        code, heard = launcher([*asked, "--only", case.name, "--job", folder], watch)
+        code, words = launcher([*asked, "--only", case.name, "--job", folder], watch)
         outcome = restore(Path(folder), case)
     if outcome is None:
         if code == InputError.exit_code:
-            raise InputError(last_words(heard, code))
-        record = Record(case.steps, stopped=last_words(heard, code))
+            raise InputError(words)
+        record = Record(case.steps, stopped=words)
         outcome = StressOutcome(case, of_physics(record), record=record)
     return outcome
 
@@ -279,10 +278,8 @@ def save(outcome: StressOutcome, folder: Path) -> None:
 
 def restore(folder: Path, case: StressCase) -> StressOutcome | None:
     """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
-    try:
-        return StressOutcome(case, **vars(load_record(folder / OUTCOME_FILE, Told)))
-    except (OSError, ValueError):
-        return None
+    told = read_record(folder / OUTCOME_FILE, Told)
+    return StressOutcome(case, **vars(told)) if told is not None else None
 
 
 PICTURES = 6
@@ -454,15 +451,10 @@ class Stress(View[StressOutcome]):
             report.bullets(left_out)
 
 
-def badness(outcome: StressOutcome) -> tuple[float, ...]:
+def badness(outcome: StressOutcome) -> tuple[bool, bool, int, int]:
     """Cases that failed first, then those with the most trouble."""
     record = outcome.record
-    return (
-        float(not outcome.passed),
-        float(bool(record.stopped)),
-        float(record.rejected),
-        float(max(record.newton, default=0)),
-    )
+    return not outcome.passed, bool(record.stopped), record.rejected, max(record.newton, default=0)
 
 
 def _padded(texts: Sequence[str]) -> str:
@@ -476,21 +468,13 @@ def _figures(report: Report, outcome: StressOutcome) -> None:
     case, record = outcome.case, outcome.record
     if record.last is not None and record.triangles is not None:
         when = f"t = {seconds(record.times[-1])}" if record.times else "the start"
-        report.figure(
-            surface(
-                record.last, record.triangles, name=f"{PLOTS}/{case.name}-shape",
-                caption=f"{case.name}: {case.title}, {when}",
-            )
-        )  # fmt: skip
+        words, name = f"{case.name}: {case.title}, {when}", f"{PLOTS}/{case.name}-shape"
+        report.figure(surface(record.last, record.triangles, name=name, caption=words))
     if len(record.times) > 1:
         times = [0.0, *record.times]
-        curves = [Curve("kinetic + potential", times, [record.start_energy, *record.energies])]
+        curves = [Series("kinetic + potential", times, [record.start_energy, *record.energies])]
         if record.balances and record.integrator == "beuler":
             work = itertools.accumulate((one.work for one in record.balances), initial=record.start_energy)
-            curves.append(Curve("energy at the start + work done", times, list(work)))
-        report.figure(
-            over_time(
-                curves, name=f"{PLOTS}/{case.name}-energy", caption=f"{case.name}: energy over time",
-                y_label="energy [J]",
-            )
-        )  # fmt: skip
+            curves.append(Series("energy at the start + work done", times, list(work)))
+        words, name = f"{case.name}: energy over time", f"{PLOTS}/{case.name}-energy"
+        report.figure(over_time(curves, name=name, caption=words, y_label="energy [J]"))

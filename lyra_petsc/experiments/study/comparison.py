@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,11 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
-from lyra_petsc.output.agreement import raise_together
+from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
 from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import stored_states
@@ -119,20 +120,16 @@ class Samples:
             On every rank, if the file cannot be read.
         """
         file, dataset = self.files[sample]
-        problem: LyraError | None = None
-        rows: Array = np.empty((0, 3))
-        try:
+
+        def read() -> Array:
             with open_stored(self.folder / file) as opened:
                 stored = opened[dataset]
-                if wanted is None:
-                    start, stop = slab(comm, self.n_vertices)
-                    rows = stored[start:stop]
-                else:
-                    rows = _picked(stored, wanted)
-        except InputError as error:
-            problem = error
-        raise_together(comm, problem)
-        return rows
+                if wanted is not None:
+                    return _picked(stored, wanted)
+                rows: Array = stored[slice(*slab(comm, self.n_vertices))]
+                return rows
+
+        return on_each(comm, read)
 
 
 def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:
@@ -201,10 +198,9 @@ def read_samples(
 
 def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
     """As ``read_samples``, on one rank and for it alone."""
-    states = []
     if folder.is_dir():
         check_folder(folder)
-        states = stored_states(folder)
+    states = stored_states(folder) if folder.is_dir() else []
     if not states:
         raise InputError("holds no states of a run", file=folder)
     at = np.array([state.time for state in states])
@@ -225,10 +221,8 @@ def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequ
     probes = {}
     if (folder / "probes.csv").is_file():
         table, chosen = _table(folder / "probes.csv", times)
-        names = [name.removesuffix("_x") for name in table if name.endswith("_x")]
-        probes = {
-            name: np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[chosen] for name in names
-        }
+        for name in (name.removesuffix("_x") for name in table if name.endswith("_x")):
+            probes[name] = np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[chosen]
     exchanged = float(np.abs(energies - energies[0]).max())
     return Samples(
         folder, tuple(times), tuple(files), len(surface.rest), surface.size, energies[at_samples], exchanged,
@@ -288,30 +282,23 @@ def make_transfer(
     point_sheets, other_sheets : sequence of int
         Vertices of each sheet, which are numbered consecutively.
     """
-    found = on_root(comm, lambda: _locate(points, point_sheets, other, other_sheets), share=False)
-    corner, weight = (scatter(comm, rows) for rows in found or (None, None))
+
+    def locate() -> tuple[Ints, Array]:
+        assert points is not None
+        assert other is not None
+        corner = np.empty((len(points.rest), 3), dtype=np.int64)
+        weight = np.empty((len(points.rest), 3))
+        ends, others = np.cumsum([0, *point_sheets]), np.cumsum([0, *other_sheets])
+        for sheet in range(len(point_sheets)):
+            mine = slice(ends[sheet], ends[sheet + 1])
+            first = other.triangles[:, 0]
+            inside = (first >= others[sheet]) & (first < others[sheet + 1])
+            corner[mine], weight[mine] = _nearest(points.rest[mine], other.rest, other.triangles[inside])
+        return corner, weight
+
+    corner, weight = (scatter(comm, rows) for rows in on_root(comm, locate, share=False) or (None, None))
     wanted, inverse = np.unique(corner, return_inverse=True)
     return Transfer(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
-
-
-def _locate(
-    points: RestSurface | None,
-    point_sheets: Sequence[int],
-    other: RestSurface | None,
-    other_sheets: Sequence[int],
-) -> tuple[Ints, Array]:
-    """Corners (n, 3) and weights (n, 3) for every vertex of ``points``."""
-    assert points is not None
-    assert other is not None
-    corner = np.empty((len(points.rest), 3), dtype=np.int64)
-    weight = np.empty((len(points.rest), 3))
-    ends, others = np.cumsum(point_sheets), np.cumsum(other_sheets)
-    for sheet, stop in enumerate(ends):
-        mine = slice(int(stop) - point_sheets[sheet], int(stop))
-        low, high = int(others[sheet]) - other_sheets[sheet], int(others[sheet])
-        inside = (other.triangles[:, 0] >= low) & (other.triangles[:, 0] < high)
-        corner[mine], weight[mine] = _nearest(points.rest[mine], other.rest, other.triangles[inside])
-    return corner, weight
 
 
 def _nearest(places: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
@@ -350,22 +337,16 @@ def barycentric(places: Array, corners: Array) -> Array:
 
 def _on_sides(places: Array, corners: Array) -> Array:
     """Weights of the nearest place on the three sides."""
-    best = np.full(len(places), np.inf)
-    weights = np.zeros((len(places), 3))
-    for k in range(3):
-        start, side = corners[:, k], corners[:, (k + 1) % 3] - corners[:, k]
-        along = np.clip(_dot(places - start, side) / _dot(side, side), 0.0, 1.0)
-        distance = np.linalg.norm(start + along[:, None] * side - places, axis=1)
-        nearer = distance < best
-        best[nearer] = distance[nearer]
-        weights[nearer] = 0.0
-        weights[nearer, k] = 1.0 - along[nearer]
-        weights[nearer, (k + 1) % 3] = along[nearer]
+    sides, ways = np.roll(corners, -1, axis=1) - corners, places[:, None] - corners
+    along = np.clip(_dot(ways, sides) / _dot(sides, sides), 0.0, 1.0)
+    side = np.linalg.norm(along[:, :, None] * sides - ways, axis=2).argmin(axis=1)
+    rows, weights = np.arange(len(side)), np.zeros((len(side), 3))
+    weights[rows, side], weights[rows, (side + 1) % 3] = 1.0 - along[rows, side], along[rows, side]
     return weights
 
 
 def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.einsum("ni,ni->n", a, b))
+    return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 Errors = dict[str, float]
@@ -382,27 +363,20 @@ def against_motion(
     comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[Quantity]
 ) -> Errors:
     """Errors of a run against an exact motion; collective."""
-    start = samples.rows(comm, 0)
-    areas = _areas(comm, on_root(comm, lambda: read_surface(samples.folder), share=False))
-    found: History = {}
-    if any(quantity.name.startswith("position") for quantity in quantities):
-        found |= _positions(
-            comm,
-            samples,
-            lambda i: samples.rows(comm, i),
-            lambda i: motion.positions(start, samples.times[i]),
-            areas,
-            samples.size,
-        )
-    forms = [motion.energies(t) for t in samples.times]
+    start, times = samples.rows(comm, 0), samples.times
+    forms = [motion.energies(t) for t in times]
     exact = np.array([[form.kinetic, form.membrane, 0.0, form.potential] for form in forms])
-    found["energy"] = _energy(samples.energies, exact, float(np.abs(exact - exact[0]).max()))
-    for quantity in quantities:
-        if quantity.probe is not None and quantity.probe in samples.probes:
-            path = samples.probes[quantity.probe]
-            expected = [motion.positions(path[:1], t)[0] for t in samples.times]
-            found[quantity.name] = _path(path, np.array(expected), samples.size)
-    return overall(_of(quantities, found))
+    probes = {
+        name: np.concatenate([motion.positions(path[:1], t) for t in times])
+        for name, path in samples.probes.items()
+    }
+    whole = replace(samples, energies=exact, exchanged=float(np.abs(exact - exact[0]).max()), probes=probes)
+
+    def positions() -> History:
+        surface = on_root(comm, lambda: read_surface(samples.folder), share=False)
+        return _positions(comm, samples, lambda i: motion.positions(start, times[i]), surface, samples.size)
+
+    return overall(_errors(samples, whole, quantities, positions))
 
 
 def against_run(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
@@ -418,31 +392,35 @@ def history_against_run(
     On different meshes the finer solution is interpolated at the rest places of the coarser one's
     vertices.
     """
+    return _errors(mine, other, quantities, lambda: _between(comm, mine, other))
+
+
+def _errors(
+    mine: Samples, other: Samples, quantities: Sequence[Quantity], positions: Callable[[], History]
+) -> History:
+    """The quantities in their order; empty where nothing can be told."""
     found: History = {}
     if any(quantity.name.startswith("position") for quantity in quantities):
-        found |= _between(comm, mine, other)
-    found["energy"] = _energy(mine.energies, other.energies, other.exchanged)
+        found |= positions()
+    if other.exchanged > 0.0:  # the error of the total over the largest energy exchanged
+        totals = mine.energies.sum(axis=1), other.energies.sum(axis=1)
+        found["energy"] = np.abs(totals[0] - totals[1]) / other.exchanged
     for quantity in quantities:
         name = quantity.probe
-        if name is not None and name in mine.probes and name in other.probes:
-            found[quantity.name] = _path(mine.probes[name], other.probes[name], other.size)
-    return _of(quantities, found)
+        if name in mine.probes and name in other.probes:
+            way = mine.probes[name] - other.probes[name]
+            found[quantity.name] = np.asarray(np.linalg.norm(way, axis=1) / other.size)
+    return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
 
 
 def overall(history: History) -> Errors:
     """The error over all samples: the root mean square of the L2 norms, of all others the largest."""
-    return {name: _overall(name, values) for name, values in history.items()}
-
-
-def _overall(name: str, values: Array) -> float:
-    if len(values) == 0:
-        return math.nan
-    return math.sqrt(float(np.mean(values**2))) if name == MEAN_SQUARE else float(values.max())
-
-
-def _of(quantities: Sequence[Quantity], found: History) -> History:
-    """The quantities in their order; empty where nothing can be told."""
-    return {quantity.name: found.get(quantity.name, np.empty(0)) for quantity in quantities}
+    found = dict.fromkeys(history, math.nan)
+    for name, errors in history.items():
+        if len(errors):
+            mean = name == MEAN_SQUARE
+            found[name] = math.sqrt(float(np.mean(errors**2))) if mean else float(errors.max())
+    return found
 
 
 def _between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
@@ -450,39 +428,22 @@ def _between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
     found = on_root(comm, lambda: [read_surface(each.folder) for each in (coarse, fine)], share=False)
     at, beyond = found or (None, None)
     same = comm.bcast(at is not None and beyond is not None and at.same_as(beyond), root=0)
-    here: Rows = lambda i: coarse.rows(comm, i)  # noqa: E731
-    there: Rows = lambda i: fine.rows(comm, i)  # noqa: E731
+    there: Rows = partial(fine.rows, comm)
     if not same:
-        transfer = make_transfer(comm, at, coarse.sheets, beyond, fine.sheets)
-        there = lambda i: transfer.rows(comm, fine, i)  # noqa: E731
-    return _positions(comm, coarse, here, there, _areas(comm, at), reference.size)
-
-
-def _areas(comm: MPI.Comm, surface: RestSurface | None) -> Array:
-    """This rank's slab of the vertices' rest areas [m²]; ``surface`` on rank 0."""
-    return scatter(comm, None if surface is None else surface.areas)
+        there = partial(make_transfer(comm, at, coarse.sheets, beyond, fine.sheets).rows, comm, fine)
+    return _positions(comm, coarse, there, at, reference.size)
 
 
 def _positions(
-    comm: MPI.Comm, samples: Samples, here: Rows, there: Rows, areas: Array, size: float
+    comm: MPI.Comm, samples: Samples, there: Rows, surface: RestSurface | None, size: float
 ) -> History:
-    """Largest and area-weighted L2 error over space, at each sample after the start."""
+    """Largest and area-weighted L2 error over space, at each sample after the start; surface on rank 0."""
+    areas = scatter(comm, None if surface is None else surface.areas)
     whole = comm.allreduce(float(areas.sum()))
     count = len(samples.times) - 1
     largest, squares = np.empty(count), np.empty(count)
     for i in range(count):
-        distance = np.linalg.norm(here(i + 1) - there(i + 1), axis=1)
+        distance = np.linalg.norm(samples.rows(comm, i + 1) - there(i + 1), axis=1)
         largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
         squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
     return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}
-
-
-def _energy(mine: Array, other: Array, exchanged: float) -> Array:
-    """Error of the total energy over the largest energy exchanged."""
-    if not exchanged > 0.0:
-        return np.empty(0)
-    return np.asarray(np.abs(mine.sum(axis=1) - other.sum(axis=1)) / exchanged)
-
-
-def _path(mine: Array, other: Array, size: float) -> Array:
-    return np.asarray(np.linalg.norm(mine - other, axis=1) / size)

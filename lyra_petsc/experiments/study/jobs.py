@@ -6,23 +6,20 @@ repeat, the wall time from all.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from mpi4py import MPI
 
-from lyra_petsc.api.mpirun import last_words
 from lyra_petsc.errors import InputError, OutputError, SolverError
 from lyra_petsc.experiments.bench import problem_of, simulated
-from lyra_petsc.experiments.case import Launcher, load_record, save_record
+from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.recorder import Recorder
@@ -30,10 +27,11 @@ from lyra_petsc.output.run_folder import FolderKind, checkpoint_files
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.stepping.problem import Outline
-from lyra_petsc.stepping.simulation import StepReport
 
 RESULT_FILE = "result.json"
+
+PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
+"""Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
 
 
 @dataclass(frozen=True)
@@ -129,68 +127,35 @@ class Result:
     notes: list[str] = field(default_factory=list)
 
     @property
-    def done(self) -> bool:
-        """Whether it ran to its end."""
-        return not self.problem
-
-    @property
     def mean_step(self) -> float:
         """Mean Δt [s]; 0 without steps."""
         return self.end / self.steps if self.steps else 0.0
-
-    def describe(self, outline: Outline) -> None:
-        """Note the mesh."""
-        self.vertices, self.triangles = outline.n_vertices, outline.n_triangles
-        self.spacing, self.sheets = outline.spacing, [each.n_vertices for each in outline.sources]
-
-    def count(self, reports: Sequence[StepReport]) -> None:
-        """Note the steps of a run."""
-        self.steps = len(reports)
-        self.rejected = sum(report.rejected for report in reports)
-        self.newton_iterations = sum(report.newton_iterations for report in reports)
-        self.linear_iterations = sum(report.linear_iterations for report in reports)
-        self.shortest = min((report.dt for report in reports), default=0.0)
-        self.longest = max((report.dt for report in reports), default=0.0)
 
     def fail(self, problem: str) -> None:
         """It has not ended as it should: no time of it counts."""
         self.problem, self.timings = problem, []
 
+    @property
     def run_seconds(self) -> list[float]:
         """Of each repeat: the steps alone."""
         return [timing.run for timing in self.timings]
 
+    @property
     def total_seconds(self) -> list[float]:
         """Of each repeat: set-up and steps."""
         return [timing.set_up + timing.run for timing in self.timings]
 
+    @property
     def phase_seconds(self) -> dict[str, float]:
-        """Median of each phase over the repeats."""
-        names = dict.fromkeys(name for timing in self.timings for name in timing.phases)
-        return {
-            name: statistics.median(timing.phases.get(name, 0.0) for timing in self.timings)
-            for name in names
-            if name != "files"
-        }
-
-    def write(self, folder: Path) -> None:
-        """Write ``result.json``; the case counts as finished from then on. Call on one rank."""
-        save_record(folder / RESULT_FILE, self)
+        """Median of each phase over the repeats; empty without any."""
+        of = {name: [timing.phases.get(name, 0.0) for timing in self.timings] for name in PHASES}
+        return {name: statistics.median(times) for name, times in of.items() if times}
 
 
 def read_result(folder: Path, fingerprint: str) -> Result | None:
     """The result of a finished case, or None if there is none for this fingerprint."""
-    try:
-        found = load_record(folder / RESULT_FILE, Result)
-    except (OSError, ValueError):
-        return None
-    return found if found.fingerprint == fingerprint else None
-
-
-def fingerprint(*parts: Sequence[str] | str) -> str:
-    """A short digest of texts."""
-    text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+    found = read_record(folder / RESULT_FILE, Result)
+    return found if found is not None and found.fingerprint == fingerprint else None
 
 
 CASES = "cases"
@@ -203,7 +168,7 @@ RESULT = re.compile(
 
 
 def _requests(folder: Path) -> list[Path]:
-    return [file for file in (folder / REQUEST_FILE,) if file.is_file()]
+    return [*folder.glob(REQUEST_FILE)]
 
 
 STUDY = FolderKind(
@@ -258,15 +223,15 @@ def run_case(comm: MPI.Comm, job: Job, watch: Watch, *, warm: bool) -> Result:
     on_root(comm, lambda: empty_case(folder))
     result = Result(job.fingerprint, ranks=comm.size)
     try:
-        scene = on_root(comm, lambda: scene_of(Path(job.scene), (), job.overrides, trust_mesh=job.trust_mesh))
+        scene = on_root(comm, lambda: scene_of(job.scene, job.overrides, trust_mesh=job.trust_mesh))
         result.integrator = str(scene.time.scheme)
         if warm:
             _warm_up(comm, scene)
         for repeat in range(job.repeats):
-            _repeat(comm, scene, folder, repeat, job.repeats, result, watch)
+            _repeat(comm, scene, job, repeat, result, watch)
     except (InputError, SolverError) as error:
         result.fail(problem_of(comm, error))
-    on_root(comm, lambda: result.write(folder))
+    on_root(comm, lambda: save_record(folder / RESULT_FILE, result))
     return result
 
 
@@ -277,18 +242,18 @@ def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
             simulation.step()
 
 
-def _repeat(
-    comm: MPI.Comm, scene: Scene, folder: Path, repeat: int, repeats: int, result: Result, watch: Watch
-) -> None:
+def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result, watch: Watch) -> None:
     """One timed run; the first also records, and the recording is charged apart."""
+    folder = Path(job.folder)
     comm.Barrier()
     phases, began = Phases(), time.perf_counter()
     with simulated(comm, scene, phases) as simulation, ExitStack() as stack:
         comm.Barrier()
         set_up = time.perf_counter() - began
-        recorder = None
+        recorder, outline = None, simulation.problem.outline
         if repeat == 0:
-            result.describe(simulation.problem.outline)
+            result.vertices, result.triangles = outline.n_vertices, outline.n_triangles
+            result.spacing, result.sheets = outline.spacing, [each.n_vertices for each in outline.sources]
             recorder = stack.enter_context(closing(Recorder(simulation)))
             with phases("files"):
                 recorder.begin(folder)
@@ -301,7 +266,7 @@ def _repeat(
             if recorder is not None:
                 with phases("files"):
                     recorder.record(reports[-1])
-            watch((repeat + min(1.0, simulation.time / simulation.control.end)) / repeats)
+            watch((repeat + min(1.0, simulation.time / simulation.control.end)) / job.repeats)
         if recorder is not None:
             with phases("files"):
                 recorder.settle()
@@ -312,7 +277,11 @@ def _repeat(
         result.notes += [note for note in simulation.notes if note not in result.notes]
         if repeat == 0:
             stack.close()
-            result.count(reports)
+            result.steps, lengths = len(reports), [report.dt for report in reports]
+            result.rejected = sum(report.rejected for report in reports)
+            result.newton_iterations = sum(report.newton_iterations for report in reports)
+            result.linear_iterations = sum(report.linear_iterations for report in reports)
+            result.shortest, result.longest = min(lengths, default=0.0), max(lengths, default=0.0)
             result.end, result.linear_solver = simulation.time, simulation.stepper.preset
             on_root(comm, lambda: _forget_checkpoints(folder))
 
@@ -332,7 +301,7 @@ def _forget_checkpoints(folder: Path) -> None:
 PROGRESS_FILE = "progress"
 
 
-def launched(launcher: Launcher, job: Job, watch: Callable[[float], None], lock: int) -> Result:
+def launched(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
     """What comes of a job in processes of its own.
 
     Parameters
@@ -345,39 +314,55 @@ def launched(launcher: Launcher, job: Job, watch: Callable[[float], None], lock:
         File descriptor that the processes keep open, so that the folder stays locked while they live.
     """
     folder = Path(job.folder)
-    told = folder.parent / f"{folder.name}.job.json"
+    told, progress = folder.with_name(f"{folder.name}.job.json"), folder / PROGRESS_FILE
     folder.parent.mkdir(exist_ok=True)
     save_record(told, job)
     try:
-        code, heard = launcher(["--job", str(told)], lambda: watch(_fraction(folder)), (lock,))
+        _, words = launcher(["--job", str(told)], lambda: watch(_fraction(progress)), (lock,))
         watch(1.0)
     finally:
         told.unlink(missing_ok=True)
-        (folder / PROGRESS_FILE).unlink(missing_ok=True)
+        progress.unlink(missing_ok=True)
     result = read_result(folder, job.fingerprint)
     if result is None:
-        result = Result(job.fingerprint, problem=last_words(heard, code))
+        result = Result(job.fingerprint, problem=words)
         folder.mkdir(parents=True, exist_ok=True)
-        result.write(folder)
+        save_record(folder / RESULT_FILE, result)
     return result
 
 
-def report_progress(folder: Path) -> Callable[[float], None]:
-    """What a launched case calls on rank 0 to tell how far it is, some times a second."""
-    last = 0.0
-
-    def tell(fraction: float) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last > 0.3:
-            last = now
-            (folder / PROGRESS_FILE).write_text(f"{fraction:.6f}", encoding="ascii")
-
-    return tell
-
-
-def _fraction(folder: Path) -> float:
+def _fraction(progress: Path) -> float:
     try:
-        return min(1.0, float((folder / PROGRESS_FILE).read_text(encoding="ascii")))
+        return min(1.0, float(progress.read_text(encoding="ascii")))
     except (OSError, ValueError):
         return 0.0
+
+
+def run_job(comm: MPI.Comm, path: Path, obey: Callable[[], None]) -> None:
+    """Run the job in a file, and tell some times a second how far it is; collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    path : Path
+    obey : callable
+        Called after every step on all ranks; may raise.
+
+    Raises
+    ------
+    InputError
+        If the file is no job.
+    """
+    job = on_root(comm, lambda: read_record(path, Job))
+    if job is None:
+        raise InputError("is no job of a study", file=path, key="--job")
+    progress, last = Path(job.folder) / PROGRESS_FILE, 0.0
+
+    def watch(fraction: float) -> None:
+        nonlocal last
+        obey()
+        if comm.rank == 0 and time.monotonic() - last > 0.3:
+            last = time.monotonic()
+            progress.write_text(f"{fraction:.6f}", encoding="ascii")
+
+    run_case(comm, job, watch, warm=True)

@@ -9,12 +9,12 @@ import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.experiments.case import load_record
+from lyra_petsc.experiments.case import Case, load_record
 from lyra_petsc.linear.petsc_options import is_set, petsc_number
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.measures import mean_edge_length
@@ -24,8 +24,11 @@ from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.document import seconds, short
 
 Value = float | str
+Physics = tuple[tuple[str, Value], ...]
+"""The settings that make a scene another one, in the axes' order."""
 
 SHORT_NAMES = {
+    "mesh": "mesh",
     "dt": "time.step",
     "integrator": "time.integrator",
     "tolerance": "time.tolerance",
@@ -35,7 +38,7 @@ SHORT_NAMES = {
     "max_iterations": "solver.max_iterations",
     "hessian": "solver.hessian",
 }
-"""Names of ours for keys of the scene; ``mesh`` beside them is the element size [m]."""
+"""Names of ours for keys of the scene; ``mesh`` is the element size [m]."""
 
 WORDS = frozenset({"time.integrator", "solver.hessian"})
 """Keys of the scene with short names whose values are words."""
@@ -79,7 +82,7 @@ class Axis:
 
     key: str
     path: str
-    values: tuple[Value, ...]
+    values: tuple[Value, ...] = ()
 
     @property
     def numeric(self) -> bool:
@@ -97,6 +100,10 @@ class Axis:
         return self.numeric and not self.physical and len(self.values) > 1
 
 
+Choice = Sequence[tuple[Axis, Value]]
+"""Axes and a value of each."""
+
+
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
     """The axes of ``--vary``, in their order.
 
@@ -105,23 +112,20 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     InputError
         Unknown key, no value, a value of the wrong kind, a value or a key given twice.
     """
-    axes: list[Axis] = []
+    axes: dict[str, Axis] = {}
     for text in texts:
         axis = _axis(text)
-        twin = next((other for other in axes if other.path == axis.path), None)
-        if twin is not None:
-            raise InputError(
-                f"varies what {twin.key} varies already; give all values at once", key=_named(text)
-            )
-        axes.append(axis)
-    paths = {axis.path for axis in axes}
-    if {"time.step", "time.tolerance"} <= paths:
+        if twin := axes.get(axis.path):
+            words = f"varies what {twin.key} varies already; give all values at once"
+            raise InputError(words, key=_named(text))
+        axes[axis.path] = axis
+    if {"time.step", "time.tolerance"} <= set(axes):
         raise InputError(
             "a tolerance is for steps of automatic length, dt for fixed ones: vary one of them", key="--vary"
         )
-    if math.prod(len(axis.values) for axis in axes) > MOST_COMBINATIONS:
+    if math.prod(len(axis.values) for axis in axes.values()) > MOST_COMBINATIONS:
         raise InputError(f"makes more than {MOST_COMBINATIONS} combinations", key="--vary")
-    return axes
+    return list(axes.values())
 
 
 def _named(text: str) -> str:
@@ -154,15 +158,13 @@ def path_of(key: str) -> str:
     InputError
         For a key that stands for nothing, with the nearest that does.
     """
-    if key == "mesh" or key in SHORT_NAMES:
-        return SHORT_NAMES.get(key, key)
-    if "." in key or "[" in key:
-        return key.replace("mesh.size", "mesh") if key == "mesh.size" else key
+    if key in SHORT_NAMES or key == "mesh.size":
+        return SHORT_NAMES.get(key, "mesh")
+    if "." in key or "[" in key or key in list(Scene.keys()):
+        return key
     if OPTION.fullmatch(key) and key not in SYNONYMS:
         return f"petsc.{key}"
-    if key in list(Scene.keys()):
-        return key
-    hint = nearest(SYNONYMS.get(key.lower(), key), ["mesh", *SHORT_NAMES, *USUAL_OPTIONS])
+    hint = nearest(SYNONYMS.get(key.lower(), key), [*SHORT_NAMES, *USUAL_OPTIONS])
     raise InputError(
         f"unknown key, {hint}; any key of the scene can vary by its path, as in time.step",
         key=f"--vary {key}",
@@ -186,17 +188,13 @@ def _value(path: str, word: str, text: str) -> Value:
         if word not in INTEGRATORS:
             raise InputError(f"unknown integrator '{word}', {nearest(word, INTEGRATORS)}", key=_named(text))
         return word
-    try:
-        number = float(word)
-    except ValueError:
-        number = math.nan
-    if math.isfinite(number):
-        return number
-    named = path in (*SHORT_NAMES.values(), "mesh") and path not in WORDS
+    with suppress(ValueError):
+        if math.isfinite(number := float(word)):
+            return number
     option = path.startswith("petsc.") and not path.endswith("_type")
-    if not named and not option:
-        return word
-    raise InputError(f"'{word}' is no number", key=_named(text))
+    if option or (path in SHORT_NAMES.values() and path not in WORDS):
+        raise InputError(f"'{word}' is no number", key=_named(text))
+    return word
 
 
 LONGEST_NAME = 80
@@ -206,53 +204,63 @@ LEAN = ("output.fields=[]", "output.reactions=false")
 
 
 @dataclass(frozen=True)
-class Combination:
+class StudyCase(Case):
+    """A run that a study makes; ``name`` is its folder.
+
+    Attributes
+    ----------
+    overrides : tuple of str
+        What ``--set`` would say to make it of the scene file.
+    weight : float
+        Its cost, as steps × vertices, in a unit that all cases share.
+    repeats : int
+        How often it is timed.
+    kernels : tuple of str
+        What cases with the same kernels share: the first of them begins with a step to warm up.
+    """
+
+    overrides: tuple[str, ...] = ()
+    weight: float = 1.0
+    repeats: int = 1
+    kernels: tuple[str, ...] = ("reference",)
+
+
+@dataclass(frozen=True)
+class Combination(StudyCase):
     """A value for each axis.
 
     Attributes
     ----------
-    axes : tuple of Axis
-    values : tuple of float or str
-        One for each axis.
+    chosen : tuple of (Axis, float or str)
     """
 
-    axes: tuple[Axis, ...]
-    values: tuple[Value, ...]
+    chosen: tuple[tuple[Axis, Value], ...] = ()
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """One for each axis."""
+        return tuple(value for _, value in self.chosen)
 
     @property
     def settings(self) -> dict[str, Value]:
         """Values by the axes' keys."""
-        return {axis.key: value for axis, value in zip(self.axes, self.values, strict=True)}
+        return {axis.key: value for axis, value in self.chosen}
 
     @property
-    def physics(self) -> dict[str, Value]:
-        """Those that make another scene."""
-        pairs = zip(self.axes, self.values, strict=True)
-        return {axis.key: value for axis, value in pairs if axis.physical}
+    def physics(self) -> Physics:
+        """Key of the physical scene it belongs to."""
+        return tuple((axis.key, value) for axis, value in self.chosen if axis.physical)
 
-    @property
-    def name(self) -> str:
-        """The folder: the settings, so that a wider study finds what a smaller one has finished."""
-        words = []
-        for axis, value in zip(self.axes, self.values, strict=True):
-            key = "" if axis.path == "time.integrator" else axis.key
-            if isinstance(value, str):
-                words.append(f"{key}-{value}" if key else value)
-            else:
-                words.append(f"{key}{value!r}")
-        plain = "-".join(words)
-        tame = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
-        if tame == plain:
-            return tame
-        return f"{tame}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
-    @property
-    def label(self) -> str:
-        """In words: ``bdf2, Δt 10 ms``."""
-        return (
-            ", ".join(described(axis.key, value) for axis, value in zip(self.axes, self.values, strict=True))
-            or "the scene as it is"
-        )
+def _folder(chosen: Choice) -> str:
+    """The settings, so that a wider study finds what a smaller one has finished."""
+    words = []
+    for axis, value in chosen:
+        key = "" if axis.path == "time.integrator" else axis.key
+        words.append(f"{key}{value!r}" if isinstance(value, float) else f"{key}-{value}".lstrip("-"))
+    plain = "-".join(words)
+    tame = re.sub(r"[^\w.+-]+", "_", plain)[:LONGEST_NAME].strip("_.-")
+    return tame if tame == plain else f"{tame}-{hashlib.sha256(plain.encode()).hexdigest()[:8]}"
 
 
 def described(key: str, value: Value) -> str:
@@ -263,47 +271,48 @@ def described(key: str, value: Value) -> str:
         return f"{key} {value}"
     if key in ("dt", "time.step"):
         return f"Δt {seconds(value, 6)}"
-    if key == "mesh":
-        return f"h {value:g} m"
-    return f"{key} {short(value)}"
+    return f"h {value:g} m" if key == "mesh" else f"{key} {short(value)}"
+
+
+def in_words(settings: Iterable[tuple[str, Value]]) -> str:
+    """Settings by key in words."""
+    return ", ".join(described(key, value) for key, value in settings)
 
 
 def combinations(axes: Sequence[Axis]) -> list[Combination]:
     """All combinations, the last axis varying fastest."""
-    values = itertools.product(*(axis.values for axis in axes))
-    return [Combination(tuple(axes), chosen) for chosen in values]
+    found = []
+    for values in itertools.product(*(axis.values for axis in axes)):
+        chosen = tuple(zip(axes, values, strict=True))
+        title = in_words((axis.key, value) for axis, value in chosen) or "the scene as it is"
+        found.append(Combination(_folder(chosen), title, chosen=chosen))
+    return found
 
 
 # -- from values to a scene ----------------------------------------------------------------------------
 
 
-def overrides(base: Scene, axes: Sequence[Axis], values: Sequence[Value]) -> list[str]:
-    """What ``--set`` would say to get a combination.
+def overrides(base: Scene, chosen: Choice) -> list[str]:
+    """What ``--set`` would say to get these values of axes, with what else of the ``time`` block must change.
 
     Raises
     ------
     InputError
         An element size for a mesh that comes with its elements.
     """
-    chosen = {axis.path: value for axis, value in zip(axes, values, strict=True)}
     found: list[str] = []
-    for axis, value in zip(axes, values, strict=True):
+    for axis, value in chosen:
         if axis.path == "mesh":
             found += mesh_overrides(base, float(value))
         else:
-            found.append(f"{axis.path}={_text(value)}")
-    return found + time_overrides(base, chosen)
-
-
-def time_overrides(base: Scene, chosen: dict[str, Any]) -> list[str]:
-    """What else of the ``time`` block must change so that it still fits together."""
-    time, found = base.time, []
-    if "time.tolerance" in chosen and time.step != "auto":
+            whole = isinstance(value, float) and value.is_integer()
+            found.append(f"{axis.path}={int(value) if whole else value}")
+    time, given = base.time, {axis.path: value for axis, value in chosen}
+    if "time.tolerance" in given and time.step != "auto":
         found.append("time.step=auto")
-    if "time.step" in chosen and chosen["time.step"] != "auto" and time.tolerance is not None:
+    if given.get("time.step", "auto") != "auto" and time.tolerance is not None:
         found.append("time.tolerance=")
-    integrator = chosen.get("time.integrator")
-    if integrator not in (None, "alpha2") and "time.spectral_radius" not in chosen:
+    if given.get("time.integrator", "alpha2") != "alpha2" and "time.spectral_radius" not in given:
         found.append("time.spectral_radius=")
     return found
 
@@ -336,12 +345,8 @@ def mesh_overrides(base: Scene, size: float) -> list[str]:
     return found
 
 
-def _text(value: Value) -> str:
-    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
-
-
-def scene_of(path: Path, given: Sequence[str], further: Sequence[str], *, trust_mesh: bool = False) -> Scene:
-    """The scene with ``--set`` and a combination's overrides, without what a study need not write.
+def scene_of(path: str, overrides: Sequence[str], *, trust_mesh: bool = False) -> Scene:
+    """The scene with the overrides of a case.
 
     Raises
     ------
@@ -349,17 +354,12 @@ def scene_of(path: Path, given: Sequence[str], further: Sequence[str], *, trust_
         As ``load_scene`` does; what comes from the combination says so.
     """
     try:
-        scene = load_scene(path, [*given, *LEAN, *further])
+        scene = load_scene(path, overrides)
     except InputError as error:
-        option, key = "--vary", error.key
-        if key is not None and key.startswith("--set "):
-            key = option + key.removeprefix("--set")
         message = error.message.replace("(from --set)", "(from --set or --vary)")
+        key = error.key and re.sub("^--set ", "--vary ", error.key)
         raise InputError(message, file=error.file, key=key) from None
     return scene.trusting_meshes() if trust_mesh else scene
-
-
-KINDS = ("position", "energy", "probes")
 
 
 @dataclass(frozen=True)
@@ -372,13 +372,13 @@ class Quantity:
         ``position_max``, ``position_l2``, ``energy`` or ``probe_<name>``: columns are ``error_<name>``.
     title : str
         In words.
-    probe : str or None
-        The scene's probe it is about.
+    probe : str
+        The scene's probe it is about; empty if it is about none.
     """
 
     name: str
     title: str
-    probe: str | None = None
+    probe: str = ""
 
 
 MEAN_SQUARE = "position_l2"
@@ -413,36 +413,22 @@ def chosen(text: str, probes: Iterable[str]) -> list[Quantity]:
     InputError
         For an unknown one, one given twice, or probes where the scene has none.
     """
-    names = list(probes)
-    key = "--quantities"
-    words = [word.strip() for word in text.split(",")] if text.strip() else []
-    if not words:
-        words = ["position", "energy", *(["probes"] if names else [])]
+    key, every = "--quantities", [probe_quantity(name) for name in probes]
+    known = {quantity.probe: [quantity] for quantity in every}
+    known |= {"position": [*POSITION], "energy": [ENERGY], "probes": every}
+    words = [word.strip() for word in text.split(",")] if text.strip() else ["position", "energy", "probes"]
     found: list[Quantity] = []
     for word in words:
         if not word:
             raise InputError("has an empty name between its commas", key=key)
-        new = _of(word, names)
-        if any(quantity in found for quantity in new):
+        if word not in known:
+            raise InputError(f"unknown quantity '{word}', {nearest(word, known)}", key=key)
+        if not known[word] and text.strip():
+            raise InputError("the scene has no probes; add some, as in probes: {tip: {group: tip}}", key=key)
+        if any(quantity in found for quantity in known[word]):
             raise InputError(f"names '{word}' twice", key=key)
-        found += new
+        found += known[word]
     return found
-
-
-def _of(word: str, probes: Sequence[str]) -> list[Quantity]:
-    if word == "position":
-        return list(POSITION)
-    if word == "energy":
-        return [ENERGY]
-    if word == "probes":
-        if not probes:
-            raise InputError(
-                "the scene has no probes; add some, as in probes: {tip: {group: tip}}", key="--quantities"
-            )
-        return [probe_quantity(name) for name in probes]
-    if word in probes:
-        return [probe_quantity(word)]
-    raise InputError(f"unknown quantity '{word}', {nearest(word, [*KINDS, *probes])}", key="--quantities")
 
 
 REQUEST_FILE = "request.json"
@@ -482,14 +468,15 @@ class Request:
     trust_mesh: bool = False
 
     def with_changes(self, overrides: Sequence[str]) -> Scene:
-        """The scene with its settings and further overrides.
+        """The scene with its settings and further overrides, without what a study need not write.
 
         Raises
         ------
         InputError
             If they do not go together.
         """
-        return scene_of(Path(self.scene), self.settings, overrides, trust_mesh=self.trust_mesh)
+        given = (*self.settings, *LEAN, *overrides)
+        return scene_of(self.scene, given, trust_mesh=self.trust_mesh)
 
 
 def read_request(folder: Path) -> Request:
@@ -509,14 +496,13 @@ def read_request(folder: Path) -> Request:
         raise InputError("is damaged; begin the study anew with --force", file=path, key="--resume") from None
 
 
+AUTO_STEPS = 200.0
+"""Steps that a run with automatic ones is guessed to take, for the time left."""
+
 LANDING = 1e-6
 """Fraction of Δt by which a multiple of it may miss a sample time."""
 
-FIXED_BY = {
-    "time.step": ("ts_dt",),
-    "time.integrator": ("ts_type",),
-    "time.tolerance": ("ts_dt",),
-}
+FIXED_BY = {"time.step": "ts_dt", "time.integrator": "ts_type", "time.tolerance": "ts_dt"}
 """PETSc options that would override what an axis varies."""
 
 
@@ -548,11 +534,6 @@ class Plan:
     every: float
     notes: list[str] = field(default_factory=list)
 
-    @property
-    def static(self) -> bool:
-        """Whether the scene asks for an equilibrium."""
-        return is_static(self.base)
-
     def axis(self, path: str) -> Axis | None:
         """The axis that varies a key of the scene."""
         return next((axis for axis in self.axes if axis.path == path), None)
@@ -563,25 +544,20 @@ class Plan:
         times = [number * self.every for number in range(count + 1)]
         return times if self.end - times[-1] <= LANDING * self.every else [*times, self.end]
 
-    def overrides(self, combination: Combination) -> list[str]:
-        """What makes the combination of the study's scene."""
-        further = overrides(self.base, combination.axes, combination.values)
-        return [f"output.every={self.every!r}", *further]
+    def overrides(self, chosen: Choice) -> tuple[str, ...]:
+        """What makes the scene with these values of axes, and with what the whole study sets."""
+        further = f"output.every={self.every!r}", *overrides(self.base, chosen)
+        return (*self.request.settings, *LEAN, *further)
 
-    def scene(self, combination: Combination) -> Scene:
-        """The scene of a combination.
+    def scene(self, case: StudyCase) -> Scene:
+        """The scene of a case.
 
         Raises
         ------
         InputError
             If its settings do not go together.
         """
-        return self.request.with_changes(self.overrides(combination))
-
-
-def is_static(scene: Scene) -> bool:
-    """Whether a scene asks for an equilibrium."""
-    return scene.time.analysis == "static"
+        return scene_of(self.request.scene, case.overrides, trust_mesh=self.request.trust_mesh)
 
 
 def make_plan(request: Request) -> Plan:
@@ -598,8 +574,7 @@ def make_plan(request: Request) -> Plan:
     base = request.with_changes([])
     quantities = chosen(request.quantities, base.probes)
     notes: list[str] = []
-    if not axes:
-        axes = default_axes(base, notes)
+    axes = axes or default_axes(base, notes)
     for axis in axes:
         if axis.path in ("output.every", "time.end", "time.analysis"):
             raise InputError("decides when errors are sampled and cannot vary", key=f"--vary {axis.key}")
@@ -609,14 +584,34 @@ def make_plan(request: Request) -> Plan:
             notes += _numbered_vertices(base)
     end = petsc_number("ts_max_time", base.time.end)
     every = _sampling(base, axes, end, notes)
-    return Plan(request, base, axes, combinations(axes), quantities, end, every, notes)
+    plan = Plan(request, base, axes, combinations(axes), quantities, end, every, notes)
+    plan.combinations = [_timed(plan, combination) for combination in plan.combinations]
+    return plan
+
+
+def _timed(plan: Plan, combination: Combination) -> Combination:
+    """The combination with what it takes to run it."""
+    settings = {axis.path: value for axis, value in combination.chosen}
+    step = settings.get("time.step", plan.base.time.step)
+    if isinstance(step, str) or "time.tolerance" in settings:
+        step = plan.end / AUTO_STEPS
+    weight = plan.request.repeats / step / float(settings.get("mesh", 1.0)) ** 2
+    words = (value for value in combination.values if isinstance(value, str))
+    return replace(
+        combination,
+        overrides=plan.overrides(combination.chosen),
+        weight=weight,
+        repeats=plan.request.repeats,
+        kernels=("combination", *words),
+    )
 
 
 def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
     """Without ``--vary``: integrators and halved steps (or tolerances); for an equilibrium, meshes."""
-    if is_static(base):
+    if base.time.static:
         size = mean_edge_length(mesh_of(base))
-        h = float(f"{_given_size(base) or size:.3g}")
+        grid = base.mesh[0].grid
+        h = float(f"{(grid.width / grid.nx if grid is not None else base.mesh[0].size) or size:.3g}")
         mesh_overrides(base, h)
         notes.append(f"no --vary: element sizes {2 * h:g}, {h:g} and {h / 2:g} m")
         return [Axis("mesh", "mesh", (2.0 * h, h, h / 2.0))]
@@ -637,13 +632,6 @@ def default_axes(base: Scene, notes: list[str]) -> list[Axis]:
     return [integrators, Axis("dt", "time.step", steps)]
 
 
-def _given_size(base: Scene) -> float | None:
-    source = base.mesh[0]
-    if source.grid is not None:
-        return source.grid.width / source.grid.nx
-    return source.size
-
-
 def _divides(step: float, every: float) -> bool:
     count = every / step
     return count >= 1.0 - LANDING and abs(count - round(count)) <= LANDING * max(1.0, count)
@@ -651,7 +639,7 @@ def _divides(step: float, every: float) -> bool:
 
 def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -> float:
     """Time between samples [s]; tells of steps that do not fit in."""
-    if is_static(base):
+    if base.time.static:
         return end
     steps = [float(v) for axis in axes if axis.path == "time.step" for v in axis.values if v != "auto"]
     if not steps and base.time.step != "auto":
@@ -676,43 +664,32 @@ def _numbered_vertices(base: Scene) -> list[str]:
     picked = [f"handles[{i}]" for i, handle in enumerate(base.handles) if handle.nodes is not None]
     picked += [f"loads[{i}]" for i, load in enumerate(base.loads) if load.nodes is not None]
     picked += [f"probes.{name}" for name, probe in base.probes.items() if probe.nodes is not None]
-    if not picked:
-        return []
-    listed = ", ".join(picked)
-    return [f"{listed}: vertices picked by number are others on another mesh; use group or box"]
+    words = "vertices picked by number are others on another mesh; use group or box"
+    return [f"{', '.join(picked)}: {words}"] if picked else []
 
 
 def _refuse_fixed(axis: Axis) -> None:
     """An option on the command line wins over the scene, and the axis would vary nothing."""
-    names = FIXED_BY.get(axis.path, ())
-    if axis.path.startswith("petsc."):
-        names = (axis.path.removeprefix("petsc."),)
-    for name in names:
-        if is_set(name):
-            raise InputError(
-                f"-{name} on the command line (or in PETSC_OPTIONS, .petscrc) would fix what varies; "
-                "leave it out",
-                key=f"--vary {axis.key}",
-            )
+    option = axis.path.removeprefix("petsc.") if axis.path.startswith("petsc.") else None
+    name = FIXED_BY.get(axis.path, option)
+    if name and is_set(name):
+        raise InputError(
+            f"-{name} on the command line (or in PETSC_OPTIONS, .petscrc) would fix what varies; "
+            "leave it out",
+            key=f"--vary {axis.key}",
+        )
 
 
 def _check_alone(request: Request, base: Scene, axis: Axis) -> None:
     """Each value must be possible by itself; conflicts in combination are reported in the row."""
     seen: dict[tuple[str, ...], Value] = {}
     for value in axis.values:
-        found = overrides(base, [axis], [value])
+        found = overrides(base, [(axis, value)])
         try:
             request.with_changes(found)
-        except InputError as error:
-            if not _needs_company(request, axis):
+        except InputError:
+            # a value may be allowed beside those of other axes only
+            if len(request.vary) <= 1 or axis.path != "time.spectral_radius":
                 raise
-            del error
-        if axis.path == "mesh":
-            other = seen.setdefault(tuple(found), value)
-            if other != value:
-                raise InputError(f"{other:g} and {value:g} m give the same grid", key=f"--vary {axis.key}")
-
-
-def _needs_company(request: Request, axis: Axis) -> bool:
-    """Whether a value may be allowed beside those of other axes only."""
-    return len(request.vary) > 1 and axis.path == "time.spectral_radius"
+        if axis.path == "mesh" and (other := seen.setdefault(tuple(found), value)) != value:
+            raise InputError(f"{other:g} and {value:g} m give the same grid", key=f"--vary {axis.key}")

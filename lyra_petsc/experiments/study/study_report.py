@@ -6,29 +6,31 @@ import itertools
 import math
 import os
 import platform
-from collections.abc import Mapping, Sequence
+import re
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from mpi4py import MPI
-
-from lyra_petsc.experiments.results import csv_text
-from lyra_petsc.experiments.study.plan import Axis, Plan, Quantity, described
-from lyra_petsc.experiments.study.work import (
-    SAFETY,
+from lyra_petsc.experiments.case import Outcome
+from lyra_petsc.experiments.results import View
+from lyra_petsc.experiments.study.jobs import PHASES
+from lyra_petsc.experiments.study.plan import (
+    MEAN_SQUARE,
+    Axis,
     Physics,
-    Reference,
-    StudyRow,
-    Work,
-    physics_of,
-    refines_time,
+    Plan,
+    Quantity,
+    StudyCase,
+    described,
+    in_words,
 )
+from lyra_petsc.experiments.study.work import SAFETY, Reference, StudyRow, Work, refines_time
 from lyra_petsc.extras import PACKAGES
-from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.summary import versions, write_summary
-from lyra_petsc.parallel import on_root
+from lyra_petsc.output.summary import versions
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import Series, convergence, fitted_slope, work_precision
 
@@ -39,15 +41,15 @@ def extent(row: StudyRow, axis: Axis) -> float:
         return row.result.spacing
     if axis.path == "time.step" and row.result.mean_step > 0.0:
         return row.result.mean_step
-    value = row.combination.settings[axis.key]
-    return float(value) if isinstance(value, float) else math.nan
+    value = row.case.settings[axis.key]
+    return value if isinstance(value, float) else math.nan
 
 
 def families(rows: Sequence[StudyRow], axis: Axis | None) -> dict[str, list[StudyRow]]:
     """Rows that ran and differ in one axis alone, coarsest first; by what they share, in words."""
     found: dict[str, list[StudyRow]] = {}
     for row in rows:
-        if row.result.done:
+        if row.passed:
             found.setdefault(shared_label(row, axis), []).append(row)
     if axis is not None:
         for group in found.values():
@@ -57,11 +59,8 @@ def families(rows: Sequence[StudyRow], axis: Axis | None) -> dict[str, list[Stud
 
 def shared_label(row: StudyRow, axis: Axis | None) -> str:
     """The settings of a row but for one axis, in words, with the integrator first."""
-    words = [row.line] if row.line else []
-    for other, value in zip(row.combination.axes, row.combination.values, strict=True):
-        if other is not axis and other.path != "time.integrator":
-            words.append(described(other.key, value))
-    return ", ".join(words)
+    rest = ((a.key, v) for a, v in row.case.chosen if a is not axis and a.path != "time.integrator")
+    return ", ".join(filter(None, [row.line, in_words(rest)]))
 
 
 @dataclass(frozen=True)
@@ -105,16 +104,15 @@ def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: 
 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
     """Mark the rows that no other beats in both run time and error."""
-    able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
-    for row in able:
-        error = row.at_most(quantity)
-        row.on_front = not any(
-            other is not row
-            and other.run <= row.run
-            and other.at_most(quantity) <= error
-            and (other.run < row.run or other.at_most(quantity) < error)
-            for other in able
-        )
+    able = _able(rows, quantity)
+    costs = [(row.run, row.at_most(quantity)) for row in able]
+    for row, mine in zip(able, costs, strict=True):
+        row.on_front = not any(one[0] <= mine[0] and one[1] <= mine[1] and one != mine for one in costs)
+
+
+def _able(rows: Sequence[StudyRow], quantity: str) -> list[StudyRow]:
+    """The rows whose error is known."""
+    return [row for row in rows if row.passed and not math.isnan(row.at_most(quantity))]
 
 
 TARGETS = (0.1, 0.01, 0.001)
@@ -151,61 +149,50 @@ def advise(rows: Sequence[StudyRow], quantity: str, axis: Axis | None = None) ->
     axis : Axis, optional
         Along it a winner may be the coarsest that ran, which the words then say.
     """
-    able = [row for row in rows if row.result.done and not math.isnan(row.at_most(quantity))]
+    able = _able(rows, quantity)
     if not able:
         return []
     best = min(row.at_most(quantity) for row in able)
     targets = list(TARGETS)
     while targets[-1] > FINEST_TARGET and best <= targets[-1] / 10.0:
         targets.append(targets[-1] / 10.0)
-    coarsest: list[StudyRow] = []
-    if axis is not None:
-        coarsest = [group[0] for group in families(able, axis).values()]
+    coarsest = [group[0] for group in families(able, axis).values()] if axis is not None else []
     return [_advice(able, quantity, float(f"{target:.3g}"), coarsest) for target in targets]
 
 
 def _advice(rows: Sequence[StudyRow], quantity: str, target: float, coarsest: Sequence[StudyRow]) -> Advice:
-    good = [row for row in rows if row.at_most(quantity) <= target]
+    def error(row: StudyRow) -> float:
+        return row.at_most(quantity)
+
+    good = [row for row in rows if error(row) <= target]
     if not good:
-        best = min(rows, key=lambda row: row.at_most(quantity))
-        return Advice(
-            target,
-            None,
-            f"For {percent(target)} nothing that ran is accurate enough; the most accurate is "
-            f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run)}.",
-        )
+        best = min(rows, key=error)
+        words = f"{setting(best)}, {_error(best, quantity)}, in {seconds(best.run)}"
+        nothing = "nothing that ran is accurate enough; the most accurate is"
+        return Advice(target, None, f"For {percent(target)} {nothing} {words}.")
     winner = min(good, key=lambda row: row.run)
     tried = ", the coarsest that ran" if any(row is winner for row in coarsest) else ""
     words = f"For {percent(target)} choose {setting(winner)}: {seconds(winner.run)}"
     words += f" ({_error(winner, quantity)}{tried})"
-    high = max(winner.result.run_seconds())
-    ties = [
-        row
-        for row in good
-        if row is not winner and row.line == winner.line and min(row.result.run_seconds()) <= high
-    ]
-    if ties:
-        words += (
-            f", or as fast within the spread, {setting(min(ties, key=lambda row: row.at_most(quantity)))}"
-        )
-    for line in dict.fromkeys(row.line for row in rows):
-        if line != winner.line:
-            words += "; " + _beside(line, [row for row in rows if row.line == line], quantity, target)
+    high = max(winner.result.run_seconds)
+    ties = [row for row in good if row.line == winner.line and min(row.result.run_seconds) <= high]
+    if ties := [row for row in ties if row is not winner]:
+        words += f", or as fast within the spread, {setting(min(ties, key=error))}"
+    for line in dict.fromkeys(row.line for row in rows if row.line != winner.line):
+        others = [row for row in rows if row.line == line]
+        if able := [row for row in others if error(row) <= target]:
+            row = min(able, key=lambda row: row.run)
+            words += f"; {line} needs {seconds(row.run)} ({_without_line(row)})"
+        else:
+            row = min(others, key=error)
+            found = f"{_without_line(row)}: {_error(row, quantity)}, {seconds(row.run)}"
+            words += f"; {line} did not reach it ({found})"
     return Advice(target, winner, words + ".")
-
-
-def _beside(line: str, rows: Sequence[StudyRow], quantity: str, target: float) -> str:
-    good = [row for row in rows if row.at_most(quantity) <= target]
-    if good:
-        row = min(good, key=lambda row: row.run)
-        return f"{line} needs {seconds(row.run)} ({_without_line(row)})"
-    best = min(rows, key=lambda row: row.at_most(quantity))
-    return f"{line} did not reach it ({_without_line(best)}: {_error(best, quantity)}, {seconds(best.run)})"
 
 
 def setting(row: StudyRow) -> str:
     """All settings of a row, in words, with the integrator first."""
-    return shared_label(row, None) or row.combination.label
+    return shared_label(row, None) or row.case.title
 
 
 def _without_line(row: StudyRow) -> str:
@@ -213,10 +200,9 @@ def _without_line(row: StudyRow) -> str:
 
 
 def _error(row: StudyRow, quantity: str) -> str:
-    if quantity in row.unresolved:
-        words = f"error below {percent(row.at_most(quantity))}"
-    else:
-        words = f"error {percent(row.errors[quantity])}"
+    unresolved = quantity in row.unresolved
+    bound = f"below {percent(row.at_most(quantity))}" if unresolved else percent(row.errors[quantity])
+    words = f"error {bound}"
     largest = row.at_most("position_max")
     if quantity == "position_l2" and math.isfinite(largest):
         words += f", at most {percent(largest)} anywhere"
@@ -232,226 +218,77 @@ def choose_recommended(advice: Sequence[Advice]) -> StudyRow | None:
     return None
 
 
-PHASES = ("mesh", "partition", "assembly", "solve", "balance", "output", "other")
-"""Phases of a run; ``balance`` is the bookkeeping of energies, the writing of files is not timed."""
-
-
-@dataclass
-class StudyOutcome:
-    """What came of a study.
-
-    Attributes
-    ----------
-    plan : Plan
-    rows : list of StudyRow
-    known : dict of physics → Reference
-        References as they came out.
-    orders : list of Order
-    advice : dict of physics → list of Advice
-    facts : dict
-        What the files say of scene, command, ranks, machine and versions.
-    """
-
-    plan: Plan
-    rows: list[StudyRow]
-    known: dict[Physics, Reference]
-    orders: list[Order]
-    advice: dict[Physics, list[Advice]]
-    facts: dict[str, Any]
-
-    @property
-    def failed(self) -> list[StudyRow]:
-        """Rows without a result."""
-        return [row for row in self.rows if not row.result.done]
-
-    def of(self, physics: Physics) -> list[StudyRow]:
-        """The rows of one physical scene."""
-        return [row for row in self.rows if physics_of(row.combination) == physics]
-
-
-def order_axes(plan: Plan) -> list[str]:
-    """Keys of the axes along which orders are reported."""
-    return [axis.key for axis in plan.axes if axis.refines]
+COUNTS = ("steps", "rejected", "newton_iterations", "linear_iterations")
 
 
 def record(plan: Plan, row: StudyRow) -> dict[str, Any]:
     """A row of ``study.csv`` by its columns; None where there is nothing to tell."""
-    result, settings = row.result, row.combination.settings
+    result, settings = row.result, row.case.settings
     names = [quantity.name for quantity in plan.quantities]
     keys = {axis.path: axis.key for axis in plan.axes}
     varied = [axis.key for axis in plan.axes if axis.path not in ("time.integrator", "time.step", "mesh")]
+    refined = [axis.key for axis in plan.axes if axis.refines]
 
     def spread(name: str, median: float, times: list[float]) -> dict[str, Any]:
-        fastest, slowest = min(times, default=None), max(times, default=None)
-        return _if(
-            result.done,
-            {f"{name}_seconds": median, f"{name}_seconds_min": fastest, f"{name}_seconds_max": slowest},
-        )
+        return {
+            name: median,
+            f"{name}_min": min(times, default=None),
+            f"{name}_max": max(times, default=None),
+        }
 
     def tolerance(name: str) -> Any:
         key = keys.get(f"solver.{name}")
         return settings[key] if key else getattr(plan.base.solver, name)
 
-    phases = result.phase_seconds()
-    steps = {
-        "steps": result.steps,
-        "rejected": result.rejected,
-        "newton_iterations": result.newton_iterations,
-        "linear_iterations": result.linear_iterations,
-    }
-    lengths = {"dt_mean": result.mean_step, "dt_min": result.shortest, "dt_max": result.longest}
-    mesh = {"h": result.spacing, "vertices": result.vertices, "triangles": result.triangles}
-    axes = order_axes(plan)
-    return {
-        "combination": row.combination.name,
-        "status": "done" if result.done else "failed",
+    step = "auto" if "time.tolerance" in keys else plan.base.time.step
+    columns = {
+        "combination": row.case.name,
+        "status": "done" if row.passed else "failed",
         "reason": result.problem,
         "integrator": row.line,
-        "dt": _nominal_step(plan, row),
-        **_if(result.done, lengths),
+        "dt": settings.get(keys.get("time.step", ""), step),
+        "dt_mean": result.mean_step,
+        "dt_min": result.shortest,
+        "dt_max": result.longest,
         "mesh": settings.get(keys.get("mesh", "")),
-        **_if(result.vertices > 0, mesh),
+        "h": result.spacing,
+        "vertices": result.vertices,
+        "triangles": result.triangles,
         **{key: settings[key] for key in varied},
         "force_tolerance": tolerance("force_tolerance"),
         "step_tolerance": tolerance("step_tolerance"),
         "linear_solver": result.linear_solver,
-        **{f"error_{name}": _told(row.shown(name)) for name in names},
-        **{f"reference_error_{name}": _told(row.own.get(name, math.nan)) for name in names},
+        **{f"error_{name}": row.shown(name) for name in names},
+        **{f"reference_error_{name}": row.own.get(name) for name in names},
         "not_resolved": " ".join(sorted(row.unresolved)),
-        **{f"order_{axis}_{name}": row.orders.get((axis, name)) for axis in axes for name in names},
+        **{f"order_{axis}_{name}": row.orders.get((axis, name)) for axis in refined for name in names},
         "repeats": len(result.timings),
         "ranks": result.ranks,
-        **spread("run", row.run, result.run_seconds()),
-        **spread("total", row.total, result.total_seconds()),
-        **_if(result.done, {f"seconds_{phase}": phases.get(phase, 0.0) for phase in PHASES}),
-        **_if(result.done, steps),
+        **spread("run_seconds", row.run, result.run_seconds),
+        **spread("total_seconds", row.total, result.total_seconds),
+        **{f"seconds_{phase}": result.phase_seconds.get(phase) for phase in PHASES},
+        **{name: getattr(result, name) for name in COUNTS},
         "pareto": row.on_front,
         "recommended": row.recommended,
     }
-
-
-def _if(there: bool, values: dict[str, Any]) -> dict[str, Any]:
-    """The values, or None for each."""
-    return values if there else dict.fromkeys(values)
-
-
-def _nominal_step(plan: Plan, row: StudyRow) -> float | str | None:
-    for axis, value in zip(row.combination.axes, row.combination.values, strict=True):
-        if axis.path == "time.step":
-            return value
-        if axis.path == "time.tolerance":
-            return "auto"
-    return plan.base.time.step
-
-
-def _told(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def write_csv(folder: Path, study: StudyOutcome) -> None:
-    """Write ``study.csv``. Call on one rank."""
-    rows_told = [record(study.plan, row) for row in study.rows]
-    replace_text(folder / "study.csv", csv_text(list(rows_told[0]), rows_told, _cell))
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return repr(float(value)) if isinstance(value, float) else str(value)
-
-
-def content(study: StudyOutcome) -> dict[str, Any]:
-    """What ``study.json`` holds: all of the table, the repeats, the references, orders and advice."""
-    plan = study.plan
-    return {
-        **study.facts,
-        "request": asdict(plan.request),
-        "axes": {axis.key: list(axis.values) for axis in plan.axes},
-        "quantities": {quantity.name: quantity.title for quantity in plan.quantities},
-        "sample_times": plan.sample_times(),
-        "notes": plan.notes,
-        "references": [
-            {
-                "scene": dict(physics),
-                "kind": one.kind,
-                "reference": one.words,
-                "run_seconds": one.seconds,
-                "own_error": {
-                    name: {"error": own.error, "observed_order": own.order, "trusted": own.trusted}
-                    for name, own in one.own.items()
-                },
-                "notes": one.notes,
-            }
-            for physics, one in study.known.items()
-        ],
-        "combinations": [
-            {
-                **{key: value for key, value in record(plan, row).items() if value not in ("", None)},
-                "errors": {name: row.shown(name) for name in row.errors},
-                "not_resolved": sorted(row.unresolved),
-                "timings": [asdict(timing) for timing in row.result.timings],
-                "notes": row.result.notes,
-            }
-            for row in study.rows
-        ],
-        "orders": [asdict(order) for order in study.orders],
-        "advice": [
-            {
-                "scene": dict(physics),
-                "accuracy": one.target,
-                "combination": one.row.combination.name if one.row is not None else None,
-                "words": one.words,
-            }
-            for physics, advice in study.advice.items()
-            for one in advice
-        ],
+    lacking = set() if row.passed else {"dt_mean", "dt_min", "dt_max", *COUNTS}
+    lacking |= set() if result.vertices else {"h", "vertices", "triangles"}
+    lacking |= {
+        key for key, value in columns.items() if isinstance(value, float) and not math.isfinite(value)
     }
+    return columns | dict.fromkeys(lacking)
 
 
 BELOW = "below what the reference can tell"
 
 
-def make_report(study: StudyOutcome) -> Report:
-    """The whole report."""
-    plan, known, facts = study.plan, study.known, study.facts
-    report = Report(f"Error against run time: {plan.base.title or facts['scene']}")
-    for physics, one in known.items():
-        _advise(report, plan, physics, one, study.advice[physics])
-    report.heading("What was run")
-    report.bullets(_what(study))
-    report.bullets([*plan.notes, *(note for one in known.values() for note in one.notes)])
-    for number, (physics, one) in enumerate(known.items(), start=1):
-        report.heading("Diagrams" + (f" for {_scene_words(physics)}" if physics else ""))
-        for drawing in drawings(plan, study.of(physics), one, "" if len(known) == 1 else f"-{number}"):
-            report.figure(drawing)
-    report.heading("Errors and run times")
-    _tables(report, plan, study.rows)
-    _orders(report, study.orders)
-    _references(report, known)
-    if study.failed:
-        report.heading("What failed")
-        why = [[row.combination.label, row.result.problem] for row in study.failed]
-        report.table(["combination", "why"], why)
-    report.heading("To repeat it")
-    report.code(str(facts["command"]))
-    report.table(["", "version"], [[name, text] for name, text in facts["versions"].items()])
-    return report
-
-
-def _scene_words(physics: Physics) -> str:
-    return ", ".join(described(key, value) for key, value in physics)
-
-
 def _advise(report: Report, plan: Plan, physics: Physics, known: Reference, advice: Sequence[Advice]) -> None:
-    report.heading("Recommendation" + (f" for {_scene_words(physics)}" if physics else ""))
+    report.heading("Recommendation" + (f" for {in_words(physics)}" if physics else ""))
     if not advice:
         report.paragraph(f"None can be given: {known.words or 'no errors are known'}.")
         return
-    main = plan.quantities[0]
-    over = "the largest at any sample time"
-    if main.name == "position_l2":
+    main, over = plan.quantities[0], "the largest at any sample time"
+    if main.name == MEAN_SQUARE:
         over = "root mean square over the area and the sample times"
     report.paragraph(
         f"Errors are meant as: {main.title}, {over}. Run times are medians of the steps alone, "
@@ -467,7 +304,7 @@ def _left_out(plan: Plan, known: Reference) -> str:
         return "The errors are whole: the reference is exact on any mesh."
     if plan.axis("mesh") is None:
         return "All runs and the reference share one mesh: its own error is not in these numbers."
-    if known.kind == "finer" and not plan.static and not refines_time(plan):
+    if known.kind == "finer" and not plan.base.time.static and not refines_time(plan):
         return (
             "All runs and the reference share the time integration: its error is not in these numbers, "
             "which are those of the mesh."
@@ -475,24 +312,23 @@ def _left_out(plan: Plan, known: Reference) -> str:
     return "The errors are those of the mesh and of all else that is solved."
 
 
-def _what(study: StudyOutcome) -> list[str]:
-    plan, rows, facts = study.plan, study.rows, study.facts
-    done = [row for row in rows if row.result.done]
+def _what(plan: Plan, rows: Sequence[StudyRow], ranks: int) -> list[str]:
+    done = [row for row in rows if row.passed]
     values = {axis.key: [f"{v:g}" if isinstance(v, float) else v for v in axis.values] for axis in plan.axes}
     varied = "; ".join(f"{key} = {', '.join(told)}" for key, told in values.items())
-    repeats = plan.request.repeats
+    repeats, end = plan.request.repeats, f"every {seconds(plan.every)} to {seconds(plan.end)}"
     times = {1: "once", 2: "twice"}.get(repeats, f"{repeats} times")
-    found = [
-        f"Scene: {facts['scene']}" + (f" ({plan.base.title})" if plan.base.title else ""),
-        f"{len(rows)} combinations of {varied}; {len(rows) - len(done)} failed",
-        f"Each was timed {times}, one at a time, on {facts['ranks']} MPI rank(s) of "
-        f"{facts['machine']}; after a warm-up step; median and range",
-    ]
     meshes = dict.fromkeys((row.result.vertices, row.result.triangles) for row in done)
-    found.append("Mesh: " + "; ".join(f"{v} vertices, {t} triangles" for v, t in meshes))
     count = len(plan.sample_times()) - 1
-    dynamic = f"Compared at {count} times, every {seconds(plan.every)} to {seconds(plan.end)}"
-    return [*found, "Compared at the full load" if plan.static else dynamic]
+    static = plan.base.time.static
+    return [
+        f"Scene: {plan.request.scene}" + (f" ({plan.base.title})" if plan.base.title else ""),
+        f"{len(rows)} combinations of {varied}; {len(rows) - len(done)} failed",
+        f"Each was timed {times}, one at a time, on {ranks} MPI rank(s) of {machine()}; "
+        "after a warm-up step; median and range",
+        "Mesh: " + "; ".join(f"{v} vertices, {t} triangles" for v, t in meshes),
+        "Compared at the full load" if static else f"Compared at {count} times, {end}",
+    ]
 
 
 # -- tables --------------------------------------------------------------------------------------------
@@ -502,30 +338,26 @@ def _tables(report: Report, plan: Plan, rows: Sequence[StudyRow]) -> None:
     names = [quantity.name for quantity in plan.quantities]
     head = ["setting", *(_short_title(quantity) for quantity in plan.quantities)]
     head += ["run time", "fastest – slowest", "with set-up", "steps", "rejected", "Newton", "linear"]
-    done = [row for row in rows if row.result.done]
+    done = [row for row in rows if row.passed]
     body = []
     for row in done:
-        result, times = row.result, row.result.run_seconds()
+        result, times = row.result, row.result.run_seconds
         body.append(
             [setting(row) + (" ★" if row.recommended else ""), *(_error_cell(row, name) for name in names),
              seconds(row.run), f"{seconds(min(times))} – {seconds(max(times))}", seconds(row.total),
              result.steps, result.rejected, result.newton_iterations, result.linear_iterations]
         )  # fmt: skip
+    starred = any(row.recommended for row in done)
+    star = f" ★: recommended for {percent(DEFAULT_TARGET)}." if starred else ""
     front = [row.on_front for row in done]
-    report.table(
-        head,
-        body,
-        caption="Bold: on the Pareto front."
-        + (f" ★: recommended for {percent(DEFAULT_TARGET)}." if any(row.recommended for row in done) else ""),
-        marked=front,
-    )
+    report.table(head, body, caption="Bold: on the Pareto front." + star, marked=front)
     if any(row.unresolved for row in rows):
         report.paragraph(
             f"“< x” stands where an error is below {SAFETY:g} times the reference's own and not resolved."
         )
     report.table(
         ["setting", *PHASES],
-        [[setting(row), *(row.result.phase_seconds().get(name, 0.0) for name in PHASES)] for row in done],
+        [[setting(row), *row.result.phase_seconds.values()] for row in done],
         caption="Wall time by phase [s], median; mesh, partition and assembly are set-up, output is the "
         "bookkeeping of energies, writing of files is not counted",
     )
@@ -539,8 +371,11 @@ def _short_title(quantity: Quantity) -> str:
 def _error_cell(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
         return f"< {short(SAFETY * row.own[name])}"
-    value = row.errors.get(name, math.nan)
-    return short(value) if math.isfinite(value) else ""
+    return _told(row.errors.get(name, math.nan))
+
+
+def _told(value: float, digits: int = 3) -> str:
+    return short(value, digits) if math.isfinite(value) else ""
 
 
 def _orders(report: Report, orders: Sequence[Order]) -> None:
@@ -560,7 +395,7 @@ def _orders(report: Report, orders: Sequence[Order]) -> None:
 def _references(report: Report, known: Mapping[Physics, Reference]) -> None:
     report.heading("Reference")
     for physics, one in known.items():
-        where = f"{_scene_words(physics)}: " if physics else ""
+        where = f"{in_words(physics)}: " if physics else ""
         took = f"; its steps took {seconds(one.seconds)}" if math.isfinite(one.seconds) else ""
         report.paragraph(f"{where}{one.words}{took}.")
         if one.kind == "finer" and one.own:
@@ -607,24 +442,17 @@ def _work(
     plan: Plan, rows: Sequence[StudyRow], known: Reference, quantity: Quantity, axis: Axis | None, mark: str
 ) -> Drawing:
     name = quantity.name
-    lines = [
-        Series(
-            label,
-            [row.run for row in group],
-            [row.shown(name) for row in group],
-            [min(row.result.run_seconds()) for row in group],
-            [max(row.result.run_seconds()) for row in group],
-            [_point(row, axis) for row in group],
-        )
-        for label, group in families(rows, axis).items()
-    ]
-    hidden = [row for row in rows if row.result.done and name in row.unresolved]
-    main = quantity == plan.quantities[0]
-    star = next((row for row in rows if row.recommended), None)
-    place = None
-    if star is not None and main:
-        at = SAFETY * star.own[name] if name in star.unresolved else star.errors[name]
-        place = (star.run, at)
+    lines = []
+    for label, group in families(rows, axis).items():
+        times = [row.result.run_seconds for row in group]
+        points = [row.run for row in group], [row.shown(name) for row in group]
+        labels = [_point(row, axis) for row in group]
+        lines.append(Series(label, *points, [*map(min, times)], [*map(max, times)], labels))
+    hidden = [row for row in rows if row.passed and name in row.unresolved]
+    main, place, stars = quantity == plan.quantities[0], None, ""
+    for star in (row for row in rows if row.recommended and main):
+        stars = f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
+        place = star.run, SAFETY * star.own[name] if name in star.unresolved else star.errors[name]
     return work_precision(
         lines,
         name=("work-precision" if main else f"work-precision-{_file(name)}") + mark,
@@ -634,9 +462,7 @@ def _work(
         front=[(row.run, row.shown(name)) for row in rows if row.on_front] if main else (),
         bounds=[(row.run, SAFETY * row.own[name]) for row in hidden],
         recommended=place,
-        recommendation=f"{setting(star)} (fastest within {percent(DEFAULT_TARGET)})"
-        if star is not None
-        else "",
+        recommendation=stars,
         floor=_floor(known, quantity),
         floor_label=BELOW,
     )
@@ -645,7 +471,7 @@ def _work(
 def _point(row: StudyRow, axis: Axis | None) -> str:
     if axis is None:
         return ""
-    return described(axis.key, row.combination.settings[axis.key]).removeprefix(axis.key).strip()
+    return described(axis.key, row.case.settings[axis.key]).removeprefix(axis.key).strip()
 
 
 def _convergence(
@@ -655,7 +481,7 @@ def _convergence(
         Series(label, [extent(row, axis) for row in group], [row.shown(quantity.name) for row in group])
         for label, group in families(rows, axis).items()
     ]
-    if not any(len(line.shown()) > 1 for line in lines):
+    if not any(len(line.shown.x) > 1 for line in lines):
         return []
     label = {"time.step": "Δt [s] (mean)", "mesh": "h [m] (mean edge)"}.get(axis.path, axis.key)
     drawing = convergence(
@@ -670,82 +496,165 @@ def _file(name: str) -> str:
     return "".join(sign if sign.isalnum() or sign in "-." else "-" for sign in name).strip("-")
 
 
-# -- the whole study ---
+# -- the whole study -----------------------------------------------------------------------------------
 
 
-def conduct(comm: MPI.Comm, work: Work, command: str) -> StudyOutcome:
-    """Run what is not finished, compare, and write tables, diagrams and reports; collective.
+class Study(View[Outcome[Any]]):
+    """Errors against run times, which are told when all has been compared.
 
     Parameters
     ----------
-    comm : MPI.Comm
     work : Work
-    command : str
-        That repeats the study.
 
-    Raises
-    ------
-    OutputError
-        On every rank, if something cannot be written.
+    Attributes
+    ----------
+    work : Work
+    orders : list of Order
+    advice : dict of physics → list of Advice
     """
-    plan, folder = work.plan, work.folder
-    plan.notes += busy(plan.request.ranks or comm.size)
-    rows = work.rows()
-    known = work.compare(rows)
-    names = [quantity.name for quantity in plan.quantities]
-    facts: dict[str, Any] = {
-        "scene": plan.request.scene,
-        "title": plan.base.title,
-        "command": command,
-        "ranks": plan.request.ranks or comm.size,
-        "machine": machine(),
-        "versions": all_versions(),
-    }
-    study = StudyOutcome(plan, rows, known, observed_orders(rows, plan.axes, names), {}, facts)
-    for physics in known:
-        mark_front(study.of(physics), names[0])
-        study.advice[physics] = advise(study.of(physics), names[0], main_axis(plan.axes))
-        choose_recommended(study.advice[physics])
-    on_root(comm, lambda: write_csv(folder, study))
-    write_summary(folder / "study.json", content(study), comm)
-    on_root(comm, lambda: make_report(study).write(folder))
-    return study
+
+    verb = "study"
+    ready = False
+
+    def __init__(self, work: Work) -> None:
+        self.work, self.plan = work, work.plan
+        self.title = f"Error against run time: {self.plan.base.title or self.plan.request.scene}"
+        self.orders: list[Order] = []
+        self.advice: dict[Physics, list[Advice]] = {}
+        self.plan.notes += busy(self.ranks)
+
+    @property
+    def ranks(self) -> int:
+        """On which each case is run."""
+        return self.plan.request.ranks or self.work.comm.size
+
+    def cases(self) -> Iterator[StudyCase]:
+        """All that is to be run, after which orders, Pareto front and advice are found."""
+        yield from self.work.cases()
+        plan, work = self.plan, self.work
+        names = [quantity.name for quantity in plan.quantities]
+        self.orders = observed_orders(work.rows, plan.axes, names)
+        for physics in work.known:
+            mark_front(work.of(physics), names[0])
+            self.advice[physics] = advise(work.of(physics), names[0], main_axis(plan.axes))
+            choose_recommended(self.advice[physics])
+        self.columns, self.ready = list(record(plan, work.rows[0])), True
+
+    def rows(self, outcome: Outcome[Any]) -> Iterator[dict[str, Any]]:
+        if isinstance(outcome, StudyRow):
+            yield record(self.plan, outcome)
+
+    def cell(self, value: Any) -> str:
+        if value is None:
+            return ""
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        return repr(float(value)) if isinstance(value, float) else str(value)
+
+    def content(self, outcomes: Sequence[Outcome[Any]], ranks: int, command: Sequence[str]) -> dict[str, Any]:
+        """All of the table, the repeats, the references, orders and advice."""
+        plan, known = self.plan, self.work.known
+        return {
+            "scene": plan.request.scene,
+            "title": plan.base.title,
+            "command": shlex.join(command),
+            "ranks": ranks,
+            "machine": machine(),
+            "versions": all_versions(),
+            "request": asdict(plan.request),
+            "axes": {axis.key: list(axis.values) for axis in plan.axes},
+            "quantities": {quantity.name: quantity.title for quantity in plan.quantities},
+            "sample_times": plan.sample_times(),
+            "notes": plan.notes,
+            "references": [
+                {
+                    "scene": dict(physics),
+                    "kind": one.kind,
+                    "reference": one.words,
+                    "run_seconds": one.seconds,
+                    "own_error": {
+                        name: {"error": own.error, "observed_order": own.order, "trusted": own.trusted}
+                        for name, own in one.own.items()
+                    },
+                    "notes": one.notes,
+                }
+                for physics, one in known.items()
+            ],
+            "combinations": [
+                {
+                    **{key: value for key, value in record(plan, row).items() if value not in ("", None)},
+                    "errors": {name: row.shown(name) for name in row.errors},
+                    "not_resolved": sorted(row.unresolved),
+                    "timings": [asdict(timing) for timing in row.result.timings],
+                    "notes": row.result.notes,
+                }
+                for row in self.work.rows
+            ],
+            "orders": [asdict(order) for order in self.orders],
+            "advice": [
+                {
+                    "scene": dict(physics),
+                    "accuracy": one.target,
+                    "combination": one.row.case.name if one.row is not None else None,
+                    "words": one.words,
+                }
+                for physics, advice in self.advice.items()
+                for one in advice
+            ],
+        }
+
+    def page(self, report: Report, outcomes: Sequence[Outcome[Any]], summary: str, *, drawn: bool) -> None:
+        plan, rows, known = self.plan, self.work.rows, self.work.known
+        for physics, one in known.items():
+            _advise(report, plan, physics, one, self.advice[physics])
+        report.heading("What was run")
+        report.bullets(_what(plan, rows, self.ranks))
+        report.bullets([*plan.notes, *(note for one in known.values() for note in one.notes)])
+        for number, (physics, one) in enumerate(known.items(), start=1):
+            report.heading("Diagrams" + (f" for {in_words(physics)}" if physics else ""))
+            mark = "" if len(known) == 1 else f"-{number}"
+            for drawing in drawings(plan, self.work.of(physics), one, mark):
+                report.figure(drawing)
+        report.heading("Errors and run times")
+        _tables(report, plan, rows)
+        _orders(report, self.orders)
+        _references(report, known)
+        failed = [[row.case.title, row.result.problem] for row in rows if not row.passed]
+        if failed:
+            report.heading("What failed")
+            report.table(["combination", "why"], failed)
+
+    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+        report.heading("To repeat it")
+        report.code(shlex.join(command))
+        report.table(["", "version"], list(all_versions().items()))
+        report.write(folder)
+        return ""
 
 
 def all_versions() -> dict[str, str]:
     """Versions of the program and all that takes part."""
     found = versions()
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 
 def busy(ranks: int) -> list[str]:
     """A note where other processes leave too few cores of this machine idle for so many ranks."""
-    cores = os.cpu_count() or 1
-    try:
+    cores, load = os.cpu_count() or 1, -math.inf
+    with suppress(OSError):
         load = os.getloadavg()[0]
-    except OSError:
-        return []
-    if load + ranks <= cores + 0.5:
-        return []
-    return [
-        f"the machine was busy when this began (load {load:.1f} on {cores} cores): "
-        "run times may be larger and spread more than on an idle one"
-    ]
+    words = "run times may be larger and spread more than on an idle one"
+    note = f"the machine was busy when this began (load {load:.1f} on {cores} cores): {words}"
+    return [note] if load + ranks > cores + 0.5 else []
 
 
 def machine() -> str:
     """Processor and cores, in words."""
     model = platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                model = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass
+    with suppress(OSError):
+        named = re.search(r"^model name[^:]*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)
+        model = named[1].strip() if named else model
     return f"{model}, {os.cpu_count() or 1} cores"

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import math
 import statistics
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -25,41 +27,29 @@ from petsc4py import PETSc
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.case import Launcher, Outcome, Verdict
 from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
-from lyra_petsc.experiments.study.comparison import (
-    Errors,
-    History,
-    RestSurface,
-    Samples,
-    against_motion,
-    against_run,
-    history_against_run,
-    overall,
-    read_here,
-    read_samples,
-    read_surface,
-)
-from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, fingerprint, read_result
+from lyra_petsc.experiments.study import comparison
+from lyra_petsc.experiments.study.comparison import Errors, History, RestSurface, Samples
+from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, launched, read_result, run_case
 from lyra_petsc.experiments.study.plan import (
-    LEAN,
+    AUTO_STEPS,
     MEAN_SQUARE,
+    Axis,
     Combination,
+    Physics,
     Plan,
+    StudyCase,
     Value,
-    mesh_overrides,
+    in_words,
     overrides,
     scene_of,
-    time_overrides,
 )
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.show.report.document import seconds
-
-Physics = tuple[tuple[str, Value], ...]
-"""The settings that make a scene another one, in the axes' order."""
 
 NUMERICAL_BLOCKS = {"time", "output", "solver", "petsc", "title", "probes"}
 """Keys in which the scene of a run to compare with may differ without a note."""
@@ -96,6 +86,9 @@ class Reference:
         What it is; empty for ``finer`` until it is known which run it became.
     motion : ExactMotion or None
     folder : Path or None
+        Of the run.
+    sheets : sequence of int
+        Vertices of each of its mesh sources; needed between different meshes.
     notes : list of str
     own : dict of str to Estimate
         Own error by quantity; empty where it is unknown.
@@ -107,20 +100,16 @@ class Reference:
     words: str = ""
     motion: ExactMotion | None = None
     folder: Path | None = None
+    sheets: Sequence[int] = ()
     notes: list[str] = field(default_factory=list)
     own: dict[str, Estimate] = field(default_factory=dict)
     seconds: float = math.nan
 
 
-def physics_of(combination: Combination) -> Physics:
-    """Key of the physical scene that a combination belongs to."""
-    return tuple(combination.physics.items())
-
-
-def physical_overrides(plan: Plan, physics: Physics) -> list[str]:
-    """What makes one physical scene of the study's scene, with what the whole study sets."""
-    axes = [axis for axis in plan.axes if axis.physical]
-    return [f"output.every={plan.every!r}", *overrides(plan.base, axes, [value for _, value in physics])]
+def physical_overrides(plan: Plan, physics: Physics) -> tuple[str, ...]:
+    """What makes one physical scene of the scene file, with what the whole study sets."""
+    values = dict(physics)
+    return plan.overrides([(axis, values[axis.key]) for axis in plan.axes if axis.physical])
 
 
 def choose_references(plan: Plan) -> dict[Physics, Reference]:
@@ -134,15 +123,15 @@ def choose_references(plan: Plan) -> dict[Physics, Reference]:
     text = plan.request.reference
     kind, colon, name = text.partition(":")
     key = f"--reference {text}"
-    groups = list(dict.fromkeys(physics_of(combination) for combination in plan.combinations))
+    groups = list(dict.fromkeys(combination.physics for combination in plan.combinations))
+
+    def scene(physics: Physics) -> Scene:
+        return plan.scene(StudyCase("", "", physical_overrides(plan, physics)))
+
     if kind == "auto" and not colon:
-        return {physics: _automatic(_scene(plan, physics)) for physics in groups}
+        return {physics: _automatic(scene(physics)) for physics in groups}
     if kind == "exact" and name:
-        found = {}
-        for physics in groups:
-            motion = exact_motion(name, Body(_scene(plan, physics)))
-            found[physics] = Reference("exact", _exact_words(name), motion)
-        return found
+        return {physics: _exact(name, exact_motion(name, Body(scene(physics)))) for physics in groups}
     if kind == "run" and name:
         if len(groups) > 1:
             listed = ", ".join(axis.key for axis in plan.axes if axis.physical)
@@ -153,12 +142,8 @@ def choose_references(plan: Plan) -> dict[Physics, Reference]:
     raise InputError("must be auto, exact:NAME or run:DIR", key=key)
 
 
-def _scene(plan: Plan, physics: Physics) -> Scene:
-    return plan.request.with_changes(physical_overrides(plan, physics))
-
-
-def _exact_words(name: str) -> str:
-    return f"exact: {name} ({SOLUTIONS[name].title})"
+def _exact(name: str, motion: ExactMotion) -> Reference:
+    return Reference("exact", f"exact: {name} ({SOLUTIONS[name].title})", motion)
 
 
 def _automatic(scene: Scene) -> Reference:
@@ -166,24 +151,20 @@ def _automatic(scene: Scene) -> Reference:
         return Reference("finer")  # no exact solution has any: the mesh need not be built to know
     body = Body(scene)
     solution = matching(body)
-    if solution is None:
-        return Reference("finer")
-    return Reference("exact", _exact_words(solution.name), solution.motion(body))
+    return Reference("finer") if solution is None else _exact(solution.name, solution.motion(body))
 
 
 def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, key=key)
     try:
-        samples = read_here(folder, plan.sample_times(), plan.every)
-        stored = read_surface(folder)
+        samples = comparison.read_here(folder, plan.sample_times(), plan.every)
+        stored = comparison.read_surface(folder)
     except InputError as error:
         raise InputError(error.message, file=error.file, key=key) from None
     axis = plan.axis("mesh")
-    for value in axis.values if axis is not None else [None]:
-        further = overrides(plan.base, [axis], [value]) if axis is not None and value is not None else []
-        scene = plan.request.with_changes(further)
-        mesh = mesh_of(scene)
+    for chosen in [[(axis, value)] for value in axis.values] if axis is not None else [[]]:
+        mesh = mesh_of(plan.request.with_changes(overrides(plan.base, chosen)))
         built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
         if not built.same_as(stored):
             raise InputError(
@@ -192,11 +173,7 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
                 file=folder,
                 key=key,
             )
-    lacking = [
-        quantity.probe
-        for quantity in plan.quantities
-        if quantity.probe is not None and quantity.probe not in samples.probes
-    ]
+    lacking = [each.probe for each in plan.quantities if each.probe and each.probe not in samples.probes]
     if lacking and plan.request.quantities:
         raise InputError(f"has no probe '{lacking[0]}'", file=folder, key=key)
     notes = [f"the reference run has no probe '{name}': its error is not told" for name in lacking]
@@ -236,42 +213,23 @@ SLOWEST = 0.5
 
 
 @dataclass(frozen=True)
-class ReferenceRun:
-    """One run of the reference's family.
-
-    Attributes
-    ----------
-    name : str
-        The folder.
-    label : str
-        In words.
-    overrides : tuple of str
-    weight : float
-        Its cost beside a run at the study's finest.
-    """
-
-    name: str
-    label: str
-    overrides: tuple[str, ...]
-    weight: float = 1.0
-
-
-@dataclass(frozen=True)
 class Chain:
     """Runs that differ in one thing by factors of two, finest first.
 
     Attributes
     ----------
-    levels : tuple of ReferenceRun
+    levels : tuple of StudyCase
     order : int
         Expected; 0 where none is.
     """
 
-    levels: tuple[ReferenceRun, ...]
+    levels: tuple[StudyCase, ...]
     order: int
 
 
-def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str) -> list[Chain]:
+def make_family(
+    plan: Plan, physics: Sequence[str], smallest: float | None, integrator: str, number: str = ""
+) -> list[Chain]:
     """The runs of the reference of one physical scene; the first of all is the reference.
 
     The finest runs of the chains differ from each other only where meshes are refined too.
@@ -285,26 +243,40 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
         Smallest Δt [s] among the runs, where the time integration is refined.
     integrator : str
         With which it is.
+    number : str
+        What the names end with, where there are several such families.
     """
     common = [*physics, *_tolerances(plan, TIGHTER)]
     mesh = plan.axis("mesh")
     meshes: list[float | None] = [None]
     if mesh is not None:
-        size = min(float(value) for value in mesh.values)
+        size = min(map(float, mesh.values))
         meshes = [size / 2.0, size, 2.0 * size]
-    if smallest is None or plan.static:
+    if smallest is None or plan.base.time.static:
         smallest, integrator = None, ""
         fixed = [axis for axis in plan.axes if axis.path in TIMES and len(axis.values) == 1]
-        common += overrides(plan.base, fixed, [axis.values[0] for axis in fixed])
+        common += overrides(plan.base, [(axis, axis.values[0]) for axis in fixed])
+
+    def level(h: float | None, step: float | None) -> StudyCase:
+        chosen: list[tuple[Axis, Value]] = []
+        if step is not None:
+            chosen += [(Axis("integrator", "time.integrator"), integrator), (Axis("dt", "time.step"), step)]
+        if h is not None:
+            chosen.append((Axis("mesh", "mesh"), h))
+        sizes = [f"dt{step:.6g}" if step is not None else "", f"h{h:.6g}" if h is not None else ""]
+        name = "-".join(filter(None, ["reference", integrator, *sizes])) + number
+        title = in_words((axis.key, value) for axis, value in chosen) or "tightest tolerances"
+        weight = (h or 1.0) ** -2 / (step or 1.0)
+        return StudyCase(name, title, (*common, *overrides(plan.base, chosen)), weight)
 
     def chain(order: int, *sizes: tuple[float | None, float | None]) -> Chain:
-        return Chain(tuple(_level(plan.base, common, h, step, integrator) for h, step in sizes), order)
+        return Chain(tuple(level(*size) for size in sizes), order)
 
     if smallest is None:
         if mesh is not None:
             return [chain(2, *((h, None) for h in meshes))]
         tolerances = (*physics, *_tolerances(plan, TIGHTER / 10.0))
-        loose = ReferenceRun("reference-loose", "tolerances ten times larger", tolerances)
+        loose = StudyCase("reference-loose" + number, "tolerances ten times larger", tolerances)
         return [Chain((*chain(0, (None, None)).levels, loose), 0)]
     finest = plan.every / (FINER * math.ceil(plan.every / smallest * (1.0 - 1e-9)))
     order = 2 if integrator in SECOND_ORDER else 1
@@ -314,7 +286,7 @@ def make_family(plan: Plan, physics: Sequence[str], smallest: float | None, inte
 
 def refines_time(plan: Plan) -> bool:
     """Whether the reference integrates time more finely: always, but where meshes alone are compared."""
-    if plan.static:
+    if plan.base.time.static:
         return False
     varies = any(axis.path in TIMES and len(axis.values) > 1 for axis in plan.axes)
     return varies or plan.axis("mesh") is None
@@ -324,26 +296,6 @@ def integrators(plan: Plan) -> list[str]:
     """Those to try for the reference, in order."""
     # the scene's own first
     return [*sorted(SECOND_ORDER, key=lambda name: name != plan.base.time.integrator), "beuler"]
-
-
-def _level(
-    base: Scene, common: list[str], h: float | None, step: float | None, integrator: str
-) -> ReferenceRun:
-    further, words, name, weight = [], [], ["reference"], 1.0
-    if step is not None:
-        chosen: dict[str, Value] = {"time.step": step, "time.integrator": integrator}
-        further += [f"time.integrator={integrator}", f"time.step={step!r}", *time_overrides(base, chosen)]
-        words += [integrator, f"Δt {seconds(step, 6)}"]
-        name += [integrator, f"dt{step:.6g}"]
-        weight /= step
-    if h is not None:
-        further += mesh_overrides(base, h)
-        words.append(f"h {h:g} m")
-        name.append(f"h{h:.6g}")
-        weight *= h**-2
-    return ReferenceRun(
-        "-".join(name), ", ".join(words) or "tightest tolerances", (*common, *further), weight
-    )
 
 
 def _tolerances(plan: Plan, tighter: float) -> list[str]:
@@ -425,7 +377,7 @@ def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -
     ----------
     .. [1] P. J. Roache, Verification and Validation in Computational Science and Engineering, 1998, ch. 5.
     """
-    sums = [overall(history) for history in differences]
+    sums = [comparison.overall(history) for history in differences]
     found = {}
     for name, first in sums[0].items():
         if len(differences) == 1:
@@ -444,12 +396,6 @@ def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -
 ROUND_OFF = 1e-13
 """Own error of an exact reference."""
 
-AUTO_STEPS = 200.0
-"""Steps that a run with automatic ones is guessed to take, for the time left."""
-
-Runner = Callable[[Job, Callable[[float], None], bool], Result]
-"""Runs a job: (job, watch, warm) → result; collective."""
-
 
 class Observer(Protocol):
     """Who wants to know how far a study is, and may end it."""
@@ -465,12 +411,11 @@ class Observer(Protocol):
 
 
 @dataclass
-class StudyRow:
-    """A combination with what came of it.
+class StudyRow(Outcome[Combination]):
+    """What came of a combination.
 
     Attributes
     ----------
-    combination : Combination
     result : Result
     errors : dict of str to float
         By quantity; NaN where nothing can be told.
@@ -483,7 +428,7 @@ class StudyRow:
     on_front, recommended : bool
     """
 
-    combination: Combination
+    _: KW_ONLY
     result: Result
     errors: dict[str, float] = field(default_factory=dict)
     own: dict[str, float] = field(default_factory=dict)
@@ -493,14 +438,19 @@ class StudyRow:
     recommended: bool = False
 
     @property
+    def passed(self) -> bool:
+        """Whether it ran to its end."""
+        return not self.result.problem
+
+    @property
     def run(self) -> float:
         """Median wall time [s] of the steps alone; NaN for a failed row."""
-        return statistics.median(self.result.run_seconds()) if self.result.timings else math.nan
+        return statistics.median(self.result.run_seconds or [math.nan])
 
     @property
     def total(self) -> float:
         """Median wall time [s] with set-up."""
-        return statistics.median(self.result.total_seconds()) if self.result.timings else math.nan
+        return statistics.median(self.result.total_seconds or [math.nan])
 
     def shown(self, quantity: str) -> float:
         """The error as a number, NaN where it is not resolved."""
@@ -517,221 +467,220 @@ class StudyRow:
     @property
     def line(self) -> str:
         """What its line in a diagram is called: its integrator."""
-        return self.result.integrator or str(self.combination.settings.get("integrator", ""))
+        return self.result.integrator or str(self.case.settings.get("integrator", ""))
 
 
 def mark_unresolved(row: StudyRow) -> None:
     """Note the quantities whose error is below the reference's own, with a margin."""
-    for name, error in row.errors.items():
-        own = row.own.get(name, 0.0)
-        if not math.isnan(error) and not math.isnan(own) and own > 0.0 and error < SAFETY * own:
-            row.unresolved.add(name)
+    row.unresolved |= {name for name, error in row.errors.items() if error < SAFETY * row.own.get(name, 0.0)}
 
 
+def fingerprint(*parts: Sequence[str] | str) -> str:
+    """A short digest of texts."""
+    text = json.dumps([part if isinstance(part, str) else list(part) for part in parts])
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+T = TypeVar("T")
+Runs = Generator[StudyCase, None, T]
+"""Cases to run, and what is made of their results."""
+
+
+@dataclass
 class Work:
     """Runs and comparisons of a study; every method is collective.
 
-    Parameters
+    Attributes
     ----------
     comm : MPI.Comm
     plan : Plan
     chosen : dict of physics → Reference
     folder : Path
-    run : callable
-        How a job is run, see `Runner`.
     observer : Observer
+    launcher : Launcher or None
+        What starts processes for each case; None: cases are run here.
+    lock : int
+        File descriptor that those processes keep open, see `launched`.
+    rows : list of StudyRow
+        The combinations that have ended.
+    known : dict of physics → Reference
+        References as they came out.
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        plan: Plan,
-        chosen: dict[Physics, Reference],
-        folder: Path,
-        run: Runner,
-        observer: Observer,
-    ) -> None:
-        self.comm, self.plan, self.chosen, self.folder = comm, plan, chosen, folder
-        self._run, self._observer = run, observer
-        self._warm: set[tuple[object, ...]] = set()
-        self._levels: dict[str, Result] = {}
+    comm: MPI.Comm
+    plan: Plan
+    chosen: dict[Physics, Reference]
+    folder: Path
+    observer: Observer
+    launcher: Launcher | None = None
+    lock: int = -1
+    rows: list[StudyRow] = field(default_factory=list, init=False)
+    known: dict[Physics, Reference] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self._results: dict[str, Result] = {}
+        self._warm: set[tuple[str, ...]] = set()
         self._done = 0.0
-        self._whole = sum(self._weight(combination) for combination in plan.combinations)
-        self._whole += sum(self._guessed(physics) for physics in chosen)
+        self._whole = sum(case.weight for case in self.plan.combinations)
+        for physics in (physics for physics, one in self.chosen.items() if one.kind == "finer"):
+            family = self._family(physics, self._smallest([]), integrators(self.plan)[0])
+            weights = {each.name: each.weight for chain in family for each in chain.levels}
+            self._whole += sum(weights.values())
 
-    # -- how much work there is --------------------------------------------------------------------------
-
-    def _weight(self, combination: Combination) -> float:
-        """Cost of a combination: repeats × steps × vertices, in a unit that the reference shares."""
-        settings = {axis.path: combination.settings[axis.key] for axis in combination.axes}
-        step = settings.get("time.step", self.plan.base.time.step)
-        if not isinstance(step, int | float) or "time.tolerance" in settings:
-            step = self.plan.end / AUTO_STEPS
-        size = settings.get("mesh")
-        return self.plan.request.repeats / float(step) / (float(size) ** 2 if size is not None else 1.0)
-
-    def _guessed(self, physics: Physics) -> float:
-        if self.chosen[physics].kind != "finer":
-            return 0.0
-        family = self._family(physics, self._smallest([]), integrators(self.plan)[0])
-        weights = {level.name: level.weight for chain in family for level in chain.levels}
-        return sum(weights.values())
+    def of(self, physics: Physics) -> list[StudyRow]:
+        """The rows of one physical scene."""
+        return [row for row in self.rows if row.case.physics == physics]
 
     # -- runs --------------------------------------------------------------------------------------------
 
-    def rows(self) -> list[StudyRow]:
-        """Run every combination that is not finished."""
-        return [
-            StudyRow(combination, self._combination(combination)) for combination in self.plan.combinations
-        ]
+    def cases(self) -> Iterator[StudyCase]:
+        """The combinations, then the runs of references, chosen by what came of those before."""
+        yield from self.plan.combinations
+        for physics in self.chosen:
+            self.known[physics] = yield from self._compared(physics)
 
-    def _combination(self, combination: Combination) -> Result:
-        request, words = self.plan.request, tuple(v for v in combination.values if isinstance(v, str))
-        overrides = (*request.settings, *LEAN, *self.plan.overrides(combination))
-        level = ReferenceRun(combination.name, combination.label, overrides, self._weight(combination))
-        return self._case(level, request.repeats, ("combination", *words))
-
-    def _case(self, level: ReferenceRun, repeats: int, kind: tuple[object, ...]) -> Result:
-        """The result of a run, which is made unless a finished one is found.
-
-        ``kind`` names the runs that use the same kernels: the first of each begins with a step to warm up.
-        """
-        folder, label = self.folder / CASES / level.name, level.label
+    def run(self, case: StudyCase) -> Outcome[Any]:
+        """What came of a case, which runs unless a finished one is found."""
+        folder, begun = self.folder / CASES / case.name, self._done
 
         def look() -> tuple[Job, Result | None, bool]:
-            digest = self._fingerprint(level.overrides, repeats)
-            request = self.plan.request
-            overrides = tuple(level.overrides)
-            job = Job(request.scene, overrides, str(folder), repeats, digest, request.trust_mesh)
+            digest, request = self._fingerprint(case), self.plan.request
             found = read_result(folder, digest)
+            job = Job(request.scene, case.overrides, str(folder), case.repeats, digest, request.trust_mesh)
             return job, found, found is None and (folder / RESULT_FILE).exists()
+
+        def watch(fraction: float) -> None:
+            self.observer.progress(begun + case.weight * fraction, self._whole)
 
         looked = on_root(self.comm, look)
         job, found, stale = looked
-        self._observer.case(label, resumed=found is not None)
+        self.observer.case(case.title, resumed=found is not None)
         if stale:
-            self._observer.note(
-                f"{label} was finished with another scene, program, options, repeats or ranks: it runs again"
+            self.observer.note(
+                f"{case.title} was finished with another scene, program, options, repeats or ranks: it runs "
+                "again"
             )
         if found is None:
-            begun = self._done
-
-            def watch(fraction: float) -> None:
-                self._observer.progress(begun + level.weight * fraction, self._whole)
-
-            found = self._run(job, watch, kind not in self._warm)
-            self._warm.add(kind)
+            if self.launcher is not None:
+                # every process warms up by itself
+                found = launched(self.launcher, job, watch, self.lock)
+            else:
+                found = run_case(self.comm, job, watch, warm=case.kernels not in self._warm)
+            self._warm.add(case.kernels)
             if found.problem:
-                self._observer.note(f"{label} failed: {found.problem}")
-        self._done += level.weight
-        self._observer.progress(self._done, self._whole)
-        return found
+                self.observer.note(f"{case.title} failed: {found.problem}")
+        watch(1.0)
+        self._done += case.weight
+        self._results[case.name] = found
+        if not isinstance(case, Combination):
+            return Outcome(case, {"done": Verdict(not found.problem, found.problem)})
+        self.rows.append(StudyRow(case, result=found))
+        return self.rows[-1]
 
-    def _fingerprint(self, overrides: Sequence[str], repeats: int) -> str:
+    def _fingerprint(self, case: StudyCase) -> str:
         """Of the scene as understood, its mesh files, the PETSc options, ranks and program."""
-        path = Path(self.plan.request.scene)
         try:
-            scene = scene_of(path, (), overrides)
+            scene = scene_of(self.plan.request.scene, case.overrides)
         except InputError as error:
-            return fingerprint(str(error), overrides)
+            return fingerprint(str(error), case.overrides)
         meshes = [hashlib.sha256(file.read_bytes()).hexdigest() for file in scene.mesh_files.values()]
         options = [f"{name}={value}" for name, value in sorted(PETSc.Options().getAll().items())]
-        ranks = str(self.plan.request.ranks or self.comm.size)
-        return fingerprint(dump_scene(scene), meshes, options, str(repeats), ranks, lyra_petsc.__version__)
+        about = str(case.repeats), str(self.plan.request.ranks or self.comm.size), lyra_petsc.__version__
+        return fingerprint(dump_scene(scene), meshes, options, *about)
 
     # -- comparisons -------------------------------------------------------------------------------------
 
-    def compare(self, rows: Sequence[StudyRow]) -> dict[Physics, Reference]:
-        """Errors of all rows that ran; the references behind them, which are run where needed."""
-        known: dict[Physics, Reference] = {}
-        for physics, chosen in self.chosen.items():
-            group = [row for row in rows if physics_of(row.combination) == physics]
-            able = [row for row in group if row.result.done]
-            if not able:
-                known[physics] = Reference("none", "no reference: no combination ran to its end")
-            elif chosen.kind == "finer":
-                known[physics] = self._against_finer(physics, able)
-            else:
-                known[physics] = self._against_given(chosen, able)
-        return known
+    def _compared(self, physics: Physics) -> Runs[Reference]:
+        """The reference of a physical scene; its errors are noted in the rows.
 
-    def _against_given(self, found: Reference, rows: Sequence[StudyRow]) -> Reference:
-        quantities, motion = self.plan.quantities, found.motion
-        if motion is not None:
-            found.own = {quantity.name: Estimate(ROUND_OFF, math.nan, True) for quantity in quantities}
-            self._fill(rows, found, lambda mine: against_motion(self.comm, mine, motion, quantities))
+        A row that misses a sample time has failed after all.
+        """
+        found, rows = self.chosen[physics], [row for row in self.of(physics) if row.passed]
+        if not rows:
+            return Reference("none", "no reference: no combination ran to its end")
+        if found.kind == "finer":
+            found = yield from self._finer(physics, rows)
+        if found.kind == "none":
             return found
-        assert found.folder is not None
-        other = self._samples(found.folder)
-        found.notes.append("the own error of the reference run is not known")
-        self._fill(rows, found, lambda mine: against_run(self.comm, mine, other, quantities))
+        if found.kind == "run":
+            found.notes.append("the own error of the reference run is not known")
+        quantities = self.plan.quantities
+        if found.motion is not None:
+            found.own = {quantity.name: Estimate(ROUND_OFF, math.nan, True) for quantity in quantities}
+            errors_of: Callable[..., Errors] = partial(
+                comparison.against_motion, self.comm, motion=found.motion
+            )
+        else:
+            assert found.folder is not None
+            other = self._samples(found.folder, found.sheets)
+            errors_of = partial(comparison.against_run, self.comm, other=other)
+        for row in rows:
+            try:
+                mine = self._of_case(row.case)
+            except InputError as error:
+                row.result.fail(" ".join(str(error).split()))
+                continue
+            row.errors = errors_of(mine, quantities=quantities)
+            row.own = {name: estimate.error for name, estimate in found.own.items()}
+            mark_unresolved(row)
         return found
 
-    def _against_finer(self, physics: Physics, rows: Sequence[StudyRow]) -> Reference:
+    def _finer(self, physics: Physics, rows: Sequence[StudyRow]) -> Runs[Reference]:
+        """A run finer than these rows, by the first integrator that can."""
         smallest = self._smallest(rows)
         notes = []
         for integrator in integrators(self.plan) if smallest is not None else [""]:
             family = self._family(physics, smallest, integrator)
             finest = family[0].levels[0]
-            best = self._level(physics, finest)
-            if best.done:
+            best = yield from self._level(finest)
+            if not best.problem:
                 break
-            notes.append(f"a reference with {finest.label} failed: {best.problem}")
+            notes.append(f"a reference with {finest.title} failed: {best.problem}")
         else:
             return Reference("none", "no reference: every attempt at one failed", notes=notes)
-        found = Reference("finer", f"finer run: {finest.label}", notes=notes)
-        found.seconds = best.timings[0].run
-        other = self._of_level(physics, finest)
-        found.own = self._own(physics, family, found)
-        self._fill(rows, found, lambda mine: against_run(self.comm, mine, other, self.plan.quantities))
+        folder, took = self.folder / CASES / finest.name, best.timings[0].run
+        found = Reference("finer", f"finer run: {finest.title}", None, folder, best.sheets, notes, {}, took)
+        found.own = yield from self._own(family, found)
         return found
 
     def _family(self, physics: Physics, smallest: float | None, integrator: str) -> list[Chain]:
-        given = [*self.plan.request.settings, *LEAN, *physical_overrides(self.plan, physics)]
-        return make_family(self.plan, given, smallest, integrator)
+        number = f"-{list(self.chosen).index(physics) + 1}" if len(self.chosen) > 1 else ""
+        return make_family(self.plan, physical_overrides(self.plan, physics), smallest, integrator, number)
 
     def _smallest(self, rows: Sequence[StudyRow]) -> float | None:
         """Smallest Δt [s] that is asked for, or that automatic steps took on average."""
         if not refines_time(self.plan):
             return None
-        axis = self.plan.axis("time.step")
+        axis, base = self.plan.axis("time.step"), self.plan.base.time.step
         steps = [float(value) for value in axis.values] if axis is not None else []
         steps += [row.result.mean_step for row in rows if row.result.mean_step > 0.0]
-        if not steps:
-            base = self.plan.base.time.step
-            steps = [float(base) if isinstance(base, int | float) else self.plan.end / AUTO_STEPS]
-        return min(steps)
+        return min(steps or [self.plan.end / AUTO_STEPS if isinstance(base, str) else float(base)])
 
-    def _level(self, physics: Physics, level: ReferenceRun) -> Result:
-        name = self._level_name(level.name, physics)
-        if name not in self._levels:
-            named = replace(level, name=name, label=f"reference: {level.label}")
-            self._levels[name] = self._case(named, 1, ("reference",))
-        return self._levels[name]
+    def _level(self, level: StudyCase) -> Runs[Result]:
+        """The result of a run of a reference, which several of its chains may share."""
+        if level.name not in self._results:
+            yield replace(level, title=f"reference: {level.title}")
+        return self._results[level.name]
 
-    def _level_name(self, name: str, physics: Physics) -> str:
-        number = f"-{list(self.chosen).index(physics) + 1}" if len(self.chosen) > 1 else ""
-        return name + number
+    def _of_case(self, case: StudyCase) -> Samples:
+        return self._samples(self.folder / CASES / case.name, self._results[case.name].sheets)
 
-    def _of_level(self, physics: Physics, level: ReferenceRun) -> Samples:
-        name = self._level_name(level.name, physics)
-        return self._samples(self.folder / CASES / name, self._levels[name].sheets)
+    def _samples(self, folder: Path, sheets: Sequence[int]) -> Samples:
+        return comparison.read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every, sheets)
 
-    def _samples(self, folder: Path, sheets: Sequence[int] = ()) -> Samples:
-        return read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every, sheets)
-
-    def _own(self, physics: Physics, family: list[Chain], known: Reference) -> dict[str, Estimate]:
+    def _own(self, family: list[Chain], known: Reference) -> Runs[dict[str, Estimate]]:
         """Own error of the reference from its chains."""
         estimates = []
         for chain in family:
-            results = [self._level(physics, level) for level in chain.levels]
-            for level, result in zip(chain.levels, results, strict=True):
-                if not result.done:
-                    known.notes.append(f"the own error of the reference is not known: {level.label} failed")
+            for level in chain.levels:
+                yield from self._level(level)
+            for level in chain.levels:
+                if self._results[level.name].problem:
+                    known.notes.append(f"the own error of the reference is not known: {level.title} failed")
                     return {}
-            samples = [self._of_level(physics, level) for level in chain.levels]
+            samples = [self._of_case(level) for level in chain.levels]
             differences = [
-                history_against_run(self.comm, coarse, fine, self.plan.quantities)
+                comparison.history_against_run(self.comm, coarse, fine, self.plan.quantities)
                 for fine, coarse in itertools.pairwise(samples)
             ]
             estimates.append(of_chain(differences, chain))
@@ -743,17 +692,3 @@ class Work:
                 f"({', '.join(doubtful)}): its own error is a guess from their largest difference"
             )
         return own
-
-    def _fill(
-        self, rows: Sequence[StudyRow], known: Reference, errors_of: Callable[[Samples], Errors]
-    ) -> None:
-        """Errors of the rows; one that misses a sample time has failed after all."""
-        for row in rows:
-            try:
-                mine = self._samples(self.folder / CASES / row.combination.name, row.result.sheets)
-            except InputError as error:
-                row.result.fail(" ".join(str(error).split()))
-                continue
-            row.errors = errors_of(mine)
-            row.own = {name: estimate.error for name, estimate in known.own.items()}
-            mark_unresolved(row)

@@ -21,7 +21,7 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Bench, problem_of
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
 from lyra_petsc.experiments.results import Line, View, aligned
-from lyra_petsc.show.report.document import PLOTS, Report, seconds
+from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds
 from lyra_petsc.show.report.plots import Series, convergence, work_precision
 
 
@@ -218,6 +218,23 @@ def data(name: str) -> dict[str, Any]:
     return content
 
 
+STATIC: dict[str, Any] = {"analysis": "static"}
+ASSEMBLED = {"end": 1.0, "step": 1.0}
+"""Time of a scene that is set up and not stepped."""
+
+
+def scene(
+    mesh: dict[str, Any], material: dict[str, Any], time: dict[str, Any] = STATIC, **more: Any
+) -> dict[str, Any]:
+    """A scene as in a file; ``more`` are further keys."""
+    return {"mesh": mesh, "material": material, "time": dict(time), **more}
+
+
+def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal") -> dict[str, Any]:
+    """The mesh block of a rectangle [m] of nx × ny cells."""
+    return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": pattern}}
+
+
 def isotropic(stiffness: float, poisson: float = 0.0) -> dict[str, float]:
     """The membrane block [N/m] of a material with c11 = ``stiffness`` in all directions."""
     shear = 0.5 * (1.0 - poisson) * stiffness
@@ -403,14 +420,9 @@ class Verification(View[VerificationOutcome]):
             "scale where that is zero; the order is that between a row and the one before; the run time of "
             "a row is that of all its simulations, set-up included."
         )
-        report.table(
-            ["case", "what is compared", "verdict", "run time"],
-            [
-                [o.case.name, o.case.title, "passed" if o.passed else "FAILED", seconds(o.seconds)]
-                for o in outcomes
-            ],
-            marked=[not o.passed for o in outcomes],
-        )
+        heads, words = ["case", "what is compared", "verdict", "run time"], {True: "passed", False: "FAILED"}
+        table = [[o.case.name, o.case.title, words[o.passed], seconds(o.seconds)] for o in outcomes]
+        report.table(heads, table, marked=[not o.passed for o in outcomes])
         for outcome in outcomes:
             case = outcome.case
             report.heading(case.name)
@@ -432,24 +444,15 @@ def _figures(report: Report, outcome: VerificationOutcome) -> None:
         for quantity, rows in outcome.tables().items()
         if case.claim_of(quantity).has_order and len(rows) > 1 and not any(row.problem for row in rows)
     }
-    if not tables:
-        return
-
-    def against(x: str) -> list[Series]:
-        return [
+    drawn: dict[str, tuple[str, str, Callable[..., Drawing]]] = {
+        "h": ("convergence", "h", convergence),
+        "wall_seconds": ("run-time", "run time", work_precision),
+    }
+    for x, (file, words, draw) in drawn.items() if tables else ():
+        lines = [
             Series(quantity, [getattr(row, x) for row in rows], [row.error for row in rows])
             for quantity, rows in tables.items()
         ]
-
-    report.figure(
-        convergence(
-            against("h"), name=f"{PLOTS}/{case.name}-convergence", caption=f"{case.name}: error against h",
-            x_label="h", y_label="relative error",
-        )
-    )  # fmt: skip
-    report.figure(
-        work_precision(
-            against("wall_seconds"), name=f"{PLOTS}/{case.name}-run-time",
-            caption=f"{case.name}: error against run time", y_label="relative error",
-        )
-    )  # fmt: skip
+        about = {"name": f"{PLOTS}/{case.name}-{file}", "caption": f"{case.name}: error against {words}"}
+        label = words if x == "h" else f"{words} [s]"
+        report.figure(draw(lines, **about, x_label=label, y_label="relative error"))

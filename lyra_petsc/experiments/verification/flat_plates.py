@@ -6,7 +6,7 @@ from typing import Any
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle_script, sides
-from lyra_petsc.experiments.verification.answers import isotropic
+from lyra_petsc.experiments.verification.answers import grid, isotropic
 
 KINDS = ("diagonal", "alternating", "criss-cross", "irregular", "gmsh")
 
@@ -23,7 +23,7 @@ def flat_mesh(
     if kind == "gmsh":
         middle = () if ny % 2 else (0.5 * width, 0.5 * height)
         return bench.script(rectangle_script(width, height, width / nx, middle))
-    return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": kind}}
+    return grid(width, height, nx, ny, kind)
 
 
 def strip_mesh(bench: Bench, kind: str, n: float, width: float, length: float = 1.0) -> dict[str, Any]:

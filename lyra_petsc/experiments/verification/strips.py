@@ -7,16 +7,14 @@ strip: wider strips resist with their membrane against the lateral curvature tha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import Measured, isotropic
-from lyra_petsc.experiments.verification.rods import Cantilever
+from lyra_petsc.experiments.verification.answers import grid, isotropic, scene
 
 MEMBRANE = 1e6
 """C L²/B: as of a strip with a thickness of 0.0035 L. The exact shapes take its stretch into account."""
@@ -32,30 +30,9 @@ def strip(pattern: str, n: float, membrane: float = MEMBRANE, **more: Any) -> di
     """
     along = round(n)
     material = {"density": DENSITY, "membrane": isotropic(membrane), "bending": 1.0}
-    return {
-        "mesh": {"grid": {"width": 1.0, "height": 1.0 / along, "nx": along, "ny": 1, "pattern": pattern}},
-        "material": material | more.pop("material", {}),
-        "handles": [{"group": "left", "clamp": True}],
-        "time": {"analysis": "static"},
-        **more,
-    }
-
-
-def tip(trial: Trial, n: float) -> tuple[float, float]:
-    """Mean (x, −z) of the two vertices of the free end over L: reach and drop."""
-    along = round(n)
-    x, _, z = trial.x[[along, 2 * along + 1]].mean(axis=0)
-    return float(x), float(-z)
-
-
-def compared(trial: Trial, n: float, exact: Cantilever, words: str) -> Sequence[Measured]:
-    """Drop and reach of the tip, both errors relative to the way the tip went."""
-    reach, drop = tip(trial, n)
-    way = float(np.hypot(exact.drop, 1.0 - exact.reach))
-    return [
-        Measured(f"drop / L, {words}", drop, exact.drop, scale=way),
-        Measured(f"reach / L, {words}", reach, exact.reach, scale=way),
-    ]
+    held = [{"group": "left", "clamp": True}]
+    mesh = grid(1.0, 1.0 / along, along, 1, pattern)
+    return scene(mesh, material | more.pop("material", {}), handles=held, **more)
 
 
 Array = NDArray[np.float64]
@@ -91,10 +68,7 @@ def hung(bench: Bench, n: int, e: float, dx: float, dz: float) -> dict[str, Any]
     start = np.column_stack(
         [cos * along[:, 0] - sin * along[:, 1], vertices[:, 1], sin * along[:, 0] + cos * along[:, 1]]
     )
-    return {
-        "mesh": bench.mesh(start, triangles, rest=vertices[:, :2]),
-        "material": {"density": e * STIFFNESS / (G * LENGTH), "membrane": isotropic(STIFFNESS)},
-        "gravity": [0, 0, -G],
-        "handles": [{"nodes": [0, n, n + 1, 2 * n + 1]}, {"box": [[-9, -9, -9], [9, 9, 9]], "axes": ["y"]}],
-        "time": {"analysis": "static"},
-    }
+    mesh = bench.mesh(start, triangles, rest=vertices[:, :2])
+    material = {"density": e * STIFFNESS / (G * LENGTH), "membrane": isotropic(STIFFNESS)}
+    held = [{"nodes": [0, n, n + 1, 2 * n + 1]}, {"box": [[-9, -9, -9], [9, 9, 9]], "axes": ["y"]}]
+    return scene(mesh, material, gravity=[0, 0, -G], handles=held)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,9 +43,15 @@ class Series:
     high: Sequence[float] = ()
     labels: Sequence[str] = field(default_factory=tuple)
 
-    def shown(self) -> list[int]:
-        """Numbers of the points that a logarithmic figure can show."""
-        return [i for i in range(len(self.x)) if _visible(self.x[i]) and _visible(self.y[i])]
+    @property
+    def shown(self) -> Series:
+        """Its points that a logarithmic figure can show."""
+        at = [i for i, point in enumerate(zip(self.x, self.y, strict=True)) if all(map(_visible, point))]
+
+        def kept(values: Sequence[Any]) -> list[Any]:
+            return [values[i] for i in at if i < len(values)]
+
+        return Series(self.name, *map(kept, (self.x, self.y, self.low, self.high, self.labels)))
 
 
 def convergence(
@@ -71,15 +77,12 @@ def convergence(
     floor_label : str
     """
     figure, axes = _axes(x_label, y_label)
-    for number, line in enumerate(series):
-        shown = line.shown()
-        if not shown:
-            continue
-        x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
-        slope = fitted_slope(x, y)
+    lines = [line.shown for line in series]
+    for line, look in _looks(lines):
+        slope = fitted_slope(line.x, line.y)
         words = line.name if math.isnan(slope) else f"{line.name}: slope {slope:.2f}"
-        axes.plot(x, y, marker=_marker(number), color=colour(number), label=words, lw=1.6, ms=5)
-    _triangles(axes, series)
+        axes.plot(line.x, line.y, label=words, lw=1.6, **look)
+    _triangles(axes, [point for line in lines for point in zip(line.x, line.y, strict=True)])
     _floor(axes, floor, floor_label)
     _finish(axes)
     return drawn(figure, name, caption)
@@ -113,27 +116,15 @@ def work_precision(
         Its name.
     """
     figure, axes = _axes(x_label, y_label)
-    for number, line in enumerate(series):
-        shown = line.shown()
-        if not shown:
-            continue
-        x, y = [line.x[i] for i in shown], [line.y[i] for i in shown]
+    for line, look in _looks([line.shown for line in series]):
         spread = None
         if line.low and line.high:
-            spread = [
-                [max(0.0, line.x[i] - line.low[i]) for i in shown],
-                [max(0.0, line.high[i] - line.x[i]) for i in shown],
-            ]
-        axes.errorbar(
-            x, y, xerr=spread, marker=_marker(number), color=colour(number), label=line.name,
-            lw=1.4, ms=5, capsize=2, elinewidth=1.0,
-        )  # fmt: skip
-        for i in shown:
-            if i < len(line.labels):
-                axes.annotate(
-                    line.labels[i], (line.x[i], line.y[i]), xytext=(5, 4), textcoords="offset points",
-                    fontsize=7, color=colour(number),
-                )  # fmt: skip
+            spread = np.maximum(0.0, [np.subtract(line.x, line.low), np.subtract(line.high, line.x)])
+        axes.errorbar(line.x, line.y, xerr=spread, label=line.name, lw=1.4, capsize=2, elinewidth=1.0, **look)
+        for label, *point in zip(line.labels, line.x, line.y, strict=False):
+            axes.annotate(
+                label, point, xytext=(5, 4), textcoords="offset points", fontsize=7, color=look["color"]
+            )
     best = sorted(point for point in front if all(map(_visible, point)))
     if best:
         times, errors = zip(*best, strict=True)
@@ -177,8 +168,11 @@ def colour(number: int) -> str:
     return COLOURS[number % len(COLOURS)]
 
 
-def _marker(number: int) -> str:
-    return MARKERS[number % len(MARKERS)]
+def _looks(lines: Sequence[Series]) -> Iterator[tuple[Series, dict[str, Any]]]:
+    """The lines that have points, and how each is drawn."""
+    for number, line in enumerate(lines):
+        if line.x:
+            yield line, {"marker": MARKERS[number % len(MARKERS)], "color": colour(number), "ms": 5}
 
 
 def empty_figure(height: float) -> Any:
@@ -203,14 +197,11 @@ def _axes(x_label: str, y_label: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _triangles(axes: Any, series: Sequence[Series]) -> None:
+def _triangles(axes: Any, points: Sequence[tuple[float, float]]) -> None:
     """Dashed lines of slope 1 and 2 through the largest point, to compare by eye."""
-    points = [(line.x[i], line.y[i]) for line in series for i in line.shown()]
     if len({x for x, _ in points}) < 2:
         return
-    low, high = min(x for x, _ in points), max(x for x, _ in points)
-    top = max(y for _, y in points)
-    bottom = min(y for _, y in points)
+    (low, high), (bottom, top) = ((min(values), max(values)) for values in zip(*points, strict=True))
     for order, dashes in ((1, (4, 3)), (2, (1, 2))):
         end = max(low, high * (0.5 * bottom / top) ** (1.0 / order))
         axes.plot(
@@ -262,21 +253,12 @@ MOST_TRIANGLES = 20_000
 """Drawn of a surface; of a larger one every k-th is."""
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One line of a figure over time."""
-
-    name: str
-    times: Sequence[float]
-    values: Sequence[float]
-
-
-def over_time(curves: Sequence[Curve], *, name: str, caption: str, y_label: str) -> Drawing:
+def over_time(curves: Sequence[Series], *, name: str, caption: str, y_label: str) -> Drawing:
     """Quantities over time [s], both axes linear."""
     figure = empty_figure(0.6 * HEIGHT)
     axes = figure.add_subplot(xlabel="time [s]", ylabel=y_label)
     for number, curve in enumerate(curves):
-        axes.plot(curve.times, curve.values, color=colour(number), label=curve.name, lw=1.6, marker=".", ms=4)
+        axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.6, marker=".", ms=4)
     axes.grid(True, color="#dfe3e8", lw=0.8)
     axes.legend(fontsize=8)
     return drawn(figure, name, caption)

@@ -65,7 +65,7 @@ class Facts:
     @property
     def static(self) -> bool:
         """Whether it seeks an equilibrium: time is the load factor then."""
-        return self.run.scene.time.analysis == "static"
+        return self.run.scene.time.static
 
     @cached_property
     def outcome(self) -> str:
@@ -451,8 +451,7 @@ def plain_pictures(run: StoredRun) -> list[Drawing]:
 
 def state_caption(run: StoredRun, i: int) -> str:
     """What a picture of state ``i`` shows."""
-    static = run.scene.time.analysis == "static"
-    return f"Load factor {run.times[i]:g}" if static else f"t = {run.times[i]:g} s"
+    return f"Load factor {run.times[i]:g}" if run.scene.time.static else f"t = {run.times[i]:g} s"
 
 
 def _overview(page: Report, facts: Facts) -> None:
@@ -479,17 +478,15 @@ def _outcome(facts: Facts, done: float) -> str:
     now = f"t = {facts.columns['time'][-1]:g} of {facts.run.scene.time.end:g} s"
     if facts.static:
         now = f"load factor {facts.columns['time'][-1]:g}"
-    if facts.outcome == "done":
-        return f"The run came to its end, {now}."
-    if facts.outcome == "running":
-        return f"The run goes on: {now}, {percent(done)}. Made again, this page shows more."
-    if facts.outcome == "killed":
-        return f"The run was killed, or its machine went down, after {now}, {percent(done)}."
-    if facts.outcome == "unknown":
-        return f"How the run ended is not known (no summary.json); its last step is at {now}."
-    if facts.outcome == "stopped":
-        return f"The run was to stop at {now}, {percent(done)}, by -ts_max_steps."
-    return f"The run stopped at {now}, {percent(done)}: {facts.outcome}"
+    part = percent(done)
+    words = {
+        "done": f"The run came to its end, {now}.",
+        "running": f"The run goes on: {now}, {part}. Made again, this page shows more.",
+        "killed": f"The run was killed, or its machine went down, after {now}, {part}.",
+        "unknown": f"How the run ended is not known (no summary.json); its last step is at {now}.",
+        "stopped": f"The run was to stop at {now}, {part}, by -ts_max_steps.",
+    }
+    return words.get(facts.outcome, f"The run stopped at {now}, {part}: {facts.outcome}")
 
 
 def _energy(page: Report, facts: Facts) -> None:

@@ -41,7 +41,7 @@ def made_up(own: float = 0.0) -> list[StudyRow]:
         seconds = (0.01 if first else 0.02) / dt
         timings = [Timing(0.5, seconds * factor) for factor in (1.0, 0.95, 1.3)]
         result = Result("", integrator=str(integrator), steps=round(1.0 / dt), end=1.0, timings=timings)
-        row = StudyRow(combination, result, {"position_max": dt if first else 25.0 * dt * dt})
+        row = StudyRow(combination, result=result, errors={"position_max": dt if first else 25.0 * dt * dt})
         row.own = {"position_max": own}
         mark_unresolved(row)
         rows.append(row)
@@ -61,7 +61,7 @@ def test_orders_between_neighbours_and_fitted() -> None:
 def test_orders_are_those_of_the_steps_really_taken() -> None:
     rows = made_up()
     for row in rows:  # as if all steps had been cut to half
-        row.result.steps *= 2 if row.combination.settings["dt"] == 0.04 else 1
+        row.result.steps *= 2 if row.case.settings["dt"] == 0.04 else 1
     orders = observed_orders(rows[:3], AXES, ["position_max"])
     assert math.isnan(orders[0].neighbours[0])  # both took the same steps
     assert orders[0].neighbours[1] == pytest.approx(1.0)

@@ -66,7 +66,7 @@ def test_refusals(texts: list[str], words: str) -> None:
 def test_all_combinations_with_the_last_axis_fastest() -> None:
     found = combinations(parse_axes(["integrator=beuler,bdf2", "dt=0.02,0.01"]))
     assert [c.name for c in found] == ["beuler-dt0.02", "beuler-dt0.01", "bdf2-dt0.02", "bdf2-dt0.01"]
-    assert found[3].label == "bdf2, Δt 10 ms"
+    assert found[3].title == "bdf2, Δt 10 ms"
     assert found[3].settings == {"integrator": "bdf2", "dt": 0.01}
 
 

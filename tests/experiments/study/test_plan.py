@@ -14,7 +14,6 @@ from lyra_petsc.experiments.study.work import (
     choose_references,
     make_family,
     physical_overrides,
-    physics_of,
     refines_time,
 )
 from lyra_petsc.scene.schema import INTEGRATORS
@@ -133,7 +132,7 @@ def test_every_physical_scene_has_a_reference_of_its_own(tmp_path: Path) -> None
     plan = plan_of(tmp_path, SCENE + MOVING, "gravity=[0,0,-9.81],[0,0,-1.62]", "dt=0.02,0.01")
     chosen = choose_references(plan)
     assert len(chosen) == 2
-    assert {physics_of(combination) for combination in plan.combinations} == set(chosen)
+    assert {combination.physics for combination in plan.combinations} == set(chosen)
     motions = [one.motion for one in chosen.values()]
     assert all(motion is not None for motion in motions)
     assert len({motion.energies(0.1).potential for motion in motions if motion}) == 2

@@ -17,11 +17,13 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     Setting,
     StressCase,
     by_directors,
+    changed,
     family,
     move,
     release,
     scale,
 )
+from lyra_petsc.experiments.verification.answers import grid
 
 Array = NDArray[np.float64]
 
@@ -33,10 +35,6 @@ PART, CRUMPLED = 0.02, 0.3
 
 STEPS, FEW, LONG = 80, 20, 0.02
 """Numbers of steps, and Δt [s] of the few."""
-
-
-def _as_it_is(content: Content) -> Content:
-    return content
 
 
 def _changed(change: Callable[..., Content], setting: Setting, bench: Bench, **numbers: float) -> Content:
@@ -57,11 +55,10 @@ def _folded(x: Array, spacing: float) -> Array:
 
 def _strip(setting: Setting, bench: Bench, frames: list[dict[str, Any]], stiffer: bool) -> Content:
     """A strip of the base scene's sheet, or a stiffer one, clamped at both ends, one of which moves."""
-    grid = {"width": 1.0, "height": 0.3, "nx": 40, "ny": 12, "pattern": "alternating"}
     content = by_directors(setting.content())
     if stiffer:
         content = scale(content, stretching=8.0, bending=10.0)
-    content["mesh"] = {"grid": grid, "transform": {"translate": [0.0, -0.15, 0.0]}}
+    content["mesh"] = grid(1.0, 0.3, 40, 12, "alternating") | {"transform": {"translate": [0.0, -0.15, 0.0]}}
     content["handles"] = [{"group": "right", "clamp": True}]
     content = move(content, frames)
     content["handles"].append({"group": "left", "clamp": True})
@@ -91,7 +88,7 @@ CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": STEPS * STEP, "scale": [P
 directors = family(
     "directors",
     "bending_model: midedge",
-    StressCase("directors-plain", "as it is", partial(_changed, _as_it_is), level=QUICK),
+    StressCase("directors-plain", "as it is", changed(by_directors), level=QUICK),
     *(
         StressCase(
             f"directors-1e6-{ms}ms", f"membrane × 1e6, Δt {ms} ms", partial(_changed, scale, stretching=1e6),

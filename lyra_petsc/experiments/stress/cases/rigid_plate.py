@@ -26,7 +26,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     StressCase,
     family,
 )
-from lyra_petsc.experiments.verification.answers import isotropic
+from lyra_petsc.experiments.verification.answers import grid, isotropic, scene
 
 LENGTH, G, DENSITY, CELLS = 1.0, 9.8, 0.15, 16
 """m, m/s², kg/m², cells along a side"""
@@ -39,15 +39,10 @@ BOUND, EARLY = 0.005, 0.25
 
 
 def _plate(setting: Setting, bench: Bench, stiffness: float, bending: float) -> Content:
-    grid = {"width": LENGTH, "height": LENGTH, "nx": CELLS, "ny": CELLS, "pattern": "alternating"}
-    return {
-        "title": "A plate hinged at one edge",
-        "mesh": {"grid": grid},
-        "material": {"density": DENSITY, "membrane": isotropic(stiffness, 0.3), "bending": bending},
-        "gravity": [0.0, 0.0, -G],
-        "handles": [{"group": "left"}],
-        "time": {"end": 0.5, "step": setting.step},
-    }
+    mesh = grid(LENGTH, LENGTH, CELLS, CELLS, "alternating")
+    material = {"density": DENSITY, "membrane": isotropic(stiffness, 0.3), "bending": bending}
+    time, about = {"end": 0.5, "step": setting.step}, "A plate hinged at one edge"
+    return scene(mesh, material, time, title=about, gravity=[0.0, 0.0, -G], handles=[{"group": "left"}])
 
 
 def _centre(trial: Trial) -> tuple[float, float]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import Measured, at_finest, case
+from lyra_petsc.experiments.verification.answers import ASSEMBLED, STATIC, Measured, at_finest, case, scene
 from lyra_petsc.experiments.verification.flat_plates import KINDS, plate_material, strip_mesh
 from lyra_petsc.experiments.verification.rods import column_shape, tall_cantilever
 from lyra_petsc.experiments.verification.spectrum import lowest_squares
@@ -57,13 +58,9 @@ def _critical(lowest: Callable[[float], float], first: float, second: float) -> 
 def column(bench: Bench, n: float) -> Iterator[Measured]:
     for words, (ends, exact) in COLUMNS.items():
         for kind in KINDS:
-            scene = {
-                "mesh": strip_mesh(bench, kind, n, WIDTH),
-                "material": plate_material(MEMBRANE),
-                "handles": [{"group": "sheet", "axes": IN_PLANE}, *ends],
-                "time": {"end": 1.0, "step": 1.0},
-            }
-            with bench.simulation(scene) as trial:
+            held = [{"group": "sheet", "axes": IN_PLANE}, *ends]
+            mesh, material = strip_mesh(bench, kind, n, WIDTH), plate_material(MEMBRANE)
+            with bench.simulation(scene(mesh, material, ASSEMBLED, handles=held)) as trial:
 
                 def lowest(load: float, trial: Trial = trial) -> float:
                     # P = C (λ − λ³)/2, λ nearly 1
@@ -101,20 +98,20 @@ LOADS = {"below": 0.95, "above": 1.2}
 )
 def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
     for kind in KINDS:
-        common = {"mesh": strip_mesh(bench, kind, n, WIDTH), "material": plate_material(SOFTER)}
+        strip = partial(scene, strip_mesh(bench, kind, n, WIDTH), plate_material(SOFTER))
         for words in ("pinned", "clamped"):
             frames: list[dict[str, Any]] = [{"time": 0.0}, {"time": 0.1, "translate": [-0.02, 0.0, 0.0]}]
             for at, each in zip((0.5, 1.0), SHORTENINGS, strict=True):
                 frames.append({"time": at, "translate": [-each, 0.0, 0.0]})
             left, right = COLUMNS[words][0]
-            scene = common | {
-                "handles": [left, right | {"motion": "push", "interpolation": "linear"}],
-                "motions": {"push": frames},
-                "loads": [{"traction": [0.0, 0.0, ASIDE], "until": 0.1}],
-                "time": {"analysis": "static", "step": 0.1},
-            }
+            shortened = strip(
+                STATIC | {"step": 0.1},
+                handles=[left, right | {"motion": "push", "interpolation": "linear"}],
+                motions={"push": frames},
+                loads=[{"traction": [0.0, 0.0, ASIDE], "until": 0.1}],
+            )
             shortenings = iter(SHORTENINGS)
-            with bench.simulation(scene) as trial:
+            with bench.simulation(shortened) as trial:
                 while not trial.simulation.finished:
                     trial.step()
                     if not np.isclose(trial.simulation.time, (0.5, 1.0)).any():
@@ -127,12 +124,9 @@ def post_buckling(bench: Bench, n: float) -> Iterator[Measured]:
                     yield Measured(f"height / L, {name}", _height(trial), height)
         for words, part in LOADS.items():
             load = part * math.pi**2
-            scene = common | {
-                "handles": [{"group": "left"}, {"group": "right", "axes": ["y", "z"]}],
-                "loads": [{"group": "right", "force": [-load * WIDTH, 0.0, 0.0]}],
-                "time": {"analysis": "static"},
-            }
-            with bench.simulation(scene) as trial:
+            held = [{"group": "left"}, {"group": "right", "axes": ["y", "z"]}]
+            pushed = [{"group": "right", "force": [-load * WIDTH, 0.0, 0.0]}]
+            with bench.simulation(strip(handles=held, loads=pushed)) as trial:
                 found = _height(trial.run())
                 assert trial.simulation.stability["stable"] is not False
             height = column_shape(load=load)[1] if part > 1.0 else 0.0
@@ -193,20 +187,11 @@ def _tipping(
     bench: Bench, kind: str, n: float, depth: float, poisson: float, about: float
 ) -> tuple[float, float]:
     """Critical load [N], near ``about``, and of the mode the tip's turn over its deflection over L."""
-    common = {
-        "mesh": strip_mesh(bench, kind, n / depth, depth),
-        "material": plate_material(STIFF, poisson=poisson),
-    }
+    strip = partial(scene, strip_mesh(bench, kind, n / depth, depth), plate_material(STIFF, poisson=poisson))
     clamp = {"group": "left", "clamp": True}
     # in the plane the sheet is in equilibrium; to leave it, it need not move in it
-    plane = common | {
-        "handles": [clamp, {"group": "sheet", "axes": ["z"]}],
-        "time": {"analysis": "static", "step": 1.0},
-    }
-    across = common | {
-        "handles": [clamp, {"group": "sheet", "axes": ["x", "y"]}],
-        "time": {"end": 1.0, "step": 1.0},
-    }
+    plane = strip(STATIC | {"step": 1.0}, handles=[clamp, {"group": "sheet", "axes": ["z"]}])
+    across = strip(ASSEMBLED, handles=[clamp, {"group": "sheet", "axes": IN_PLANE}])
     mode = np.empty(0)
 
     def lowest(load: float) -> float:

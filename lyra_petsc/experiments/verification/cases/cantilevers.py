@@ -1,15 +1,19 @@
-"""Clamped strips that bend without limit: by a load at the tip, by their weight, by their rest curvature."""
+"""Clamped strips that bend without limit: by a load at the tip, by their weight, by their rest curvature.
+
+By hinges on strips one cell wide, and by directors on edges on every kind of mesh and of any width.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.answers import (
     Claim,
     Converges,
@@ -18,84 +22,170 @@ from lyra_petsc.experiments.verification.answers import (
     at_finest,
     case,
     isotropic,
+    scene,
 )
 from lyra_petsc.experiments.verification.cases.hinges import expected
+from lyra_petsc.experiments.verification.flat_plates import KINDS, plate_material, strip_mesh
 from lyra_petsc.experiments.verification.rods import (
     Cantilever,
     cantilever,
     heavy_coupled_strip,
     overhang_weight,
 )
-from lyra_petsc.experiments.verification.strips import DENSITY, MEMBRANE, compared, strip, tip
+from lyra_petsc.experiments.verification.strips import DENSITY, MEMBRANE, strip
 from lyra_petsc.parallel import on_root
 
-STRIPS: dict[str, Any] = {"resolutions": (16, 32, 64), "quick": 1, "counts": "cells along the strip"}
+COUNTS: dict[str, Any] = {"quick": 1, "counts": "cells along the strip"}
+HINGED = COUNTS | {"resolutions": (16, 32, 64)}
+DIRECTED = COUNTS | {"resolutions": (25, 50, 100), "claim": at_finest(3e-3)}
 
 PATTERNS = ("alternating", "criss-cross")
-"""Those whose bending does not twist them."""
+"""Those whose bending by hinges does not twist them."""
+
+WIDTHS = {"one cell": 0.0, "0.1 L": 0.1, "0.25 L": 0.25}
+"""Of strips that bend by directors."""
+
+Loads = Mapping[str, Sequence[float]]
 
 
-def _tips(
-    bench: Bench, n: float, runs: Iterable[tuple[dict[str, Any], Cantilever, str]]
-) -> Sequence[Measured]:
-    """The tips of strips against what is exact: (scene, exact, words) of each."""
-    found: list[Measured] = []
-    for scene, exact, words in runs:
-        with bench.simulation(scene) as trial:
-            found += compared(trial.run(), n, exact, words)
-    return found
+@dataclass(frozen=True)
+class Strip:
+    """A clamped strip of length 1 m with B = 1 N·m, static.
+
+    Attributes
+    ----------
+    words : str
+    width : float
+        [m].
+    stiffness : float
+        What its mesh makes of B [N·m].
+    scene : callable (**more) → scene content
+        ``more`` are further keys.
+    """
+
+    words: str
+    width: float
+    stiffness: float
+    scene: Callable[..., dict[str, Any]]
 
 
-LOADS = (0.25, 1.0, 4.0, 10.0, 50.0)
-"""α = P L² / B_effective, P per width"""
+def hinged(n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
+    """Strips of square cells that bend by hinges, with the loads of each pattern."""
+    for pattern, some in loads.items():
+        made = Strip(pattern, 1.0 / n, expected(pattern), partial(strip, pattern, n))
+        yield from ((made, load) for load in some)
+
+
+def directed(bench: Bench, n: float, loads: Loads) -> Iterator[tuple[Strip, float]]:
+    """Strips that bend by directors on every kind of mesh, with the loads of each width."""
+    for kind in KINDS:
+        for words, some in loads.items():
+            scene = partial(_directed, bench, kind, n, WIDTHS[words])
+            made = Strip(f"{kind}, {words} wide", WIDTHS[words] or 1.0 / n, 1.0, scene)
+            yield from ((made, load) for load in some)
+
+
+def _directed(
+    bench: Bench, kind: str, n: float, width: float, length: float = 1.0, **more: Any
+) -> dict[str, Any]:
+    given: dict[str, Any] = {"material": plate_material(MEMBRANE)} | more
+    return scene(
+        strip_mesh(bench, kind, n, width, length), handles=[{"group": "left", "clamp": True}], **given
+    )
+
+
+def _tip(trial: Trial) -> tuple[float, float]:
+    """Mean (x, −z) of the vertices of the free end over L: reach and drop."""
+    start = trial.start[:, 0]
+    x, _, z = trial.x[np.isclose(start, start.max(), rtol=1e-9)].mean(axis=0) / start.max()
+    return float(x), float(-z)
+
+
+def _compared(bench: Bench, scene: dict[str, Any], exact: Cantilever, words: str) -> Iterator[Measured]:
+    """Drop and reach of the tip, both errors relative to the way the tip went."""
+    with bench.simulation(scene) as trial:
+        reach, drop = _tip(trial.run())
+    way = float(np.hypot(exact.drop, 1.0 - exact.reach))
+    yield Measured(f"drop / L, {words}", drop, exact.drop, scale=way)
+    yield Measured(f"reach / L, {words}", reach, exact.reach, scale=way)
+
+
+TIP_LOAD = (
+    "elastica by collocation; K. E. Bisshopp and D. C. Drucker, Quart. Appl. Math. 3 (1945) 272-275, with "
+    "T = C (λ³ − λ)/2 for the stretch"
+)
+
+
+def _tip_loads(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[Measured]:
+    for each, load in strips:
+        # the scene's force is the total over the width
+        force = [{"group": "right", "force": [0, 0, -load * each.stiffness * each.width]}]
+        exact = cantilever(0.0, tip_load=load, stretch=each.stiffness / MEMBRANE)
+        yield from _compared(bench, each.scene(loads=force), exact, f"{each.words}, α = {load:g}")
 
 
 @case(
     "Clamped strip with a load at the tip, α = P L²/B_effective: tip against the elastica with the "
     "strip's stretch; error over the way of the tip",
-    source=(
-        "elastica by collocation; K. E. Bisshopp and D. C. Drucker, Quart. Appl. Math. 3 (1945) 272-275, "
-        "with T = C (λ³ − λ)/2 for the stretch"
-    ),
     claim=at_finest(2e-3),
-    **STRIPS,
+    source=TIP_LOAD,
+    **HINGED,
 )
 def tip_load(bench: Bench, n: float) -> Sequence[Measured]:
-    def run(pattern: str, load: float) -> tuple[dict[str, Any], Cantilever, str]:
-        stiffness = expected(pattern)
-        # the scene's force is the total over the strip's width of one cell
-        force = [{"group": "right", "force": [0, 0, -load * stiffness / n]}]
-        exact = cantilever(0.0, tip_load=load, stretch=stiffness / MEMBRANE)
-        return strip(pattern, n, loads=force), exact, f"{pattern}, α = {load:g}"
-
-    return _tips(bench, n, (run(pattern, load) for pattern in PATTERNS for load in LOADS))
+    """α = P L² / B_effective, P per width."""
+    return [*_tip_loads(bench, hinged(n, dict.fromkeys(PATTERNS, (0.25, 1.0, 4.0, 10.0, 50.0))))]
 
 
-WEIGHTS = (0.1, 1.0, 10.0, 100.0, 1e3, 1e4)
-"""Γ = w L³ / B_effective"""
+@case(
+    "Strip that bends by directors, with a load at the tip, α = P L²/B: tip against the elastica with the "
+    "strip's stretch; error over the way of the tip",
+    source=TIP_LOAD,
+    **DIRECTED,
+)
+def elastica_tip(bench: Bench, n: float) -> Iterator[Measured]:
+    """α = P L²/B for each width, P per width."""
+    loads = {"one cell": (1.0, 50.0), "0.1 L": (4.0,), "0.25 L": (10.0,)}
+    yield from _tip_loads(bench, directed(bench, n, loads))
+
+
+WEIGHT = (
+    "heavy elastica by collocation; test of Romero et al., ACM Trans. Graph. 40(4):66 (2021); with "
+    "T = C (λ³ − λ)/2 for the stretch"
+)
+
+
+def _weights(bench: Bench, strips: Iterator[tuple[Strip, float]]) -> Iterator[Measured]:
+    for each, weight in strips:
+        exact = cantilever(weight, stretch=each.stiffness / MEMBRANE)
+        scene = each.scene(gravity=[0, 0, -weight * each.stiffness / DENSITY])
+        yield from _compared(bench, scene, exact, f"{each.words}, Γ = {weight:g}")
 
 
 @case(
     "Clamped strip under its own weight, Γ = w L³/B_effective: tip against the heavy elastica with the "
     "strip's stretch; error over the way of the tip",
-    source=(
-        "heavy elastica by collocation; test of Romero et al., ACM Trans. Graph. 40(4):66 (2021); with "
-        "T = C (λ³ − λ)/2 for the stretch"
-    ),
     claim=at_finest(2e-3),
-    **STRIPS,
+    source=WEIGHT,
+    **HINGED,
 )
 def heavy_cantilever(bench: Bench, n: float) -> Sequence[Measured]:
-    def run(pattern: str, weight: float) -> tuple[dict[str, Any], Cantilever, str]:
-        stiffness = expected(pattern)
-        exact = cantilever(weight, stretch=stiffness / MEMBRANE)
-        scene = strip(pattern, n, gravity=[0, 0, -weight * stiffness / DENSITY])
-        return scene, exact, f"{pattern}, Γ = {weight:g}"
-
-    return _tips(bench, n, (run(pattern, weight) for pattern in PATTERNS for weight in WEIGHTS))
+    """Γ = w L³ / B_effective."""
+    return [*_weights(bench, hinged(n, dict.fromkeys(PATTERNS, (0.1, 1.0, 10.0, 100.0, 1e3, 1e4))))]
 
 
-# -- rest curvature --------------------------------------------------------------------------------------
+@case(
+    "Strip that bends by directors, under its own weight, Γ = w L³/B: tip against the heavy elastica with "
+    "the strip's stretch; error over the way of the tip",
+    source=WEIGHT,
+    **DIRECTED,
+)
+def elastica_weight(bench: Bench, n: float) -> Iterator[Measured]:
+    """Γ = w L³/B for each width."""
+    weights = {"one cell": (1.0, 1000.0), "0.1 L": (10.0,), "0.25 L": (100.0,)}
+    yield from _weights(bench, directed(bench, n, weights))
+
+
+# -- rolled up -------------------------------------------------------------------------------------------
 
 TURNS = {"diagonal": (0.25, 1.0), "alternating": (0.25, 0.5), "criss-cross": (0.25, 0.5)}
 """Parts of a full circle for each pattern of mesh."""
@@ -132,15 +222,34 @@ def _of_arcs() -> dict[str, Claim]:
     source="closed form; the shape of K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551",
     claim=Converges(2.0, 1e-4),
     claims=_of_arcs(),
-    **STRIPS,
+    **HINGED,
 )
 def roll_up(bench: Bench, n: float) -> Sequence[Measured]:
-    def run(pattern: str, turns: float) -> tuple[dict[str, Any], Cantilever, str]:
+    found: list[Measured] = []
+    for each, turns in hinged(n, TURNS):
         curved = {"rest_curvature": [-2.0 * math.pi * turns, 0.0, 0.0]}
         # without tension or weight the membrane stretches nothing, and a softer one is found sooner
-        return strip(pattern, n, 1e4, material=curved), _arc(turns), _part(pattern, turns)
+        scene = each.scene(membrane=1e4, material=curved)
+        found += _compared(bench, scene, _arc(turns), _part(each.words, turns))
+    return found
 
-    return _tips(bench, n, (run(pattern, turns) for pattern, parts in TURNS.items() for turns in parts))
+
+@case(
+    "Strip that bends by directors, rolled up by the moment 2π f B/L at its end: tip against the arc; "
+    "error over the way of the tip",
+    source="closed form; K. Y. Sze, X. H. Liu, S. H. Lo, Finite Elem. Anal. Des. 40 (2004) 1551, section 3.2",
+    # facets of criss-cross cells that bend far lie flat only in finer meshes
+    claims={
+        f"{side} / L, criss-cross, one cell wide, f = 1": Converges(4.0, 3e-3, slack=math.inf)
+        for side in ("drop", "reach")
+    },
+    **DIRECTED,
+)
+def elastica_roll_up(bench: Bench, n: float) -> Iterator[Measured]:
+    """f = M L/(2π B) for each width: parts of a full circle."""
+    for each, turns in directed(bench, n, {"one cell": (0.25, 1.0), "0.1 L": (0.5,), "0.25 L": (0.5,)}):
+        scene = each.scene(loads=[{"group": "right", "moment": -2.0 * math.pi * turns}])
+        yield from _compared(bench, scene, _arc(turns), f"{each.words}, f = {turns:g}")
 
 
 # -- strips that twist -----------------------------------------------------------------------------------
@@ -157,7 +266,7 @@ STIFF = 1e7
     "bending twists it; error over the way of the tip",
     source="Kirchhoff rod with bend-twist coupling, its stiffness by hand from the hinges of a cell",
     claim=at_finest(2e-3),
-    **STRIPS,
+    **HINGED,
 )
 def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
     found: list[Measured] = []
@@ -180,37 +289,57 @@ def coiling_strip(bench: Bench, n: float) -> Sequence[Measured]:
 
 # -- the cloth maker's test ------------------------------------------------------------------------------
 
-ANGLES = (7.1, 41.5, 45.0)
-"""Of the chord from the clamp to the tip, degrees below the horizontal; 41.5 is the standard's."""
-
 BENDING_LENGTH, CLOTH_DENSITY, GRAVITY = 0.02, 0.15, 9.81
 """c [m], kg/m², m/s²; the cloth's flexural rigidity is w c³ with its weight w [N/m²]."""
+
+RIGIDITY = CLOTH_DENSITY * GRAVITY * BENDING_LENGTH**3
+
+OVERHANG = "ASTM D1388, option A, and ISO 9073-7 (angle, G = w c³); overhangs from the exact heavy elastica"
+
+
+def _overhangs(
+    bench: Bench, strips: Iterator[tuple[Strip, float]], cloth: Callable[[Strip, float], dict[str, Any]]
+) -> Iterator[Measured]:
+    """Angles of the chord from the clamp to the tip, degrees below the horizontal; 41.5 is the standard's."""
+    for each, angle in strips:
+        with bench.simulation(cloth(each, BENDING_LENGTH * overhang_weight(angle) ** (1.0 / 3.0))) as trial:
+            reach, drop = _tip(trial.run())
+        reached = math.degrees(math.atan2(drop, reach))
+        yield Measured(f"angle of the chord, {each.words}, overhang for {angle:g}°", reached, angle, "°")
 
 
 @case(
     "Cantilever test of cloth: with B = w c³, corrected for the mesh, the chord must reach the angle "
     "that belongs to the overhang (41.5° at 2.0003 c)",
-    source="ASTM D1388, option A, and ISO 9073-7 (angle, G = w c³); overhangs from the exact heavy elastica",
     claim=at_finest(2e-3),
-    **STRIPS,
+    source=OVERHANG,
+    **HINGED,
 )
 def cloth_overhang(bench: Bench, n: float) -> Sequence[Measured]:
-    found = []
-    rigidity = CLOTH_DENSITY * GRAVITY * BENDING_LENGTH**3
-    for pattern in PATTERNS:
-        for angle in ANGLES:
-            overhang = BENDING_LENGTH * overhang_weight(angle) ** (1.0 / 3.0)
-            material = {
-                "density": CLOTH_DENSITY,
-                "membrane": isotropic(MEMBRANE * rigidity / overhang**2),
-                # what the mesh makes of B is known, hence corrected
-                "bending": rigidity / expected(pattern),
-            }
-            scene = strip(pattern, n, material=material, gravity=[0, 0, -GRAVITY])
-            scene["mesh"]["grid"] |= {"width": overhang, "height": overhang / round(n)}
-            with bench.simulation(scene) as trial:
-                reach, drop = tip(trial.run(), n)
-            reached = math.degrees(math.atan2(drop, reach))
-            words = f"angle of the chord, {pattern}, overhang for {angle:g}°"
-            found.append(Measured(words, reached, angle, "°"))
-    return found
+    def cloth(each: Strip, overhang: float) -> dict[str, Any]:
+        material = {
+            "density": CLOTH_DENSITY,
+            "membrane": isotropic(MEMBRANE * RIGIDITY / overhang**2),
+            # what the mesh makes of B is known, hence corrected
+            "bending": RIGIDITY / each.stiffness,
+        }
+        scene = each.scene(material=material, gravity=[0, 0, -GRAVITY])
+        scene["mesh"]["grid"] |= {"width": overhang, "height": overhang * each.width}
+        return scene
+
+    return [*_overhangs(bench, hinged(n, dict.fromkeys(PATTERNS, (7.1, 41.5, 45.0))), cloth)]
+
+
+@case(
+    "Cantilever test of cloth that bends by directors: with B = w c³ the chord must reach the angle that "
+    "belongs to the overhang (41.5° at 2.0003 c)",
+    source=OVERHANG,
+    **DIRECTED,
+)
+def elastica_overhang(bench: Bench, n: float) -> Iterator[Measured]:
+    def cloth(each: Strip, overhang: float) -> dict[str, Any]:
+        material = plate_material(MEMBRANE * RIGIDITY / overhang**2, RIGIDITY) | {"density": CLOTH_DENSITY}
+        return each.scene(length=overhang, material=material, gravity=[0, 0, -GRAVITY])
+
+    angles = {"one cell": (7.1, 41.5), "0.1 L": (45.0,), "0.25 L": (41.5,)}
+    yield from _overhangs(bench, directed(bench, n, angles), cloth)

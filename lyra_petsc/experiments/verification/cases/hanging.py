@@ -16,7 +16,9 @@ from lyra_petsc.experiments.verification.answers import (
     case,
     data,
     farthest,
+    grid,
     isotropic,
+    scene,
 )
 from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
 
@@ -30,14 +32,9 @@ STIFFNESS = 100.0
 
 
 def _by_one_end(n: int, density: float, held: dict[str, Any], **more: Any) -> dict[str, Any]:
-    grid = {"width": LENGTH, "height": WIDTH, "nx": n, "ny": 1, **more.pop("grid", {})}
-    return {
-        "mesh": {"grid": grid},
-        "material": {"density": density, "membrane": isotropic(STIFFNESS)},
-        "handles": [held, {"group": "sheet", "axes": ["z"]}],
-        "time": {"analysis": "static"},
-        **more,
-    }
+    mesh = grid(LENGTH, WIDTH, n, 1, more.pop("pattern", "diagonal"))
+    material = {"density": density, "membrane": isotropic(STIFFNESS)}
+    return scene(mesh, material, handles=[held, {"group": "sheet", "axes": ["z"]}], **more)
 
 
 @case(
@@ -76,9 +73,9 @@ def hanging_strip_chain(bench: Bench, n: float) -> Iterator[Measured]:
 )
 def hanging_strip(bench: Bench, n: float) -> Iterator[Measured]:
     for e, exact in HANGING["strip"]["rows"]:
-        density, grid = e * STIFFNESS / (G * LENGTH), {"pattern": "criss-cross"}
-        scene = _by_one_end(int(n), density, {"group": "left"}, grid=grid, gravity=[G, 0, 0])
-        with bench.simulation(scene) as trial:
+        density, held = e * STIFFNESS / (G * LENGTH), {"group": "left"}
+        hanging = _by_one_end(int(n), density, held, pattern="criss-cross", gravity=[G, 0, 0])
+        with bench.simulation(hanging) as trial:
             x = trial.run().x
         end = float(x[[int(n), 2 * int(n) + 1], 0].mean()) - LENGTH
         yield Measured(f"elongation, weight {e:g} of c11", end, exact * LENGTH, "m")

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data
+from lyra_petsc.experiments.verification.answers import (
+    ASSEMBLED,
+    Converges,
+    Exact,
+    Measured,
+    case,
+    data,
+    grid,
+    scene,
+)
 from lyra_petsc.experiments.verification.flat_sheet import (
     hinge_blocks,
     sheet_stiffness,
@@ -21,18 +30,10 @@ from lyra_petsc.experiments.verification.strips import DENSITY, strip
 PATTERNS = ("diagonal", "alternating", "criss-cross")
 
 
-def _grid(width: float, height: float, nx: int, ny: int, pattern: str) -> dict[str, Any]:
-    return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": pattern}}
-
-
 def _plate(mesh: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A flat sheet with B = 1 N m."""
-    return {
-        "mesh": mesh,
-        "material": {"density": 1.0, "membrane": {"c11": 1, "c22": 1, "c12": 0, "c33": 0.5}, "bending": 1.0},
-        "time": {"end": 1.0, "step": 1.0},
-        **more,
-    }
+    material = {"density": 1.0, "membrane": {"c11": 1, "c22": 1, "c12": 0, "c33": 0.5}, "bending": 1.0}
+    return scene(mesh, material, ASSEMBLED, **more)
 
 
 # -- endless strips and sheets ---------------------------------------------------------------------------
@@ -67,7 +68,7 @@ def hinge_strip(bench: Bench, n: float) -> Sequence[Measured]:
     found = []
     for words, ratio in RATIOS.items():
         for pattern in PATTERNS:
-            with bench.simulation(_plate(_grid(6.0, round(n) * ratio, 6, round(n), pattern))) as trial:
+            with bench.simulation(_plate(grid(6.0, round(n) * ratio, 6, round(n), pattern))) as trial:
                 hinges, points = hinge_blocks(trial), trial.x[:, :2]
             value = strip_stiffness(hinges, points, start=2.0, period=2.0, width=n * ratio)
             found.append(Measured(f"B_effective / B, {pattern}, {words}", value, expected(pattern, ratio)))
@@ -111,8 +112,8 @@ def _equilateral(bench: Bench) -> dict[str, Any]:
 def hinge_sheet(bench: Bench, n: float) -> Sequence[Measured]:
     found = []
     for mesh, wanted in SHEET["D_over_k"].items():
-        grid = _equilateral(bench) if mesh == "equilateral" else _grid(CELLS, CELLS, CELLS, CELLS, mesh)
-        with bench.simulation(_plate(grid)) as trial:
+        made = _equilateral(bench) if mesh == "equilateral" else grid(CELLS, CELLS, CELLS, CELLS, mesh)
+        with bench.simulation(_plate(made)) as trial:
             hinges, points = hinge_blocks(trial), trial.x[:, :2]
         # k = B/6
         value = 6.0 * sheet_stiffness(hinges, points, (1.0 / n, 1.0 / n), n * _lattice(mesh))
@@ -147,7 +148,7 @@ def wide_strip(bench: Bench, n: float) -> Sequence[Measured]:
     along = round(n)
     for across in (2, 4):
         for pattern in PATTERNS:
-            mesh = _grid(1.0, across / along, along, across, pattern)
+            mesh = grid(1.0, across / along, along, across, pattern)
             with bench.simulation(strip(pattern, n) | {"mesh": mesh}) as trial:
                 operator, mass = stiffness(trial), trial.mass
             height = operator.solve(mass / DENSITY)
@@ -170,7 +171,7 @@ PLACE = {"CCCC": (0.5, 0.5), "SSSS": (0.5, 0.5), "CFFF": (1.0, 0.5)}
 
 def square_plate(edges: str, pattern: str, n: int) -> dict[str, Any]:
     """A unit square with B = 1 and a weight of 1 N/m²."""
-    return _plate(_grid(1.0, 1.0, n, n, pattern), handles=HANDLES[edges])
+    return _plate(grid(1.0, 1.0, n, n, pattern), handles=HANDLES[edges])
 
 
 @case(

@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import quarter_disc, rectangle
-from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data, isotropic
+from lyra_petsc.experiments.verification.answers import (
+    ASSEMBLED,
+    Converges,
+    Exact,
+    Measured,
+    case,
+    data,
+    grid,
+    isotropic,
+    scene,
+)
 from lyra_petsc.experiments.verification.spectrum import lowest_modes
 
 G = 9.81
@@ -34,20 +44,12 @@ RADIUS, STIFFNESS = 1.0, 1000.0
 def circular_membrane(bench: Bench, n: float) -> Iterator[Measured]:
     number = np.arange((int(n) + 1) ** 2).reshape(int(n) + 1, int(n) + 1)
     rim = np.unique(np.concatenate([number[-1], number[:, -1]]))
-    common = {
-        "mesh": bench.mesh(*quarter_disc(int(n), RADIUS)),
-        "gravity": [0, 0, -G],
-        # the rim, and the two planes of symmetry
-        "handles": [
-            {"nodes": rim.tolist()},
-            {"nodes": number[:, 0].tolist(), "axes": ["x"]},
-            {"nodes": number[0].tolist(), "axes": ["y"]},
-        ],
-        "time": {"analysis": "static"},
-    }
+    mesh, symmetry = bench.mesh(*quarter_disc(int(n), RADIUS)), {"x": number[:, 0], "y": number[0]}
+    held: list[dict[str, Any]] = [{"nodes": rim.tolist()}]
+    held += [{"nodes": nodes.tolist(), "axes": [axis]} for axis, nodes in symmetry.items()]
     for nu, e, exact in ROUND["rows"]:
         material = {"density": e * STIFFNESS / (G * RADIUS), "membrane": isotropic(STIFFNESS, nu)}
-        with bench.simulation(common | {"material": material}) as trial:
+        with bench.simulation(scene(mesh, material, gravity=[0, 0, -G], handles=held)) as trial:
             sag = -float(trial.run().x[0, 2])
         name = f"central deflection, ν = {nu:g}, load {e:g} C/a"
         yield Measured(name, sag, exact * RADIUS, "m")
@@ -67,13 +69,8 @@ def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[
     edge = np.unique(np.concatenate([number[0], number[-1], number[:, 0], number[:, -1]]))
     start = vertices * [STRETCHED["lam1"], STRETCHED["lam2"], 0.0]
     membrane = {name.lower(): STRETCHED[name] for name in ("C11", "C22", "C12", "C33")}
-    return {
-        "mesh": bench.mesh(start, triangles, rest=vertices[:, :2]),
-        "material": {"density": STRETCHED["rho"], "membrane": membrane},
-        "handles": [{"nodes": edge.tolist()}],
-        "time": time,
-        **more,
-    }
+    mesh, material = bench.mesh(start, triangles, rest=vertices[:, :2]), {"density": STRETCHED["rho"]}
+    return scene(mesh, material | {"membrane": membrane}, time, handles=[{"nodes": edge.tolist()}], **more)
 
 
 @case(
@@ -85,7 +82,7 @@ def _stretched(bench: Bench, n: int, time: dict[str, Any], **more: Any) -> dict[
     counts="cells along the longer side",
 )
 def stretched_membrane(bench: Bench, n: float) -> Sequence[Measured]:
-    with bench.simulation(_stretched(bench, int(n), {"end": 1.0, "step": 1.0})) as trial:
+    with bench.simulation(_stretched(bench, int(n), ASSEMBLED)) as trial:
         found, _ = lowest_modes(trial, len(MODES))
     return [
         Measured(f"ω of mode {mode}", float(omega), STRETCHED["omega"][mode], "rad/s")
@@ -169,21 +166,12 @@ STIFF = 1e6
     counts="cells along the strip",
 )
 def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
-    scene = {
-        "mesh": {"grid": {"width": WIDTH, "height": LENGTH, "nx": 2, "ny": int(n)}},
-        "material": {"density": DENSITY, "membrane": isotropic(STIFF)},
-        "gravity": [0, -G, 0],
-        # a membrane pulled in one direction only does not feel its neighbours on either side: of the
-        # three columns of vertices the middle one, whose masses are those of a wide sheet, is free
-        "handles": [
-            {"group": "top"},
-            {"group": "sheet", "axes": ["x"]},
-            {"group": "left", "axes": ["z"]},
-            {"group": "right", "axes": ["z"]},
-        ],
-        "time": {"end": 1.0, "step": 1.0},
-    }
-    with bench.simulation(scene) as trial:
+    # a membrane pulled in one direction only does not feel its neighbours on either side: of the three
+    # columns of vertices the middle one, whose masses are those of a wide sheet, is free
+    kept = {"sheet": "x", "left": "z", "right": "z"}
+    held = [{"group": "top"}, *({"group": name, "axes": [axis]} for name, axis in kept.items())]
+    mesh, material = grid(WIDTH, LENGTH, 2, int(n)), {"density": DENSITY, "membrane": isotropic(STIFF)}
+    with bench.simulation(scene(mesh, material, ASSEMBLED, gravity=[0, -G, 0], handles=held)) as trial:
         x = trial.start
         trial.set_state(x=np.column_stack([x[:, 0], _hanging(x[:, 1], n), x[:, 2]]))
         found, _ = lowest_modes(trial, 3)

@@ -18,7 +18,9 @@ from lyra_petsc.experiments.verification.answers import (
     case,
     data,
     farthest,
+    grid,
     isotropic,
+    scene,
 )
 
 # -- falls -----------------------------------------------------------------------------------------------
@@ -28,12 +30,9 @@ FALL = data("free_fall")
 
 def _sheet(nx: int, n: float, end: float, density: float, **more: Any) -> dict[str, Any]:
     """A sheet that nothing holds, stepped by 1/n s."""
-    return {
-        "mesh": {"grid": {"width": 1.0, "height": 0.6, "nx": nx, "ny": 3, "pattern": "alternating"}},
-        "material": {"density": density, "membrane": {"c11": 1200, "c22": 800, "c12": 300, "c33": 250}},
-        "time": {"end": end, "step": 1.0 / n},
-        **more,
-    }
+    material = {"density": density, "membrane": {"c11": 1200, "c22": 800, "c12": 300, "c33": 250}}
+    time = {"end": end, "step": 1.0 / n}
+    return scene(grid(1.0, 0.6, nx, 3, "alternating"), material, time, **more)
 
 
 @case(
@@ -137,13 +136,10 @@ def _sprung_sheet(time: dict[str, Any]) -> dict[str, Any]:
     triangle's mass is on each of its corners, and so is a third of its share of stiffness.
     """
     third = SPRING_DENSITY * 0.5 / 3.0 * OMEGA**2
-    return {
-        "mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}},
-        "material": {"density": SPRING_DENSITY, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}},
-        "handles": [{"nodes": [0, 3], "stiffness": 2.0 * third}, {"nodes": [1, 2], "stiffness": third}],
-        "initial": {"velocity": [0, 0, 1]},
-        "time": time,
-    }
+    material = {"density": SPRING_DENSITY, "membrane": {"c11": 50, "c22": 50, "c12": 0, "c33": 20}}
+    springs = [{"nodes": [0, 3], "stiffness": 2.0 * third}, {"nodes": [1, 2], "stiffness": third}]
+    initial = {"velocity": [0, 0, 1]}
+    return scene(grid(1.0, 1.0, 1, 1), material, time, handles=springs, initial=initial)
 
 
 def _states(trial: Trial) -> NDArray[np.complex128]:
@@ -240,12 +236,9 @@ def _backward_euler(n: float) -> tuple[float, float]:
 def rigid_rotation(bench: Bench, n: float) -> Sequence[Measured]:
     corners = 0.5 * np.pi + 2.0 / 3.0 * np.pi * np.arange(3)
     vertices = RADIUS * np.column_stack([np.cos(corners), np.sin(corners), np.zeros(3)])
-    scene = {
-        "mesh": bench.mesh(vertices, np.array([[0, 1, 2]])),
-        "material": {"density": TRIANGLE_DENSITY, "membrane": isotropic(_stiffness(n))},
-        "time": {"end": STEPS * DT, "step": DT},
-    }
-    with bench.simulation(scene) as trial:
+    mesh = bench.mesh(vertices, np.array([[0, 1, 2]]))
+    material = {"density": TRIANGLE_DENSITY, "membrane": isotropic(_stiffness(n))}
+    with bench.simulation(scene(mesh, material, {"end": STEPS * DT, "step": DT})) as trial:
         v = _first_velocity(n)
         radial = vertices / RADIUS
         trial.set_state(v=v.real * radial + v.imag * np.cross([0.0, 0.0, 1.0], radial))

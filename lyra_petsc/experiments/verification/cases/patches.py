@@ -9,7 +9,16 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import irregular_rectangle
-from lyra_petsc.experiments.verification.answers import Exact, Measured, case, data, farthest
+from lyra_petsc.experiments.verification.answers import (
+    ASSEMBLED,
+    STATIC,
+    Exact,
+    Measured,
+    case,
+    data,
+    farthest,
+    scene,
+)
 
 DATA = data("patch_states")
 WIDTH, HEIGHT = 1.0, 0.7
@@ -23,12 +32,8 @@ TILT = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
 
 
 def _scene(mesh: dict[str, Any], material: str, **more: Any) -> dict[str, Any]:
-    return {
-        "mesh": mesh,
-        "material": {"density": 0.2, "membrane": DATA["materials"][material]},
-        "time": {"end": 1.0, "step": 1.0},
-        **more,
-    }
+    shell = {"density": 0.2, "membrane": DATA["materials"][material]}
+    return scene(mesh, shell, **{"time": ASSEMBLED} | more)
 
 
 @case(
@@ -96,7 +101,7 @@ def uniaxial_pull(bench: Bench, n: float) -> Iterator[Measured]:
     ]  # fmt: skip
     for material, along, across, pull in DATA["uniaxial"]["rows"]:
         pulled = [{"time": 0}, {"time": 1, "translate": [(along - 1.0) * WIDTH, 0, 0]}]
-        static = {"handles": handles, "motions": {"pull": pulled}, "time": {"analysis": "static"}}
+        static = {"handles": handles, "motions": {"pull": pulled}, "time": STATIC}
         with bench.simulation(_scene(mesh, material, **static)) as trial:
             trial.run()
             problem = trial.simulation.problem

@@ -10,13 +10,23 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import SIDES
-from lyra_petsc.experiments.verification.answers import Converges, Exact, Measured, case, data, farthest
+from lyra_petsc.experiments.verification.answers import (
+    STATIC,
+    Converges,
+    Exact,
+    Measured,
+    case,
+    data,
+    farthest,
+    scene,
+)
 from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, plate_material
 from lyra_petsc.terms.midedge import MidEdge
 
 Array = NDArray[np.float64]
 
 EXACT = data("linear_plate")
+AT_ONCE = STATIC | {"step": 1.0}
 HELD = {
     "CCCC": ("clamp", SIDES),
     "SSSS": ("pin", SIDES),
@@ -39,14 +49,14 @@ def plate(bench: Bench, n: float) -> Iterator[Measured]:
         how, sides = HELD[edges]
         load = LARGEST / exact["at"]
         for kind in KINDS:
-            scene = {
-                "mesh": flat_mesh(bench, kind, round(n), round(n)),
-                "material": plate_material(1.0, poisson=float(poisson)),
-                "gravity": [0.0, 0.0, load],
-                "handles": [{"group": side, "clamp": how == "clamp"} for side in sides],
-                "time": {"analysis": "static", "step": 1.0},
-            }
-            with bench.simulation(scene) as trial:
+            mesh, material = (
+                flat_mesh(bench, kind, round(n), round(n)),
+                plate_material(1.0, poisson=float(poisson)),
+            )
+            held = [{"group": side, "clamp": how == "clamp"} for side in sides]
+            with bench.simulation(
+                scene(mesh, material, AT_ONCE, gravity=[0.0, 0.0, load], handles=held)
+            ) as trial:
                 height, start = trial.run().x[:, 2], trial.start[:, :2]
             at = int(np.argmin(np.linalg.norm(start - exact["place"], axis=1)))
             value = float(height[at]) / LARGEST
@@ -93,14 +103,12 @@ def plate_curvature(bench: Bench, n: float) -> Iterator[Measured]:
         }
         for words, (load, exact) in loads.items():
             for kind in KINDS:
-                scene = {
-                    "mesh": flat_mesh(bench, kind, round(n), round(n)),
-                    "material": plate_material(1.0, poisson=poisson),
-                    "loads": load,
-                    "handles": [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS],
-                    "time": {"analysis": "static", "step": 1.0},
-                }
-                with bench.simulation(scene) as trial:
+                mesh, material = (
+                    flat_mesh(bench, kind, round(n), round(n)),
+                    plate_material(1.0, poisson=poisson),
+                )
+                held = [_at(x, y) | {"axes": axes} for x, y, axes in CORNERS]
+                with bench.simulation(scene(mesh, material, AT_ONCE, loads=load, handles=held)) as trial:
                     found = _curvatures(bench, trial.run()) / SMALL
                 for k, name in enumerate(("κ11", "κ22", "κ12")):
                     value = farthest(found[:, k], exact[k])

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import Converges, Measured, at_finest, case, data
+from lyra_petsc.experiments.verification.answers import (
+    STATIC,
+    Converges,
+    Measured,
+    at_finest,
+    case,
+    data,
+    grid,
+    scene,
+)
 from lyra_petsc.experiments.verification.rods import cantilever
 
 Array = NDArray[np.float64]
@@ -30,15 +39,11 @@ STIFFNESS = 1.2e6 * 0.1**3 / 12.0
 """B [N·m]"""
 
 
-def increments(bench: Bench, scene: dict[str, Any], fraction: float) -> Iterator[tuple[float, Trial]]:
+def increments(bench: Bench, content: dict[str, Any], fraction: float) -> Iterator[tuple[float, Trial]]:
     """Every load factor of a static scene, with these increments, and the equilibrium there; collective."""
-    scene = scene | {
-        "gravity": [0, 0, 0],
-        "time": {"analysis": "static", "step": fraction},
-        "petsc": {"ts_adapt_dt_max": fraction, "ksp_rtol": 1e-6},
-        "solver": {"force_tolerance": 1e-6},
-    }
-    with bench.simulation(scene) as trial:
+    solver = {"solver": {"force_tolerance": 1e-6}, "petsc": {"ts_adapt_dt_max": fraction, "ksp_rtol": 1e-6}}
+    time = STATIC | {"step": fraction}
+    with bench.simulation(content | solver | {"gravity": [0, 0, 0], "time": time}) as trial:
         while not trial.simulation.finished:
             yield trial.step().time, trial
 
@@ -46,10 +51,8 @@ def increments(bench: Bench, scene: dict[str, Any], fraction: float) -> Iterator
 def sze_strip(kind: str, n: float, loads: list[dict[str, Any]]) -> dict[str, Any]:
     """A strip of Sze et al., of width 1 m, with n square cells along it."""
     length = LENGTHS[kind]
-    size = {"width": length, "height": 1.0, "nx": round(n), "ny": round(n / length)}
-    grid = size | {"pattern": "alternating"}
-    held = [{"group": "left", "clamp": True}]
-    return {"mesh": {"grid": grid}, "material": STRIP, "handles": held, "loads": loads}
+    mesh = grid(length, 1.0, round(n), round(n / length), "alternating")
+    return scene(mesh, STRIP, handles=[{"group": "left", "clamp": True}], loads=loads)
 
 
 def _tips(
@@ -115,13 +118,10 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
         {"nodes": edge[1:-1], "force": [0.0, 0.0, 3.2 * (n - 1) / n]},
         {"nodes": [edge[0], edge[-1]], "force": [0.0, 0.0, 3.2 / n]},
     ]
-    scene = {
-        "mesh": bench.mesh(vertices, faces[:, ::-1]),
-        "material": {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0},
-        "handles": [{"nodes": [each + around for each in edge], "clamp": True}],
-        "loads": loads,
-    }
-    return scene, (edge[0], edge[-1])
+    material = {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0}
+    held = [{"nodes": [each + around for each in edge], "clamp": True}]
+    made = scene(bench.mesh(vertices, faces[:, ::-1]), material, handles=held, loads=loads)
+    return made, (edge[0], edge[-1])
 
 
 @case(
@@ -137,10 +137,10 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
 def slit_annulus(bench: Bench, n: float) -> Sequence[Measured]:
     content = TABLES["slit_annulus"]
     table = {round(row[0], 6): row[1:] for row in content["rows"]}
-    scene, ends = slit_annulus_scene(bench, round(n))
+    plate, ends = slit_annulus_scene(bench, round(n))
     worst: list[Measured] = []
     height = np.zeros(2)
-    for factor, trial in increments(bench, scene, INCREMENT):
+    for factor, trial in increments(bench, plate, INCREMENT):
         height = trial.x[list(ends), 2]
         exact = table.get(round(factor, 6))
         if exact is not None:
@@ -180,19 +180,16 @@ def _curved(
     n: int,
     pattern: str,
     surface: Callable[[Array, Array], tuple[Array, Array, Array]],
-    scene: dict[str, Any],
+    material: dict[str, Any],
+    **more: Any,
 ) -> tuple[Array, Array]:
     """Places (V, 3) [m] of n × n cells on a surface, and how far they move; collective."""
     flat, faces = rectangle(n, n, 1.0, 1.0, alternating=pattern == "alternating")
     vertices = np.column_stack(surface(flat[:, 0], flat[:, 1]))
-    scene = {
-        "mesh": bench.mesh(vertices, faces),
-        "gravity": [0, 0, 0],
-        "time": {"analysis": "static", "step": 1.0},
-        "solver": {"force_tolerance": 1e-8},
-        "petsc": {"ksp_rtol": 1e-8},
-    } | scene
-    with bench.simulation(scene) as trial:
+    tight = {"solver": {"force_tolerance": 1e-8}, "petsc": {"ksp_rtol": 1e-8}}
+    given = {"gravity": [0, 0, 0]} | tight | more
+    shell = scene(bench.mesh(vertices, faces), material, STATIC | {"step": 1.0}, **given)
+    with bench.simulation(shell) as trial:
         return vertices, trial.run().x - vertices
 
 
@@ -216,13 +213,11 @@ def _cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Ar
 def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
     part, half = 1e-3, 25.0  # of the load, so small that the roof is linear to 1e-5
     for pattern in PATTERNS:
-        scene = {
-            "material": {"young": 4.32e8, "poisson": 0.0, "thickness": 0.25, "density": 1.0},
-            "gravity": [0.0, 0.0, -90.0 * part],
-            "handles": [*_symmetric("xy", 25.0), {"box": _on("y", half, 25.0), "axes": ["x", "z"]}],
-        }
+        material = {"young": 4.32e8, "poisson": 0.0, "thickness": 0.25, "density": 1.0}
+        gravity = [0.0, 0.0, -90.0 * part]
+        held = [*_symmetric("xy", 25.0), {"box": _on("y", half, 25.0), "axes": ["x", "z"]}]
         surface = _cylinder(25.0, math.radians(40.0), half)
-        _, way = _curved(bench, round(n), pattern, surface, scene)
+        _, way = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
         found = float(-way[round(n), 2]) / part
         yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
         yield Measured(f"deflection, {pattern}, deep shell", found, LINEAR["deep_roof"], "m")
@@ -244,17 +239,12 @@ ORDER = 1.5
 def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
     force = 100.0
     for pattern in PATTERNS:
-        scene = {
-            "material": {"young": 3e6, "poisson": 0.3, "thickness": 3.0, "density": 1.0},
-            "loads": [{"nodes": [0], "force": [0.0, 0.0, -force / 4.0]}],
-            "handles": [
-                {"box": _on("y", 300.0, 300.0), "axes": ["x", "z"]},
-                *_symmetric("xyz", 300.0),
-            ],
-        }
-        surface = _cylinder(300.0, 0.5 * math.pi, 300.0)
+        material = {"young": 3e6, "poisson": 0.3, "thickness": 3.0, "density": 1.0}
+        loads = [{"nodes": [0], "force": [0.0, 0.0, -force / 4.0]}]
+        held = [{"box": _on("y", 300.0, 300.0), "axes": ["x", "z"]}, *_symmetric("xyz", 300.0)]
+        given = (_cylinder(300.0, 0.5 * math.pi, 300.0), material)
         coarse, fine = (
-            float(-_curved(bench, cells, pattern, surface, scene)[1][0, 2]) / force
+            float(-_curved(bench, cells, pattern, *given, loads=loads, handles=held)[1][0, 2]) / force
             for cells in (round(n) // 2, round(n))
         )
         last = fine + (fine - coarse) / (2.0**ORDER - 1.0)
@@ -272,14 +262,9 @@ def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
 def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
     part, cells = 0.02, round(n)  # out and in, what is quadratic in the load cancels
     for pattern in PATTERNS:
-        scene = {
-            "material": {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0},
-            "loads": [
-                {"nodes": [0], "force": [part, 0.0, 0.0]},
-                {"nodes": [cells], "force": [0.0, -part, 0.0]},
-            ],
-            "handles": [*_symmetric("xy", 10.0), {"nodes": [cells // 2], "axes": ["z"]}],
-        }
+        material = {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0}
+        loads = [{"nodes": [0], "force": [part, 0.0, 0.0]}, {"nodes": [cells], "force": [0.0, -part, 0.0]}]
+        held = [*_symmetric("xy", 10.0), {"nodes": [cells // 2], "axes": ["z"]}]
 
         def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
             around, up = 0.5 * math.pi * s, math.radians(72.0) * t
@@ -289,6 +274,6 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
                 10.0 * np.sin(up),
             )
 
-        _, way = _curved(bench, cells, pattern, surface, scene)
+        _, way = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
         mean = 0.5 * float(way[0, 0] - way[cells, 1]) / part
         yield Measured(f"way of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import SIDES
-from lyra_petsc.experiments.verification.answers import Measured, at_finest, case, data
+from lyra_petsc.experiments.verification.answers import ASSEMBLED, Measured, at_finest, case, data, scene
 from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, plate_material
 from lyra_petsc.experiments.verification.spectrum import lowest_modes
 
@@ -35,17 +35,12 @@ def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
         for words, exact in EXACT[shape].items():
             edges, poisson = words.split()
             for kind in KINDS:
-                scene = {
-                    "mesh": flat_mesh(bench, kind, round(finer * n), round(finer * n * height), 1.0, height),
-                    "material": plate_material(1.0, poisson=float(poisson)),
-                    "handles": [
-                        {"group": "sheet", "axes": ["x", "y"]},
-                        *({"group": side, "clamp": True} for side in CLAMPED[edges]),
-                    ],
-                    "time": {"end": 1.0, "step": 1.0},
-                }
-                rigid = 0 if CLAMPED[edges] else 3
-                with bench.simulation(scene) as trial:
+                mesh = flat_mesh(bench, kind, round(finer * n), round(finer * n * height), 1.0, height)
+                clamped = [{"group": side, "clamp": True} for side in CLAMPED[edges]]
+                held = [{"group": "sheet", "axes": ["x", "y"]}, *clamped]
+                material = plate_material(1.0, poisson=float(poisson))
+                rigid = 0 if clamped else 3
+                with bench.simulation(scene(mesh, material, ASSEMBLED, handles=held)) as trial:
                     found, _ = lowest_modes(trial, rigid + len(exact), shift=SHIFT if rigid else 0.0)
                 for number, (omega, wanted) in enumerate(zip(found[rigid:], exact, strict=True), 1):
                     name = f"λ{number}, {shape}, {edges}, ν = {poisson}, {kind}"
