@@ -437,7 +437,7 @@ def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape, what: str) 
         a, b = edges[number.ravel()[steep[0]]]
         raise InputError(
             f"the {what} is folded by 179.9° or more at the edge of vertices {a} and {b}, and bending_model: "
-            "midedge cannot tell to which side; open the fold (or, where several sheets meet, turn one over), "
+            "midedge cannot tell to which side; open the fold (or, where sheets meet, turn one over), "
             "or take bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
