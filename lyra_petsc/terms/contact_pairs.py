@@ -432,3 +432,11 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
             left = d - offset[e]
         most = min(most, t)
     return most
+
+
+@kernel()
+def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
+    """What `free_way` gives for each of the first len(out) pairs alone."""
+    for e in range(len(out)):
+        one = slice(e, e + 1)
+        out[e] = free_way(x, others, way, others_way, kind[one], points[one], offset[one], keep, 1.0)
