@@ -30,6 +30,7 @@ from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.stepping.initial_state import check_resolved, start_positions, start_velocities
 from lyra_petsc.stepping.integrators import integrator_of
+from lyra_petsc.stepping.near_pairs import nearest_pair
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.motion import Motion, Window, motion_of
@@ -214,6 +215,12 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
+    if scene.contact is not None:
+        from lyra_petsc.mesh.obstacles import made as made_obstacles
+        from lyra_petsc.mesh.start_crossings import refuse_crossings  # with kernels
+
+        obstacles = made_obstacles(scene, mesh.obstacles, Motion)
+        refuse_crossings(scene, mesh, data.get("start", mesh.positions), obstacles)
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     outline = Outline(
@@ -328,6 +335,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     for term in system.active.elastic:
         term.begin(system.x)
     system.rest_at(0.0)
+    refuse_contact(system, scene, "at the start")
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Problem(
         scene,
@@ -342,6 +350,27 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
         data.get("tag"),
         system.x[rows].copy() if "displacement" in scene.output.fields else None,
     )
+
+
+def refuse_contact(system: StageEquations, scene: Scene, when: str) -> None:
+    """Refuse a state, named by ``when``, in which contact has what is not apart; collective.
+
+    Raises
+    ------
+    InputError
+        Where it is worst.
+    """
+    near = nearest_pair(system)
+    if near is not None and not near.gap > 0.0:
+        apart, remedy = "not apart", "move them apart"
+        if near.kept > 0.0:
+            apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
+            apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
+        raise InputError(
+            f"{when} {near.words} are {apart}; {remedy}",
+            file=scene.source,
+            key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
+        )
 
 
 def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:

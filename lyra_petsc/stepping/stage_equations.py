@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property, partial, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -44,6 +44,22 @@ Array = NDArray[np.float64]
 
 LEAST = 1e-6
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
+
+
+class RefusedWay(NamedTuple):
+    """What may not be gone because something meets there.
+
+    Attributes
+    ----------
+    x, ahead : (n_local, 3)
+        Where it begins and how far it goes [m].
+    carried : bool
+        Obstacles go theirs in the step, too; else they stand where they do at the stage.
+    """
+
+    x: Array
+    ahead: Array
+    carried: bool
 
 
 class StageEquations:
@@ -81,7 +97,11 @@ class StageEquations:
         Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
     active : ActiveTerms
     applied : AppliedLoads
+    refused_way : RefusedWay or None
+        What the present step may not go.
     """
+
+    refused_way: RefusedWay | None = None
 
     def __init__(
         self,
@@ -151,16 +171,18 @@ class StageEquations:
         self.reference.until(time, self.x)
 
     def rest_at(self, time: float) -> None:
-        """Let moving targets stand where they are at ``time`` [s], between two steps."""
+        """Let moving targets stand where they are at ``time`` [s], between two steps; collective."""
         self.t0 = self.t1 = time
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
+        self._follow(self.x)  # energies at the start of a run are those of all stencils
 
     # -- a step ------------------------------------------------------------------------------------
 
     def begin_step(self, t0: float, t1: float) -> None:
         """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
+        self.refused_way = None
         self.new_iterate(None)
         self._follow(self.x)
         after = self.integrator.stage_after(self.dt)
@@ -400,7 +422,10 @@ class StageEquations:
         x, ahead = self._ahead(here, there - here)
         free = all(term.lets_pass(x, ahead, self.active.frozen[term]) for term in self.active.limiting)
         free &= self.discretisation.largest_step(x, ahead) == 1.0
-        return not self.points.comm.allreduce(int(not free), MPI.MAX)
+        if not self.points.comm.allreduce(int(not free), MPI.MAX):
+            return True
+        self.refused_way = RefusedWay(x.copy(), ahead, carried=True)
+        return False
 
     def may_end(self, v: Array) -> bool:
         """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
@@ -412,8 +437,14 @@ class StageEquations:
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
         if self.integrator.lagged_loads:  # one linear solve has found it
             v = self.velocity_of_staying()
-        from_x = self.evaluate_at(v)[0][:n]
-        return self.largest_step(v, (end - from_x) / self.stage.reach) == 1.0
+        from_x = self.evaluate_at(v)[0].copy()
+        way = end - from_x[:n]
+        if self.largest_step(v, way / self.stage.reach) == 1.0:
+            return True
+        ahead = fitted(way, n, self.points.n_local)
+        self.points.update_ghosts(ahead)
+        self.refused_way = RefusedWay(from_x, ahead, carried=False)
+        return False
 
     # -- what Newton asks for ----------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, UpcomingStep
+from lyra_petsc.terms.term import Elastic, Pair, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -303,8 +303,25 @@ class Contact(Elastic):
         found: Array = out - self.offset
         return found
 
+    def gaps(self, x: Array, frozen: Places) -> Array:
+        return self.distances(x, frozen.now)[: self.n_owned]
+
+    def free_parts(self, x: Array, way: Array, frozen: Places, *, carried: bool) -> Array:
+        others = frozen.before if carried else frozen.now
+        theirs = frozen.now - frozen.before if carried else np.zeros_like(frozen.now)
+        pairs, out = (self.kind, self.points, self._offset), np.empty(self.n_owned)
+        contact_pairs.free_ways(x, others, way, theirs, *pairs, KEPT, out)
+        return out
+
+    def pair(self, element: int) -> Pair:
+        points, begins = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
+        parts = (tuple(points[:begins]), tuple(points[begins:]))
+        number = int(self.obstacle[element])
+        name = self.obstacles.each[number].name if number >= 0 else ""
+        return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
+
     def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
-        left = self.distances(x, frozen.now)[: self.n_owned]
+        left = self.gaps(x, frozen)
         count = float((left < self.barrier.gap).sum())
         return {"contacts": count, "smallest_gap": float(left.min(initial=np.inf))}
 

@@ -452,3 +452,11 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, no
             for i in range(4):
                 g += beta[e, i] * p[i, k]
             normal[e, k] = g / d
+
+
+@kernel()
+def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
+    """What `free_way` gives for each of the first len(out) pairs alone."""
+    for e in range(len(out)):
+        one = slice(e, e + 1)
+        out[e] = free_way(x, others, way, others_way, kind[one], points[one], offset[one], keep, 1.0)

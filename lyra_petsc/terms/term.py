@@ -68,6 +68,24 @@ class UpcomingStep:
     reference: Callable[[float, Ints], Array]
 
 
+class Pair(NamedTuple):
+    """Two parts that an element keeps apart.
+
+    Attributes
+    ----------
+    parts : tuple of tuples of int
+        Local rows of the vertices of each part of a sheet.
+    obstacle : str
+        The other part, where ``parts`` has one alone: the name of an obstacle.
+    kept : float
+        Distance [m] that counts as none.
+    """
+
+    parts: tuple[tuple[int, ...], ...]
+    obstacle: str
+    kept: float
+
+
 class Term(ABC):
     """A sum over elements; what it is to the rest of the program stands in its registration.
 
@@ -219,6 +237,24 @@ class Elastic(Term):
     def lets_pass(self, x: Array, way: Array, frozen: Any) -> bool:
         """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in the step."""
         return True
+
+    def gaps(self, x: Array, frozen: Any) -> Array:
+        """Distance less what is to be kept [m] of the parts of each owned element, (n_owned,).
+
+        Empty where elements keep nothing apart.
+        """
+        return np.empty(0)
+
+    def free_parts(self, x: Array, way: Array, frozen: Any, *, carried: bool) -> Array:
+        """Fraction, up to 1, of the way (n_local, 3) [m] from x that each owned element lets go, (n_owned,).
+
+        ``carried``: obstacles go theirs in the step meanwhile, as for `lets_pass`. Empty as for `gaps`.
+        """
+        return np.empty(0)
+
+    def pair(self, element: int) -> Pair:
+        """What an element keeps apart."""
+        raise NotImplementedError
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""

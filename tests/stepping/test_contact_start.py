@@ -1,0 +1,131 @@
+"""What contact cannot begin with is refused, with the place."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+from physics import Simulation, grid, obj_file
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.terms.contact import Contact
+
+pytestmark = pytest.mark.parallel
+
+SHEET: dict[str, Any] = {"mesh": grid(1.0, 1.0, 4, 4), "contact": {"gap": 0.02}}
+"""In the plane z = 0, from x, y = 0 to 1."""
+
+
+def sheet(**changes: Any) -> dict[str, Any]:
+    return SHEET | changes
+
+
+def obstacle(**shape: Any) -> dict[str, Any]:
+    return sheet(obstacles={"thing": shape})
+
+
+def refusal(comm: MPI.Comm, scene: dict[str, Any]) -> str:
+    """The message, the same on all ranks."""
+    with pytest.raises(InputError) as caught, Simulation(scene, comm):
+        pass
+    text = str(caught.value)
+    assert comm.allgather(text) == [text] * comm.size
+    assert "\n" not in text
+    return text
+
+
+OVERLAPS: dict[str, tuple[dict[str, Any], str]] = {
+    "sphere": (
+        {"sphere": {"center": [0.4, 0.3, 0.05], "radius": 0.06}},
+        "1 triangle of the sheet reaches into it",
+    ),
+    "capsule that passes through": (
+        {"capsule": {"from": [0.42, 0.35, -1], "to": [0.42, 0.35, 1], "radius": 0.01}},
+        "1 triangle of the sheet reaches into it",
+    ),
+    "box around the sheet": ({"box": {"min": [-1, -1, -1], "max": [2, 2, 1]}}, "32 triangles of the sheet"),
+    "box that a triangle is around": (
+        {"box": {"min": [0.4, 0.33, -1], "max": [0.41, 0.34, 1]}},
+        "1 triangle",
+    ),
+    "plane": (
+        {"plane": {"point": [0.9, 0, 0], "normal": [-1, 0, 0]}},
+        "8 triangles of the sheet reach beyond",
+    ),
+    "box inside": ({"box": {"min": [-1, -1, -1], "max": [2, 0.9, 1]}, "inside": True}, "8 triangles"),
+    "sphere inside": ({"sphere": {"center": [0, 0, 0], "radius": 1.3}, "inside": True}, "2 triangles"),
+}
+
+
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_what_is_in_an_obstacle(comm: MPI.Comm, name: str) -> None:
+    shape, words = OVERLAPS[name]
+    text = refusal(comm, obstacle(**shape))
+    assert text.startswith("obstacles.thing: at the start ")
+    assert words in text
+    assert " around (" in text
+
+
+def test_a_mesh_that_crosses(comm: MPI.Comm, shared_tmp: Path) -> None:
+    if comm.rank == 0:
+        obj_file(shared_tmp / "blade.obj", [(0.3, 0.1, -1), (0.3, 0.1, 1), (0.3, 0.3, 0)], [(0, 1, 2)])
+    comm.Barrier()
+    text = refusal(comm, obstacle(mesh={"file": str(shared_tmp / "blade.obj")}))
+    assert "2 pairs of a triangle of the sheet and one of it cross (counted from 0, the first: " in text
+
+
+def test_sheets_that_cross(comm: MPI.Comm) -> None:
+    other = grid(1.0, 1.0, 1, 1) | {"transform": {"rotate": {"axis": [1, 0, 0], "degrees": 90}}}
+    other["transform"]["translate"] = [0.0, 0.6, -0.5]
+    scene = sheet(mesh=[SHEET["mesh"], other])
+    text = refusal(comm, scene)
+    assert text.startswith("contact: at the start ")
+    assert "pairs of triangles cross (counted from 0, the first: " in text
+    with Simulation(scene | {"contact": {"gap": 0.02, "self": False}}, comm):
+        pass
+
+
+def test_noise_of_the_start_counts(comm: MPI.Comm) -> None:
+    floor = obstacle(plane={"point": [0, 0, -0.01], "normal": [0, 0, 1]})
+    with Simulation(floor, comm):
+        pass
+    assert "reach beyond it" in refusal(comm, floor | {"initial": {"noise": 0.02, "seed": 1}})
+
+
+def test_nearer_than_thickness(comm: MPI.Comm) -> None:
+    scene = obstacle(plane={"point": [0, 0, -0.003], "normal": [0, 0, 1]})
+    with Simulation(scene | {"contact": {"gap": 0.02, "thickness": 0.002}}, comm) as simulation:
+        system, contact = simulation.system, simulation.problem.terms["contact"]
+        assert isinstance(contact, Contact)
+        energies = contact.energies(system.x, system.active.frozen[contact])
+        total = comm.allreduce(float(energies.sum()))
+    # of 25 vertices at the first state, of which no step has been taken
+    stiffness, left, gap = contact.barrier.stiffness, 0.001, 0.02
+    assert total == pytest.approx(-25 * stiffness * (left - gap) ** 2 * math.log(left / gap))
+    text = refusal(comm, scene | {"contact": {"gap": 0.02, "thickness": 0.004}})
+    assert text == (
+        "obstacles.thing: at the start vertex 0 and the obstacle 'thing', around (0, 0, 0) m, are 0.003 m "
+        "apart, not more than contact.thickness = 0.004 m; move them apart, or give a smaller thickness"
+    )
+
+
+def test_touching_is_not_apart(comm: MPI.Comm) -> None:
+    text = refusal(comm, obstacle(plane={"point": [0, 0, 0], "normal": [0, 0, 1]}))
+    assert text == (
+        "obstacles.thing: at the start vertex 0 and the obstacle 'thing', around (0, 0, 0) m, are not apart; "
+        "move them apart"
+    )
+
+
+def test_sheets_nearer_than_thickness(comm: MPI.Comm) -> None:
+    above = SHEET["mesh"] | {"transform": {"translate": [0.1, 0.03, 0.003]}}
+    scene = sheet(mesh=[SHEET["mesh"], above])
+    with Simulation(scene, comm):
+        pass
+    text = refusal(comm, scene | {"contact": {"gap": 0.02, "thickness": 0.004}})
+    assert re.match(r"contact: at the start (vertex \d+|edge \d+-\d+|the triangle .*) and ", text)
+    assert " are 0.003 m apart, not more than contact.thickness = 0.004 m" in text
