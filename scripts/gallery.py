@@ -55,6 +55,7 @@ ENTRIES = {
     "plate": Entry(1.0, ("--handles", "--field", "curvature"), speed=0.5),
     "buckle": Entry(2.0, ("--handles", "--field", "curvature")),
     "twist": Entry(2.0, ("--handles", "--field", "curvature")),
+    "ball": Entry(1.0, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
     "shell": Entry(1.0, ("--handles", "--field", "curvature")),
 }
 

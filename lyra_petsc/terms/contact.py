@@ -309,7 +309,7 @@ class Contact(Elastic):
     def free_parts(self, x: Array, way: Array, frozen: Places, *, carried: bool) -> Array:
         others = frozen.before if carried else frozen.now
         theirs = frozen.now - frozen.before if carried else np.zeros_like(frozen.now)
-        pairs, out = (self.kind, self.points, self._offset), np.empty(self.n_owned)
+        pairs, out = (self.kind, self.points, self.offset), np.empty(self.n_owned)
         contact_pairs.free_ways(x, others, way, theirs, *pairs, KEPT, out)
         return out
 

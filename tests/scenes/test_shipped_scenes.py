@@ -11,11 +11,12 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.mesh.crossings import self_crossings
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SHIPPED = ("buckle", "drape", "flag", "paper", "plate", "sail", "shell", "spin", "swing", "twist")
+SHIPPED = ("ball", "buckle", "drape", "flag", "paper", "plate", "sail", "shell", "spin", "swing", "twist")
 
 
 @contextmanager
@@ -33,6 +34,23 @@ def simulated(name: str, *settings: str) -> Iterator[SteppedScene]:
 def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
     mean: NDArray[np.float64] = simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
     return mean
+
+
+def test_a_turning_ball_takes_its_cloth_along() -> None:
+    with simulated("ball", "mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.01") as simulation:
+        x, surface = simulation.problem.system.x, simulation.problem.surface
+        columns = simulation.ledger.columns()
+        crossings = self_crossings(x, surface.triangles.astype(np.int64))
+    near = (distance := np.linalg.norm(surface.x[:, :2], axis=1)) < 0.25
+    near &= distance > 0.01
+    before, after = (at[near, 0] + 1j * at[near, 1] for at in (surface.x, x))
+    turned = np.degrees(np.angle(after / before))
+    # by 120° at most; it slips while the ball starts
+    assert 90.0 < turned.min()
+    assert turned.max() < 120.0
+    assert len(crossings) == 0
+    assert np.linalg.norm(x, axis=1).min() > 0.3
+    assert columns["smallest_gap"] > 0.0
 
 
 def test_every_shipped_scene_is_tested() -> None:
