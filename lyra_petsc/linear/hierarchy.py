@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.linear.coarsening import coarsen
 from lyra_petsc.linear.galerkin import Galerkin
-from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.linear.pattern import BlockPattern, begins
+from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
@@ -171,18 +172,20 @@ class Hierarchy:
 def interpolations(layout: Layout, surface: Surface, most: int) -> list[InterpolationRows]:
     """This rank's rows of the interpolations between at most so many levels, finest first; collective.
 
-    Rank 0 makes all coarse meshes, so that they do not depend on the ranks. Nothing is interpolated to the
-    unknowns of edges.
+    Rank 0 makes all coarse meshes, in the order in which one rank numbers vertices: so they do not depend on
+    the ranks, nor on the partition, which is another each time. Nothing is interpolated to the unknowns of
+    edges.
     """
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
-    parts = comm.gather((surface.x[:n], corners))
+    parts = comm.gather((surface.x[:n], corners, layout.original))
     shares: list[list[InterpolationRows]] = []
     if parts is not None:
-        x, triangles = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
+        x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
         del parts
-        shares = _shares(x, triangles, layout.vertex_bounds, most)
+        place = np.arange(len(x)) if comm.size == 1 else _places(triangles, original)
+        shares = _shares(x, triangles, place, layout.vertex_bounds, most)
     share: list[InterpolationRows] = comm.scatter(shares)
     if share and layout.n_owned > n:
         start = share[0].start
@@ -190,21 +193,36 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     return share
 
 
-def _shares(x: Array, triangles: Ints, bounds: Ints, most: int) -> list[list[InterpolationRows]]:
-    """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers."""
+def _places(triangles: Ints, original: Ints) -> Ints:
+    """Number (N,) that each vertex has on one rank; ``original`` (N,) are their positions in the mesh."""
+    position: Ints = locality_order(vertex_graph([original[triangles]], len(original)))[original]
+    return position
+
+
+def _shares(x: Array, triangles: Ints, place: Ints, bounds: Ints, most: int) -> list[list[InterpolationRows]]:
+    """Of each rank its rows, from all vertices x (N, 3) and triangles (F, 3) in global numbers.
+
+    ``place`` (N,) are the vertices' places in the order in which coarse meshes are made.
+    """
     shares: list[list[InterpolationRows]] = [[] for _ in bounds[1:]]
+    number = np.argsort(place)
+    x, triangles = x[number], place[triangles]
+    triangles = triangles[np.lexsort(np.sort(triangles, axis=1).T[::-1])]
     levels = 1
     while levels < most and (len(x) > COARSEST or levels == 1):
         coarse = coarsen(x, triangles)
         if len(coarse.vertices) > WORTH * len(x):
             break
-        below = np.searchsorted(coarse.vertices, bounds)
+        kept = number[coarse.vertices]
+        below = np.searchsorted(np.sort(kept), bounds)
+        number_below = np.argsort(np.argsort(kept))
+        place = np.argsort(number)
         for share, lo, hi in zip(shares, bounds, bounds[1:], strict=False):
-            start = coarse.start[lo : hi + 1]
-            rows = slice(start[0], start[-1])
-            share.append(
-                InterpolationRows(below, start - start[0], coarse.parents[rows], coarse.weights[rows])
-            )
-        x, triangles, bounds = x[coarse.vertices], coarse.triangles, below
+            first, counts = coarse.start[place[lo:hi]], np.diff(coarse.start)[place[lo:hi]]
+            start = begins(counts)
+            rows = np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
+            parents = number_below[coarse.parents[rows]]
+            share.append(InterpolationRows(below, start, parents, coarse.weights[rows]))
+        x, triangles, number, bounds = x[coarse.vertices], coarse.triangles, number_below, below
         levels += 1
     return shares

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from physics import CLOTH, Simulation, grid
+from physics import CLOTH, Simulation, gathered, grid
 
 from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Level, interpolations
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.mesh import distribute
 from lyra_petsc.mesh.points import Points
 
 
@@ -82,6 +83,41 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
             for item in (fine, coarse, interpolation.mat, product):
                 item.destroy()
         hierarchy.destroy()
+
+
+@pytest.mark.parallel
+def test_coarse_meshes_do_not_depend_on_the_partition(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def at_random(ranks: MPI.Comm, graph: object, n_vertices: int) -> tuple[np.ndarray, str]:
+        return np.random.default_rng(1).integers(ranks.size, size=n_vertices), "at random"
+
+    monkeypatch.setattr(distribute, "partition", at_random)
+    there_and_back = []
+    for ranks in (comm, MPI.COMM_SELF):
+        with Simulation({"mesh": grid(1, 1, 60, 48), "material": CLOTH}, ranks) as simulation:
+            problem = simulation.problem
+            between = interpolations(problem.points, problem.surface, 4)
+            hierarchy = Hierarchy(problem.points, problem.pattern, between)
+            down = []
+            for share, *levels in zip(between, hierarchy.levels, hierarchy.levels[1:], strict=False):
+                down.append(Interpolation(share, *levels))
+                down[-1].set(np.ones((levels[0].points.n_owned, 3)))
+            x = down[0].mat.createVecLeft()
+            x.setArray(problem.system.x[: problem.points.n_owned].ravel())
+            for each in down:
+                coarse = each.mat.createVecRight()
+                each.mat.multTranspose(x, coarse)
+                x = coarse
+            for each in reversed(down):
+                fine = each.mat.createVecLeft()
+                each.mat.mult(x, fine)
+                x = fine
+            there_and_back.append(gathered(problem.points, x.getArray().reshape(-1, 3)))
+            for each in down:
+                each.mat.destroy()
+            hierarchy.destroy()
+    np.testing.assert_allclose(*there_and_back, rtol=0.0, atol=1e-10 * np.abs(there_and_back[0]).max())
 
 
 @pytest.mark.parallel
