@@ -151,10 +151,11 @@ class StageEquations:
         self.reference.until(time, self.x)
 
     def rest_at(self, time: float) -> None:
-        """Let moving targets stand where they are at ``time`` [s], between two steps."""
+        """Let moving targets stand where they are at ``time`` [s], between two steps; collective."""
         self.t0 = self.t1 = time
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
+        self._follow(self.x)
 
     # -- a step ------------------------------------------------------------------------------------
 
