@@ -38,7 +38,7 @@ CLOSE = 0.1
 """Part of the way to the least distance that continuous collision detection may leave."""
 
 PARALLEL = 1e-12
-"""Squared sine of the angle of two edges below which they count as parallel."""
+"""Squared sine of the angle of two edges, or sides of a triangle, below which they count as parallel."""
 
 
 @kernel(inline="always")
@@ -84,6 +84,9 @@ def _vertex_triangle(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
     """
     _clear(beta, gamma)
     ab, ac, ap = minus(b, a), minus(c, a), minus(p, a)
+    normal = cross(ab, ac)
+    if not dot(normal, normal) > PARALLEL * dot(ab, ab) * dot(ac, ac):
+        return _nearest_side(p, a, b, c, beta, gamma)  # as near; what follows would be rounding
     d1, d2 = dot(ab, ap), dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
         beta[0], beta[1] = 1.0, -1.0
@@ -106,13 +109,35 @@ def _vertex_triangle(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
         return _to_segment(p, b, c, 0, 2, 3, beta, gamma)
     total = va + vb + vc
-    if not total > 0.0:  # no area
-        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
     v, w = vb / total, vc / total
     beta[0], beta[1], beta[2], beta[3] = 1.0, v + w - 1.0, -v, -w
     gamma[0, 1], gamma[0, 2] = 1.0, -1.0
     gamma[1, 1], gamma[1, 3] = 1.0, -1.0
     return 2
+
+
+@kernel()
+def _nearest_side(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
+    best, found = math.inf, 0
+    for side in range(3):
+        _to_side(side, p, a, b, c, beta, gamma)
+        square = 0.0
+        for k in range(3):
+            g = beta[0] * p[k] + beta[1] * a[k] + beta[2] * b[k] + beta[3] * c[k]
+            square += g * g
+        if square < best:
+            best, found = square, side
+    return _to_side(found, p, a, b, c, beta, gamma)
+
+
+@kernel()
+def _to_side(side, p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
+    _clear(beta, gamma)
+    if side == 0:
+        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
+    if side == 1:
+        return _to_segment(p, b, c, 0, 2, 3, beta, gamma)
+    return _to_segment(p, c, a, 0, 3, 1, beta, gamma)
 
 
 @kernel()
@@ -191,11 +216,12 @@ def _around_foot(p):  # type: ignore[no-untyped-def]
     lies behind it.
     """
     height, axis = 0.0, 0
+    length = math.sqrt(p[2, 0] ** 2 + p[2, 1] ** 2 + p[2, 2] ** 2)  # not 1 while the plane turns
+    n = p[2, 0] / length, p[2, 1] / length, p[2, 2] / length
     for k in range(3):
-        height += p[2, k] * (p[0, k] - p[1, k])
-        if abs(p[2, k]) < abs(p[2, axis]):
+        height += n[k] * (p[0, k] - p[1, k])
+        if abs(n[k]) < abs(n[axis]):
             axis = k
-    n = p[2, 0], p[2, 1], p[2, 2]
     one = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0
     u = cross(n, one)
     v = cross(n, u)
@@ -392,32 +418,56 @@ def hessians(x, others, kind, points, offset, gap, stiffness, parallel, lo, blen
 
 
 @kernel()
+def _speed(kind, w):  # type: ignore[no-untyped-def]
+    """How much the distance of a pair changes at most on the ways w (4, 3) [m], without what is common."""
+    longest = np.zeros(4)
+    for k in range(3):
+        mean = 0.25 * (w[0, k] + w[1, k] + w[2, k] + w[3, k])
+        for i in range(4):
+            w[i, k] -= mean
+            longest[i] += w[i, k] * w[i, k]
+    if kind == EDGE_EDGE:
+        return math.sqrt(max(longest[0], longest[1])) + math.sqrt(max(longest[2], longest[3]))
+    return math.sqrt(longest[0]) + math.sqrt(max(longest[1], longest[2], longest[3]))
+
+
+@kernel()
+def _plane_speed(p, w, most):  # type: ignore[no-untyped-def]
+    """The same of a vertex and a plane, up to a fraction ``most`` of the ways."""
+    way = arm = turn = 0.0
+    for k in range(3):
+        w[0, k] -= w[1, k]
+        w[1, k] = 0.0
+        way += w[0, k] * w[0, k]
+        arm += (p[0, k] - p[1, k]) ** 2
+        turn += w[2, k] * w[2, k]
+    if turn > 3.0:
+        return math.inf
+    # up to there the normal on its way has at least half its length
+    way, turn = math.sqrt(way), 2.0 * math.sqrt(turn)
+    return way + turn * (math.sqrt(arm) + most * way)
+
+
+@kernel()
 def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
     """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
 
     Each keeps at least the part ``keep`` of its distance less the offset. Additive continuous collision
     detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
-    170, algorithm 1.
+    170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
     p, w = np.empty((4, 3)), np.empty((4, 3))
     beta, gamma = np.empty(4), np.empty((2, 4))
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         _load(way, others_way, points, e, w)
-        longest = np.zeros(4)
-        for k in range(3):
-            mean = 0.25 * (w[0, k] + w[1, k] + w[2, k] + w[3, k])
-            for i in range(4):
-                w[i, k] -= mean
-                longest[i] += w[i, k] * w[i, k]
-        if kind[e] == EDGE_EDGE:
-            speed = math.sqrt(max(longest[0], longest[1])) + math.sqrt(max(longest[2], longest[3]))
-        else:
-            speed = math.sqrt(longest[0]) + math.sqrt(max(longest[1], longest[2], longest[3]))
+        speed = _plane_speed(p, w, most) if kind[e] == VERTEX_PLANE else _speed(kind[e], w)
         d, _ = nearest(kind[e], p, beta, gamma)
         left = d - offset[e]
         if left - most * speed >= keep * left or speed == 0.0:
             continue
+        if not speed < math.inf:
+            return 0.0
         least, enough, t = keep * left, (1.0 - keep) * CLOSE * left, 0.0
         # each advance is shorter than what is left of the way to the least distance
         while left - least > enough:

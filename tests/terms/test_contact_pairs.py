@@ -1,0 +1,315 @@
+"""Contact of single pairs: distances, derivatives and free ways, against sampling and differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.terms import contact_pairs
+from lyra_petsc.terms.contact_pairs import CLOSE, EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GAP, STIFFNESS, KEPT = 3.0, 2.0, 0.2
+NOWHERE = 1e-9
+"""A ``parallel`` below which no edges of a test are."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of one kind, whose points are in ``x`` or, for obstacles, in ``others``."""
+
+    kind: Ints
+    points: Ints
+    x: Array
+    others: Array
+    offset: Array
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @property
+    def places(self) -> Array:
+        """(n, 4, 3)"""
+        at = self.points
+        if not len(self.others):
+            return np.asarray(self.x[at])
+        return np.where((at >= 0)[:, :, None], self.x[np.maximum(at, 0)], self.others[np.maximum(~at, 0)])
+
+    def part(self, at: NDArray[np.bool_] | slice) -> Pairs:
+        """Some of them."""
+        return replace(self, kind=self.kind[at], points=self.points[at], offset=self.offset[at])
+
+    def distances(self, x: Array | None = None, others: Array | None = None) -> Array:
+        out = np.empty(len(self))
+        x, others = self.x if x is None else x, self.others if others is None else others
+        contact_pairs.distances(x, others, self.kind, self.points, out)
+        return out
+
+    def energies(self, x: Array, parallel: float = NOWHERE) -> Array:
+        out = np.empty(len(self))
+        numbers = self.offset, GAP, STIFFNESS, parallel
+        contact_pairs.energies(x, self.others, self.kind, self.points, *numbers, out)
+        return out
+
+    def gradient(self, x: Array, parallel: float = NOWHERE) -> tuple[Array, Array]:
+        out, pull = np.zeros_like(x), np.zeros_like(self.others)
+        numbers = self.offset, GAP, STIFFNESS, parallel
+        contact_pairs.add_gradient(x, self.others, self.kind, self.points, *numbers, out, pull)
+        return out, pull
+
+    def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
+        """(n, 12, 12)"""
+        out = np.empty((len(self), 4, 4, 3, 3))
+        numbers = self.offset, GAP, STIFFNESS, parallel
+        contact_pairs.hessians(self.x, self.others, self.kind, self.points, *numbers, 0, blend, out)
+        return out.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
+
+    def free_way(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
+        at = slice(None) if e is None else slice(e, e + 1)
+        pairs = self.kind[at], self.points[at], self.offset[at]
+        return float(contact_pairs.free_way(self.x, self.others, way, others_way, *pairs, KEPT, most))
+
+
+def units(rng: np.random.Generator, n: int) -> Array:
+    v = rng.normal(size=(n, 3))
+    return np.asarray(v / np.linalg.norm(v, axis=1)[:, None])
+
+
+def among_sheets(kind: int, n: int, seed: int = 1) -> Pairs:
+    x = np.random.default_rng(seed).normal(size=(4 * n, 3))
+    none = np.zeros((0, 3))
+    return Pairs(np.full(n, kind), np.arange(4 * n).reshape(n, 4), x, none, np.full(n, 0.05))
+
+
+def nearly_parallel(n: int) -> Pairs:
+    """Edges side by side, whose directions differ by 1e-1 to 1e-4."""
+    rng = np.random.default_rng(7)
+    u, v, along = units(rng, n), units(rng, n), rng.uniform(-0.9, 0.9, size=n)
+    turned = u + 10.0 ** rng.uniform(-4.0, -1.0, size=n)[:, None] * v
+    first = rng.normal(size=(n, 3))
+    away = np.cross(u, units(rng, n))
+    second = first + along[:, None] * u + away / np.linalg.norm(away, axis=1)[:, None]
+    x = np.stack([first, first + u, second, second + turned], axis=1).reshape(-1, 3)
+    return replace(among_sheets(EDGE_EDGE, n), x=x)
+
+
+def planes(n: int) -> Pairs:
+    """Vertices before a plane, at most twice the gap."""
+    rng = np.random.default_rng(3)
+    x, normals = rng.normal(size=(n, 3)), units(rng, n)
+    across = np.cross(normals, units(rng, n))
+    points = x - rng.uniform(0.1, 2.0 * GAP, size=n)[:, None] * normals + 3.0 * across
+    number = np.arange(n)
+    stencil = np.column_stack([number, ~(2 * number), ~(2 * number + 1), ~(2 * number)])
+    others = np.stack([points, normals], axis=1).reshape(-1, 3)
+    return Pairs(np.full(n, VERTEX_PLANE), stencil, x, others, np.full(n, 0.05))
+
+
+def balls(n: int) -> Pairs:
+    """Vertices inside spheres (the first half) and capsules."""
+    rng = np.random.default_rng(4)
+    ends = rng.normal(size=(n, 2, 3))
+    ends[: n // 2, 1] = ends[: n // 2, 0]
+    radius = rng.uniform(2.0, 4.0, size=n)
+    middle = ends[:, 0] + rng.random((n, 1)) * (ends[:, 1] - ends[:, 0])
+    x = middle + (radius * rng.uniform(0.2, 0.98, size=n))[:, None] * units(rng, n)
+    number = np.arange(n)
+    stencil = np.column_stack([number, ~(2 * number), ~(2 * number + 1), ~(2 * number)])
+    inside = Pairs(np.full(n, VERTEX_INSIDE), stencil, x, ends.reshape(-1, 3), 0.05 - radius)
+    return inside.part(inside.distances() - inside.offset > 0.01)
+
+
+KINDS: dict[str, tuple[Callable[[], Pairs], float]] = {
+    "vertex and triangle": (lambda: among_sheets(VERTEX_TRIANGLE, 1000), NOWHERE),
+    "edges": (lambda: among_sheets(EDGE_EDGE, 1000), NOWHERE),
+    "edges that fade": (lambda: among_sheets(EDGE_EDGE, 1000), 20.0),
+    "edges nearly parallel": (lambda: nearly_parallel(1000), 0.1),
+    "vertex and plane": (lambda: planes(500), NOWHERE),
+    "vertex inside": (lambda: balls(500), NOWHERE),
+}
+
+
+def sampled_distance(kind: int, p: Array) -> float:
+    """Least distance of points of both, at a grid of places."""
+    s = np.linspace(0.0, 1.0, 61)
+    if kind == VERTEX_TRIANGLE:
+        u, v = (c[np.add.outer(s, s) <= 1.0 + 1e-12] for c in np.meshgrid(s, s))
+        found = p[1] + u[:, None] * (p[2] - p[1]) + v[:, None] * (p[3] - p[1])
+        return float(np.linalg.norm(p[0] - found, axis=1).min())
+    one, other = (p[i] + s[:, None] * (p[i + 1] - p[i]) for i in (0, 2))
+    return float(np.linalg.norm(one[:, None] - other, axis=2).min())
+
+
+@pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
+def test_distances_of_simplices(kind: int) -> None:
+    pairs = among_sheets(kind, 300, seed=6)
+    found = pairs.distances()
+    for p, distance in zip(pairs.places, found, strict=True):
+        sampled, spacing = sampled_distance(kind, p), 2.0 * np.linalg.norm(p - p[0], axis=1).max() / 60
+        assert distance - 1e-12 <= sampled <= np.hypot(distance, spacing) + 1e-12
+
+
+@pytest.mark.parametrize("kind", [VERTEX_TRIANGLE, EDGE_EDGE])
+def test_distances_of_simplices_without_extent(kind: int) -> None:
+    """An obstacle's vertex is a triangle, and its edge may be a point, of which all corners are one."""
+    pairs = among_sheets(kind, 20)
+    x = pairs.x.copy().reshape(-1, 4, 3)
+    x[:10, 2] = x[:10, 3]
+    x[10:, 1 if kind == VERTEX_TRIANGLE else 2 :] = x[10:, 1:2]
+    pairs = replace(pairs, x=x.reshape(-1, 3))
+    for p, distance in zip(pairs.places[:10], pairs.distances()[:10], strict=True):
+        assert distance == pytest.approx(sampled_distance(kind, p), rel=5e-3)
+    # a point and a triangle that is one, and edges of which the second and one end of the first are one
+    expected = np.linalg.norm(x[10:, 0] - x[10:, 1], axis=1) if kind == VERTEX_TRIANGLE else np.zeros(10)
+    np.testing.assert_allclose(pairs.distances()[10:], expected, atol=1e-15)
+
+
+def test_distances_of_planes_and_containers() -> None:
+    pairs = planes(200)
+    p = pairs.places
+    expected = np.einsum("ij,ij->i", p[:, 0] - p[:, 1], p[:, 2])
+    np.testing.assert_allclose(pairs.distances(), expected, atol=1e-13)
+    behind = replace(pairs, x=pairs.x - 10.0 * p[:, 2])
+    np.testing.assert_allclose(behind.distances(), expected - 10.0, atol=1e-12)
+    assert (behind.energies(behind.x) == np.inf).all()
+    pairs = balls(200)
+    s = np.linspace(0.0, 1.0, 2001)[:, None]
+    for p, distance in zip(pairs.places, pairs.distances(), strict=True):
+        nearest = np.linalg.norm(p[0] - (p[1] + s * (p[2] - p[1])), axis=1).min()
+        assert -distance == pytest.approx(nearest, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_derivatives(name: str) -> None:
+    make, parallel = KINDS[name]
+    pairs = make()
+    h, rng = 1e-6, np.random.default_rng(9)
+    direction = rng.normal(size=pairs.x.shape)
+    # elsewhere the barrier is too steep for differences, or they straddle where it begins
+    left = pairs.distances() - pairs.offset
+    usable = (left > 0.02) & (np.abs(left - GAP) > 1e-4)
+    assert usable.sum() > 0.7 * len(pairs)
+    assert (left[usable] < GAP).sum() > 0.4 * len(pairs)
+    sheet = (pairs.points >= 0)[:, :, None]
+    along = np.where(sheet, direction[np.maximum(pairs.points, 0)], 0.0).reshape(-1, 12)
+
+    def of_pairs(gradient: Array) -> Array:
+        return np.where(sheet, gradient[np.maximum(pairs.points, 0)], 0.0).reshape(-1, 12)
+
+    ahead, behind = pairs.x + h * direction, pairs.x - h * direction
+    slope = (of_pairs(pairs.gradient(pairs.x, parallel)[0]) * along).sum(axis=1)
+    with np.errstate(invalid="ignore"):  # infinite where they overlap
+        change = (pairs.energies(ahead, parallel) - pairs.energies(behind, parallel)) / (2.0 * h)
+    error = np.abs(change - slope) / (1.0 + np.abs(slope))
+    assert np.median(error[usable]) < 1e-8
+    assert error[usable].max() < 1e-4
+    turned = np.einsum("eij,ej->ei", pairs.hessians(parallel), along)
+    gradients = (of_pairs(pairs.gradient(y, parallel)[0]) for y in (ahead, behind))
+    change = (next(gradients) - next(gradients)) / (2.0 * h)
+    error = np.abs(change - turned).max(axis=1) / (1.0 + np.abs(turned).max(axis=1))
+    # second derivatives jump where another corner or edge becomes the nearest
+    assert np.median(error[usable]) < 1e-7
+    assert np.percentile(error[usable], 99) < 1e-4
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_regularised_hessians_are_positive_semidefinite(name: str) -> None:
+    make, parallel = KINDS[name]
+    pairs = make()
+    exact, regular = pairs.hessians(parallel), pairs.hessians(parallel, blend=1.0)
+    for h in (exact, regular):
+        np.testing.assert_allclose(h, h.transpose(0, 2, 1), atol=1e-11 * np.abs(h).max())
+    least, most = np.linalg.eigvalsh(regular)[:, [0, -1]].T
+    assert (least >= -1e-12 * most - 1e-300).all()
+    assert (most > 0.0).sum() > 0.4 * len(pairs)
+    mixed = pairs.hessians(parallel, blend=0.25)
+    if parallel == NOWHERE:
+        np.testing.assert_allclose(mixed, 0.75 * exact + 0.25 * regular, atol=1e-11 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_forces_of_both_sides_balance(name: str) -> None:
+    make, parallel = KINDS[name]
+    pairs = make()
+    pairs = pairs.part(pairs.distances() > pairs.offset)
+    out, pull = pairs.gradient(pairs.x, parallel)
+    total = np.abs(out.sum(axis=0) + pull.sum(axis=0)).max()
+    assert total <= 1e-13 * (np.abs(out).sum() + np.abs(pull).sum())
+    assert np.abs(out).sum() > 0.0
+
+
+def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> None:
+    pairs = planes(2)
+    normal, foot = pairs.others[1], pairs.others[0]
+    for beyond, energy, force in ((1e-3, 0.0, 0.0), (-1e-3, 1e-8, 1e-5)):
+        x = pairs.x.copy()
+        x[0] = foot + (GAP + 0.05 + beyond) * normal
+        assert pairs.energies(x)[0] == pytest.approx(energy, abs=1e-8)
+        assert np.linalg.norm(pairs.gradient(x)[0][0]) == pytest.approx(force, abs=1e-5)
+
+
+def closest(pairs: Pairs, e: int, way: Array, others_way: Array, end: float) -> tuple[float, float]:
+    """Least of what is left on the way to a fraction of it, over what is left at first; that at the end."""
+    left = [
+        pairs.distances(pairs.x + t * way, pairs.others + t * others_way)[e] - pairs.offset[e]
+        for t in np.linspace(0.0, end, 100)
+    ]
+    return min(left) / left[0], left[-1] / left[0]
+
+
+@pytest.mark.parametrize("speed", [0.5, 2.0, 100.0])
+@pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
+def test_free_ways(name: str, speed: float) -> None:
+    pairs = KINDS[name][0]()
+    pairs = pairs.part(pairs.distances() > pairs.offset).part(slice(0, 120))
+    rng = np.random.default_rng(11)
+    way, others_way = speed * rng.normal(size=pairs.x.shape), speed * rng.normal(size=pairs.others.shape)
+    if pairs.kind[0] == VERTEX_PLANE:
+        others_way[1::2] = 0.0  # planes that do not turn
+    limited, found = 0, []
+    for e in range(len(pairs)):
+        found.append(fraction := pairs.free_way(way, others_way, e))
+        assert 0.0 < fraction <= 1.0
+        least, last = closest(pairs, e, way, others_way, fraction)
+        assert least >= KEPT - 1e-12
+        if fraction < 1.0:
+            limited += 1
+            assert last <= KEPT + (1.0 - KEPT) * CLOSE + 1e-12
+    assert limited > 5 or speed < 1.0
+    assert pairs.free_way(way, others_way) == min(found)
+    assert pairs.free_way(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
+
+
+def test_a_common_motion_of_both_is_free() -> None:
+    for make in (lambda: among_sheets(VERTEX_TRIANGLE, 50), lambda: planes(50), lambda: balls(50)):
+        pairs = make()
+        pairs = pairs.part(pairs.distances() > pairs.offset)
+        way = np.tile([30.0, -20.0, 50.0], (len(pairs.x), 1))
+        others_way = np.tile([30.0, -20.0, 50.0], (len(pairs.others), 1))
+        if len(pairs.others) and pairs.kind[0] == VERTEX_PLANE:
+            others_way[1::2] = 0.0
+        assert pairs.free_way(way, others_way) == 1.0
+
+
+def test_planes_that_turn() -> None:
+    """The normal at a fraction of the way is that of straight ways of both its ends."""
+    pairs = planes(200)
+    rng = np.random.default_rng(12)
+    others_way = np.zeros_like(pairs.others)
+    others_way[1::2] = units(rng, len(pairs)) - pairs.others[1::2]
+    way = rng.normal(size=pairs.x.shape)
+    limited = 0
+    for e in range(len(pairs)):
+        fraction = pairs.free_way(way, others_way, e)
+        limited += fraction < 1.0
+        for t in np.linspace(0.0, fraction, 50):
+            point, normal = pairs.others[2 * e], pairs.others[2 * e + 1] + t * others_way[2 * e + 1]
+            height = (pairs.x[e] + t * way[e] - point) @ normal / np.linalg.norm(normal)
+            assert height > pairs.offset[e]
+    assert limited > 20
