@@ -46,6 +46,9 @@ class HalfStored:
         self._shape = pattern.n_owned, 4
         self._kept = np.empty(self._shape) if pattern.n_owned <= MOST_KEPT else None
 
+    def changed(self) -> None:
+        """The values are others: they are read where they stand."""
+
     def __call__(self, x: Array, out: Array) -> None:
         """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
         sums = np.empty(self._shape) if self._kept is None else self._kept

@@ -10,10 +10,20 @@ takes processors a hundred times longer: a flat sheet's couplings across its pla
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.pattern import BlockPattern
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
 
 TINY = np.float32(1e-20)
 """Velocities [m/s] below it are none."""
@@ -23,20 +33,25 @@ NEGLIGIBLE = 1e-12
 
 
 @cached(inline="always")
-def _flushed(value):  # type: ignore[no-untyped-def]
+def flushed(value):  # type: ignore[no-untyped-def]
     return value if abs(value) > TINY else np.float32(0.0)
 
 
 @cached()
-def store(indptr, values, blocks):  # type: ignore[no-untyped-def]
-    """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision, without negligible ones."""
+def negligible(indptr, values):  # type: ignore[no-untyped-def]
+    """What entries of values (n_blocks, 9) must exceed to count."""
     least = np.float64(np.inf)
     for row in range(Index(len(indptr) - 1)):
         k = Index(indptr[row])
         for i in (0, 4, 8):
             if 0.0 < values[k, i] < least:
                 least = values[k, i]
-    least *= NEGLIGIBLE
+    return least * NEGLIGIBLE
+
+
+@cached()
+def store(values, least, blocks):  # type: ignore[no-untyped-def]
+    """blocks (n_blocks, 9) = values (n_blocks, 9) in single precision, those up to ``least`` as 0."""
     for block in range(Index(len(blocks))):
         for i in range(Index(9)):
             value = values[block, i]
@@ -70,14 +85,13 @@ def invert_diagonal(indptr, values, inverse):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def invert_roots(rows, indptr, values, roots):  # type: ignore[no-untyped-def]
-    """L⁻¹ of the diagonal blocks L Lᵀ of rows (n,) into roots (n_local, 6), lower half row by row.
+def invert_roots(rows, values, roots):  # type: ignore[no-untyped-def]
+    """L⁻¹ of the diagonal blocks L Lᵀ, values (n, 9), of rows (n,) into roots (n_local, 6).
 
-    Directions without stiffness, or with a negative one, are left out.
+    Their lower half row by row. Directions without stiffness, or with a negative one, are left out.
     """
     for number in range(Index(len(rows))):
-        row = Index(rows[number])
-        k = Index(indptr[row])
+        row, k = Index(rows[number]), number
         least = 1e-12 * max(values[k, 0], values[k, 4], values[k, 8])
         b, c, e = values[k, 1], values[k, 2], values[k, 5]
         d, f = values[k, 4], values[k, 8]
@@ -127,12 +141,12 @@ def relative_couplings(rows, indptr, ends, columns, values, roots, sums):  # typ
 
 
 @cached(inline="always")
-def _solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
+def solved(inverse, row, s0, s1, s2):  # type: ignore[no-untyped-def]
     """A point's unknowns by the inverse of its block."""
     y0 = inverse[row, 0] * s0 + inverse[row, 1] * s1 + inverse[row, 2] * s2
     y1 = inverse[row, 3] * s0 + inverse[row, 4] * s1 + inverse[row, 5] * s2
     y2 = inverse[row, 6] * s0 + inverse[row, 7] * s1 + inverse[row, 8] * s2
-    return _flushed(y0), _flushed(y1), _flushed(y2)
+    return flushed(y0), flushed(y1), flushed(y2)
 
 
 @cached(fastmath=True)
@@ -148,7 +162,7 @@ def backward(indptr, ends, columns, blocks, inverse, x, r):  # type: ignore[no-u
         row = n - Index(1) - below
         lo, hi = Index(indptr[row] + 1), Index(ends[row])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
-        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
         less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         r[row, 0] = r[row, 1] = r[row, 2] = 0.0
@@ -175,7 +189,7 @@ def forward(indptr, ends, columns, blocks, inverse, b, x, r):  # type: ignore[no
     for row in range(n):
         lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
         s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
-        y0, y1, y2 = _solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
         x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
         scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
 
@@ -206,3 +220,62 @@ def add_interpolated(start, parents, weights, free, coarse, x):  # type: ignore[
         x[row, 0] += free[row, 0] * e0
         x[row, 1] += free[row, 1] * e1
         x[row, 2] += free[row, 2] * e2
+
+
+class BlockSweeps:
+    """Sweeps over a pattern's rows, and their residual.
+
+    Parameters
+    ----------
+    pattern : BlockPattern
+
+    Attributes
+    ----------
+    r : (n_owned, 4)
+        Residual, and numbers without a meaning.
+    flops : float
+        Of a sweep.
+    """
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        n = pattern.n_owned
+        self._rows = pattern.indptr, pattern.ends, pattern.columns
+        self._beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
+        self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
+        self._inverse = np.empty((n, 9), dtype=np.float32)
+        self.r = np.zeros((n, 4), dtype=np.float32)
+        self.flops = 18.0 * pattern.n_couplings
+
+    def diagonal(self, values: Array, rows: Ints) -> Array:
+        """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9)."""
+        found: Array = values[self._rows[0][rows]]
+        return found
+
+    def set(self, values: Array) -> None:
+        """Take block rows (n_blocks, 9)."""
+        store(values, negligible(self._rows[0], values), self._blocks)
+        invert_diagonal(self._rows[0], values, self._inverse)
+
+    def shrink(self, rows: Ints, factor: Array) -> None:
+        """Divide the inverses of the diagonal blocks of rows (n,) by ``factor`` (n, 1)."""
+        self._inverse[rows] /= factor
+
+    def begin(self, b: Floats) -> None:
+        """Let the residual be b (n_local, 3): x is zero."""
+        self.r[:, :3] = b[: len(self.r)]
+
+    def add(self, rows: Ints, more: Floats) -> None:
+        """Add to the residual of rows (n,)."""
+        self.r[rows, :3] += more
+
+    def backward(self, x: Floats) -> None:
+        """Sweep; see the function."""
+        backward(*self._rows, self._blocks, self._inverse, x, self.r)
+
+    def subtract_ghosts(self, x: Floats) -> None:
+        """See the function."""
+        subtract_ghosts(self._beside, *self._rows, self._blocks, x, self.r)
+
+    def forward(self, b: Floats, x: Floats) -> None:
+        """Sweep; see the function."""
+        forward(*self._rows, self._blocks, self._inverse, b, x, self.r)

@@ -16,6 +16,7 @@ from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_couplings import ProductWithEdges
     from lyra_petsc.terms.edge_turns import EdgeTurns
 
 Array = NDArray[np.float64]
@@ -95,11 +96,14 @@ class Level:
         Interpolates from the next coarser level, and makes its block rows.
     turns : EdgeTurns or None
         How unknowns of edges, that nothing is interpolated to, follow the vertices.
+    product : ProductWithEdges or None
+        With the same block rows, where edges carry unknowns.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
         self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
+        self.product: ProductWithEdges | None = None
 
 
 class Hierarchy:

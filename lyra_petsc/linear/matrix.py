@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from lyra_petsc.linear.block_product import MOST_KEPT, HalfStored
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
 from lyra_petsc.mesh.points import Points
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_couplings import ProductWithEdges
 
 Array = NDArray[np.float64]
 
@@ -43,8 +47,16 @@ class _Product:
     def __init__(self, points: Points, pattern: BlockPattern, rows: Array) -> None:
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
-        self._multiply = HalfStored(pattern, rows)
-        self._operations = 2.0 * 9.0 * pattern.n_couplings
+        edges = pattern.edge_couplings
+        self.multiply: HalfStored | ProductWithEdges
+        if edges is None:
+            self.multiply = HalfStored(pattern, rows)
+            self._operations = 2.0 * 9.0 * pattern.n_couplings
+        else:
+            from lyra_petsc.linear.edge_couplings import ProductWithEdges  # of use for nothing else
+
+            self.multiply = ProductWithEdges(edges, pattern, rows)
+            self._operations = 2.0 * edges.n_numbers
         n_local = points.n_local if self._points is not None else 0
         self._local = np.empty((n_local, 3)) if n_local <= MOST_KEPT else None
 
@@ -56,7 +68,7 @@ class _Product:
             local[: len(values)] = values
             self._points.update_ghosts(local)
             values = local
-        self._multiply(values, y.getArray().reshape(-1, 3))
+        self.multiply(values, y.getArray().reshape(-1, 3))
         PETSc.Log.logFlops(self._operations)
 
     multTranspose = mult  # it is symmetric
@@ -87,6 +99,8 @@ class BlockMatrix:
         Of type ``python``.
     rows : (n_blocks, 3, 3) float64
         Its block rows; ``set`` tells PETSc that they changed.
+    product : HalfStored or ProductWithEdges
+        With them.
     followers : list of callables
         Are given the block rows whenever they change.
     """
@@ -102,7 +116,9 @@ class BlockMatrix:
         self.rows = np.zeros((pattern.n_blocks, 3, 3))
         self.followers: list[Callable[[Array], None]] = []
         self._diagonal = pattern.indptr[:-1]
-        self.mat.setPythonContext(_Product(points, pattern, self.rows))
+        made = _Product(points, pattern, self.rows)
+        self.product = made.multiply
+        self.mat.setPythonContext(made)
         _set_vec_type(self.mat)
         self.mat.setUp()
         # what PETSc frees when Python is gone must not call it
@@ -120,6 +136,7 @@ class BlockMatrix:
             self.rows[self._diagonal] *= 1.0 + larger
         for follower in self.followers:
             follower(self.rows)
+        self.product.changed()
         self.mat.assemble()
         self.mat.stateIncrease()
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.terms.term import Across, Couplings
+from lyra_petsc.terms.term import Across, Coupling, Couplings, WithEdges
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_couplings import EdgeCouplings
 
 Ints = NDArray[np.int64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
@@ -29,13 +32,13 @@ class BlockPattern:
 
     Parameters
     ----------
-    couplings : mapping of name → (E, n) int or Across
+    couplings : mapping of name → (E, n) int, Across or WithEdges
         Local rows that elements couple; only these get an entry, and the diagonal.
     n_owned, n_local : int
 
     Attributes
     ----------
-    n_owned : int
+    n_owned, n_local : int
     indptr : (n_owned + 1,) int64
         The first block of a row is the diagonal one.
     columns : (n_blocks,) int32
@@ -44,11 +47,14 @@ class BlockPattern:
         Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
         index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
         both rows. Of `Across` (E,).
+    edges : tuple of WithEdges
+        Elements that couple edges.
     """
 
     def __init__(self, couplings: Couplings, n_owned: int, n_local: int) -> None:
         keys = _with(couplings, diagonal_keys(n_owned, n_local), n_owned, n_local)
         self._set(keys, n_owned, n_local)
+        self.edges = tuple(part for part in couplings.values() if isinstance(part, WithEdges))
         self.offsets: dict[str, Offsets] = {}
         self._locate(couplings, keys, n_local)
 
@@ -74,6 +80,7 @@ class BlockPattern:
         own = rows * n_local + self.columns
         keys = _with(couplings, own, self.n_owned, n_local)
         made = BlockPattern.of_keys(keys, self.n_owned, n_local)
+        made.edges = self.edges
         place = np.searchsorted(keys, own)
         kind = index_type(2 * len(keys))
         for name, offsets in self.offsets.items():
@@ -92,11 +99,11 @@ class BlockPattern:
         """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""
         made = cls.__new__(cls)
         made._set(keys, n_owned, n_local)
-        made.offsets = {}
+        made.offsets, made.edges = {}, ()
         return made
 
     def _set(self, keys: Ints, n_owned: int, n_local: int) -> None:
-        self.n_owned = n_owned
+        self.n_owned, self.n_local = n_owned, n_local
         rows, columns = np.divmod(keys, max(n_local, 1))
         self.columns: NDArray[np.int32] = columns.astype(np.int32)
         self.indptr: Ints = begins(np.bincount(rows, minlength=n_owned))
@@ -113,6 +120,15 @@ class BlockPattern:
             return self.indptr[1:]
         ends: Ints = self.indptr[:-1] + np.diff(begins(owned)[self.indptr])
         return ends
+
+    @cached_property
+    def edge_couplings(self) -> EdgeCouplings | None:
+        """Couplings of edges one by one, where elements have some."""
+        if not self.edges:
+            return None
+        from lyra_petsc.linear.edge_couplings import EdgeCouplings  # of use for nothing else
+
+        return EdgeCouplings(self)
 
     @property
     def n_couplings(self) -> int:
@@ -135,19 +151,19 @@ def index_type(largest: int) -> np.dtype[Any]:
     return np.dtype("int32" if largest <= LARGEST_INT32 else "int64")
 
 
-def _pairs(coupling: NDArray[np.int32] | Across) -> list[tuple[int, int]]:
+def _pairs(coupling: Coupling) -> list[tuple[int, int]]:
     """Which rows (a, b), b ≥ a, of elements are coupled."""
     if isinstance(coupling, Across):
         return [(0, 1)]
-    n = coupling.shape[1]
+    n = _stencil(coupling).shape[1]
     return [(a, b) for a in range(n) for b in range(a, n)]
 
 
-def _stencil(coupling: NDArray[np.int32] | Across) -> NDArray[np.int32]:
-    return coupling.stencil if isinstance(coupling, Across) else coupling
+def _stencil(coupling: Coupling) -> NDArray[np.int32]:
+    return coupling.stencil if isinstance(coupling, Across | WithEdges) else coupling
 
 
-def _same(one: NDArray[np.int32] | Across | None, other: NDArray[np.int32] | Across) -> bool:
+def _same(one: Coupling | None, other: Coupling) -> bool:
     return one is not None and type(one) is type(other) and np.array_equal(_stencil(one), _stencil(other))
 
 
@@ -174,7 +190,7 @@ def union(*parts: Ints) -> Ints:
     return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers
 
 
-def _offsets(coupling: NDArray[np.int32] | Across, keys: Ints, n_owned: int, n_local: int) -> Offsets:
+def _offsets(coupling: Coupling, keys: Ints, n_owned: int, n_local: int) -> Offsets:
     stencil, pairs = _stencil(coupling), _pairs(coupling)
     out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
     for pair, (a, b) in enumerate(pairs):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from lyra_petsc.linear import gauss_seidel as sweeps
 from lyra_petsc.linear.hierarchy import Hierarchy, Level
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.phases import SWEEP, TRANSFER
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_sweeps import SweepsWithEdges
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -39,6 +43,15 @@ SAFE = 0.9
 """What couplings to other ranks may reach in sum, relative to the diagonal blocks."""
 
 
+def _sweeps_of(level: Level) -> sweeps.BlockSweeps | SweepsWithEdges:
+    pattern = level.pattern
+    if pattern.edge_couplings is None:
+        return sweeps.BlockSweeps(pattern)
+    from lyra_petsc.linear.edge_sweeps import SweepsWithEdges  # of use for nothing else
+
+    return SweepsWithEdges(pattern, pattern.edge_couplings, level.product)
+
+
 class Smoother:
     """The arrays that a level's sweeps and its interpolation work on.
 
@@ -46,28 +59,22 @@ class Smoother:
     ----------
     b, x : (n_local, 3)
         Right-hand side and solution.
-    r : (n_owned, 4)
-        Residual, and numbers without a meaning; n_local rows where edges follow vertices.
     """
 
     def __init__(self, level: Level) -> None:
         pattern, points = level.pattern, level.points
         self.points, self.n_couplings = points, pattern.n_couplings
-        n = points.n_owned
         self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
-        self._inverse = np.empty((n, 9), dtype=np.float32)
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
-        self._turns = level.turns
-        self.r = np.zeros((points.n_local if self._turns else n, 4), dtype=np.float32)
+        self._turns, self._sweeps = level.turns, _sweeps_of(level)
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
-        self._parents = start, parents, weights.astype(np.float32)
-        # of blocks, and of three coordinates of each parent
-        self._sweep_flops, self._transfer_flops = 18.0 * self.n_couplings, 6.0 * len(parents)
+        self._parents = start[: len(self._sweeps.r) + 1], parents, weights.astype(np.float32)
+        self._all_parents = start, *self._parents[1:]
+        self._transfer_flops = 6.0 * len(parents)  # of three coordinates of each parent
         self._free = np.ones_like(self.x)
         self._lagged = np.empty(0, dtype=np.int64)
         self._increase = np.empty((0, 3, 3), dtype=np.float32)
@@ -75,9 +82,8 @@ class Smoother:
 
     def set(self, values: Array, free: Array) -> None:
         """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
-        values, first = values.reshape(-1, 9), self._rows[0]
-        sweeps.store(first, values, self._blocks)
-        sweeps.invert_diagonal(first, values, self._inverse)
+        values = values.reshape(-1, 9)
+        self._sweeps.set(values)
         self._increase_diagonal(values)
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
@@ -92,7 +98,8 @@ class Smoother:
             return
         packed = np.empty((self.points.n_local, 3))  # six numbers in single precision: one message
         roots = packed.view(np.float32)
-        sweeps.invert_roots(self._edge, self._rows[0], values, roots)
+        diagonal = self._sweeps.diagonal(values, self._edge)
+        sweeps.invert_roots(self._edge, diagonal, roots)
         self.points.update_ghosts(packed)
         sums = np.empty(len(self._edge))
         sweeps.relative_couplings(self._edge, *self._rows, values, roots, sums)
@@ -100,8 +107,8 @@ class Smoother:
         self._lagged = rows = self._edge[found]
         if len(found):
             growth = (sums[found, None] - SAFE) / 2.0
-            self._inverse[rows] /= 1.0 + growth
-            self._increase = (growth * values[self._rows[0][rows]]).astype(np.float32).reshape(-1, 3, 3)
+            self._sweeps.shrink(rows, 1.0 + growth)
+            self._increase = (growth * diagonal[found]).astype(np.float32).reshape(-1, 3, 3)
 
     def before(self, coarse: Floats, *, again: bool) -> None:
         """Sweep; ``coarse`` (n_local coarse, 3) gets the restricted residual; collective.
@@ -112,18 +119,18 @@ class Smoother:
             self._subtract_ghosts(np.zeros_like(self.x[self.points.n_owned :]))
         else:
             self.x[:] = 0.0
-            self.r[:, :3] = self.b[: len(self.r)]
+            self._sweeps.begin(self.b)
             self._seen = np.zeros((len(self._lagged), 3), dtype=np.float32)
         seen = self.x[self.points.n_owned :].copy()
         with PETSc.Log.Event(SWEEP):
-            sweeps.backward(*self._rows, self._blocks, self._inverse, self.x, self.r)
-            PETSc.Log.logFlops(self._sweep_flops)
+            self._sweeps.backward(self.x)
+            PETSc.Log.logFlops(self._sweeps.flops)
         self._subtract_ghosts(seen)
-        start, *parents = self._parents
         with PETSc.Log.Event(TRANSFER):
             if self._turns is not None:
-                self._turns.gather(self.r)
-            sweeps.restrict(start[: len(self.r) + 1], *parents, self._free, self.r, coarse)
+                assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+                self._turns.gather(self._sweeps.of_edges, self._sweeps.r)
+            sweeps.restrict(*self._parents, self._free, self._sweeps.r, coarse)
             PETSc.Log.logFlops(self._transfer_flops)
             self._coarse.add_to_owners(coarse)
 
@@ -133,14 +140,14 @@ class Smoother:
             self.points.update_ghosts(self.x)
             ghosts = self.x[self.points.n_owned :]
             ghosts -= seen
-            sweeps.subtract_ghosts(self._edge, *self._rows, self._blocks, self.x, self.r)
+            self._sweeps.subtract_ghosts(self.x)
             ghosts += seen
         if len(self._lagged):
             self._add_increase(self.x[self._lagged] - self._seen)
 
     def _add_increase(self, moved: Floats) -> None:
         """Let the residual follow what the increased diagonal makes of own values that have moved so far."""
-        self.r[self._lagged, :3] += np.einsum("nij,nj->ni", self._increase, moved)
+        self._sweeps.add(self._lagged, np.einsum("nij,nj->ni", self._increase, moved))
         self._seen = self._seen + moved
 
     def after(self, coarse: Floats) -> None:
@@ -157,17 +164,17 @@ class Smoother:
             right, self._seen = self.b[lagged], self.x[lagged]
             self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
         with PETSc.Log.Event(SWEEP):
-            sweeps.forward(*self._rows, self._blocks, self._inverse, self.b, self.x, self.r)
-            PETSc.Log.logFlops(self._sweep_flops)
+            self._sweeps.forward(self.b, self.x)
+            PETSc.Log.logFlops(self._sweeps.flops)
         if len(lagged):
             self.b[lagged] = right
 
     def _add_interpolated(self, coarse: Floats) -> None:
         if self._turns is None:
-            sweeps.add_interpolated(*self._parents, self._free, coarse, self.x)
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, self.x)
             return
         more = np.zeros_like(self.x)
-        sweeps.add_interpolated(*self._parents, self._free, coarse, more)
+        sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
         self._turns.follow(more)
         self.x += more
         self.points.update_ghosts(self.x)  # edges of others have followed there

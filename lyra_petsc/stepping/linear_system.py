@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.linear import multigrid, presets
+from lyra_petsc.linear.block_product import HalfStored
 from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Surface, interpolations
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
 from lyra_petsc.linear.multigrid import Multigrid
@@ -101,6 +102,9 @@ class LinearSystem:
 
             below = VertexEquations(self._equations)
         hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below)
+        product = self.preconditioner.product
+        if self.preconditioner is self.operator and not isinstance(product, HalfStored):
+            hierarchy.levels[0].product = product
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
     def attach(self, ksp: PETSc.KSP) -> None:

@@ -54,6 +54,7 @@ def _set(x, stencil, share, out):  # type: ignore[no-untyped-def]
 @cached(fastmath=True)
 def _follow(stencil, places, turns, x):  # type: ignore[no-untyped-def]
     """Add to the edges' unknowns of x (n_local, 3) what its vertices make of them."""
+    flat = x.reshape(-1)
     for e in range(Index(len(stencil))):
         n0, n1, n2 = turns[e, 0], turns[e, 1], turns[e, 2]
         a, b, c = Index(stencil[e, 0]), Index(stencil[e, 1]), Index(stencil[e, 2])
@@ -62,19 +63,20 @@ def _follow(stencil, places, turns, x):  # type: ignore[no-untyped-def]
         h2 = n0 * x[c, 0] + n1 * x[c, 1] + n2 * x[c, 2]
         w01, w02, w12 = turns[e, 4], turns[e, 5], turns[e, 7]
         p, q, r = Index(places[e, 0]), Index(places[e, 1]), Index(places[e, 2])
-        x[p // Index(3), p % Index(3)] += turns[e, 9] * (turns[e, 3] * h0 + w01 * h1 + w02 * h2)
-        x[q // Index(3), q % Index(3)] += turns[e, 10] * (w01 * h0 + turns[e, 6] * h1 + w12 * h2)
-        x[r // Index(3), r % Index(3)] += turns[e, 11] * (w02 * h0 + w12 * h1 + turns[e, 8] * h2)
+        flat[p] += turns[e, 9] * (turns[e, 3] * h0 + w01 * h1 + w02 * h2)
+        flat[q] += turns[e, 10] * (w01 * h0 + turns[e, 6] * h1 + w12 * h2)
+        flat[r] += turns[e, 11] * (w02 * h0 + w12 * h1 + turns[e, 8] * h2)
 
 
 @cached(fastmath=True)
-def _gather(stencil, places, turns, r):  # type: ignore[no-untyped-def]
-    """Add to the vertices of r (n_local, 4) what the transpose of ``_follow`` makes of its edges."""
+def _gather(stencil, places, turns, of_edges, r):  # type: ignore[no-untyped-def]
+    """Add to the vertices of r (n_local, 4) what the transpose of ``_follow`` makes of edges (n_local, 3)."""
+    flat = of_edges.reshape(-1)
     for e in range(Index(len(stencil))):
         p, q, s = Index(places[e, 0]), Index(places[e, 1]), Index(places[e, 2])
-        f0 = turns[e, 9] * r[p // Index(3), p % Index(3)]
-        f1 = turns[e, 10] * r[q // Index(3), q % Index(3)]
-        f2 = turns[e, 11] * r[s // Index(3), s % Index(3)]
+        f0 = turns[e, 9] * flat[p]
+        f1 = turns[e, 10] * flat[q]
+        f2 = turns[e, 11] * flat[s]
         w01, w02, w12 = turns[e, 4], turns[e, 5], turns[e, 7]
         h0 = turns[e, 3] * f0 + w01 * f1 + w02 * f2
         h1 = w01 * f0 + turns[e, 6] * f1 + w12 * f2
@@ -121,6 +123,6 @@ class EdgeTurns:
         """Add to x (n_local, 3), all 0 in the edges' unknowns, what its vertices make of those owned."""
         _follow(self._stencil, self._places, self._turns, x)
 
-    def gather(self, r: Floats) -> None:
-        """Add to the vertices, ghosts too, of r (n_local, 4) the transpose times the edges' unknowns."""
-        _gather(self._stencil, self._places, self._turns, r)
+    def gather(self, of_edges: Floats, r: Floats) -> None:
+        """Add to the vertices, ghosts too, of r (n_local, 4) the transpose times edges' (n_local, 3)."""
+        _gather(self._stencil, self._places, self._turns, of_edges, r)

@@ -39,7 +39,20 @@ class Across(NamedTuple):
     stencil: NDArray[np.int32]
 
 
-Coupling = NDArray[np.int32] | Across
+class WithEdges(NamedTuple):
+    """Elements that couple rows of ``vertices`` (E, n) and ``edges`` (E, m), places of their unknowns."""
+
+    vertices: NDArray[np.int32]
+    edges: Ints
+
+    @property
+    def stencil(self) -> NDArray[np.int32]:
+        """Rows (E, n + m)."""
+        rows = (self.edges // 3).astype(np.int32)
+        return np.ascontiguousarray(np.concatenate([self.vertices, rows], axis=1))
+
+
+Coupling = NDArray[np.int32] | Across | WithEdges
 Couplings = Mapping[str, Coupling]
 """Rows (E, n) that the element Hessians couple, by the names of their offsets in a pattern."""
 
@@ -122,8 +135,7 @@ class Term(ABC):
         """What the Hessians couple."""
         if self.edges is None:
             return {self.name: self.stencil}
-        rows = (self.edges // 3).astype(np.int32)
-        return {self.name: np.ascontiguousarray(np.concatenate([self.stencil, rows], axis=1))}
+        return {self.name: WithEdges(self.stencil, self.edges)}
 
     @property
     def reference_rows(self) -> Ints:

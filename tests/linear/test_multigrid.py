@@ -176,13 +176,14 @@ def test_iterations_do_not_depend_on_the_ranks(comm: MPI.Comm) -> None:
     assert max(counts) <= max(serial) + 2
 
 
+@pytest.mark.parametrize("model", ["hinge", "midedge"])
 @pytest.mark.parametrize("pattern", ["diagonal", "criss-cross"])
-def test_the_cycle_is_positive_definite(pattern: str, comm: MPI.Comm) -> None:
+def test_the_cycle_is_positive_definite(pattern: str, model: str, comm: MPI.Comm) -> None:
     """Ranks whose points lie scattered: sweeps alone have an eigenvalue of −0.7 on three of them."""
     content = hanging(12, step=0.04)
     content["mesh"]["grid"] |= {"ny": 1, "height": 1.0 / 12.0, "pattern": pattern}
     content["handles"] = [{"nodes": [0]}]
-    content["material"]["bending_scale"] = 1000.0
+    content["material"] |= {"bending_scale": 1000.0, "bending_model": model}
     options, given = PETSc.Options(), {"pc_type": "python", "mat_partitioning_type": "average"}
     for name, value in given.items():
         options[name] = value

@@ -1,0 +1,216 @@
+"""Gauss-Seidel where edges carry unknowns: over the edges one by one, and over the points of the vertices.
+
+As ``gauss_seidel``, on ``edge_couplings``. The residual of edges is apart, (n_local, 3) as x is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
+from lyra_petsc.linear.edge_couplings import AHEAD_EDGES
+from lyra_petsc.linear.gauss_seidel import (
+    flushed,
+    invert_diagonal,
+    negligible,
+    solved,
+    subtract_ghosts,
+)
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
+    from lyra_petsc.linear.pattern import BlockPattern
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+
+@cached()
+def invert_numbers(indptr, numbers, inverse):  # type: ignore[no-untyped-def]
+    """Inverses of the edges' diagonal into the flat form of inverse (n_rows, 3); 0 of 0."""
+    flat = inverse.reshape(-1)
+    for edge in range(Index(len(flat))):
+        value = numbers[Index(indptr[edge]), 0]
+        flat[edge] = 1.0 / value if value != 0.0 else 0.0
+
+
+@cached(fastmath=True)
+def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+    """``gauss_seidel.backward`` over the owned edges, from place ``first`` on, in x and r (n_local, 3)."""
+    flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
+    n, first = Index(len(inverses)), Index(first)
+    for below in range(n):
+        edge = n - Index(1) - below
+        at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
+        s = rest[at]
+        for k in range(lo, hi):
+            s -= numbers[k, 0] * flat[Index(others[k])]
+        y = flushed(inverses[edge] * s)
+        less = flat[at] - y
+        flat[at], rest[at] = y, 0.0
+        for k in range(lo, hi):
+            rest[Index(others[k])] += numbers[k, 0] * less
+
+
+@cached(inline="always")
+def _forward_edge(edge, beyond, first, indptr, others, numbers, inverses, x, r):  # type: ignore[no-untyped-def]
+    at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
+    s = r[at] - beyond
+    for k in range(lo, hi):
+        s -= numbers[k, 0] * x[Index(others[k])]
+    y = flushed(inverses[edge] * s)
+    x[at] = y
+    for k in range(lo, hi):
+        r[Index(others[k])] -= numbers[k, 0] * y
+
+
+@cached(fastmath=True)
+def forward_edges(  # type: ignore[no-untyped-def]
+    row_ptr, columns, blocks, n_vertices, indptr, others, numbers, inverse, x, r
+):
+    """``gauss_seidel.forward`` over the owned edges; of their rows there are blocks of ghosts alone."""
+    flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
+    n, first = Index(n_vertices), Index(3) * Index(n_vertices)
+    for row in range(Index(len(inverse))):
+        lo, hi, edge = Index(row_ptr[n + row]), Index(row_ptr[n + row + Index(1)]), Index(3) * row
+        s0 = s1 = s2 = blocks.dtype.type(0.0)
+        if lo < hi:
+            s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        _forward_edge(edge, s0, first, indptr, others, numbers, inverses, flat, rest)
+        _forward_edge(edge + Index(1), s1, first, indptr, others, numbers, inverses, flat, rest)
+        _forward_edge(edge + Index(2), s2, first, indptr, others, numbers, inverses, flat, rest)
+
+
+@cached(fastmath=True)
+def backward_vertices(  # type: ignore[no-untyped-def]
+    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, x, r, of_edges
+):
+    """``gauss_seidel.backward`` over the owned vertices, after that over the edges."""
+    n = Index(len(inverse))
+    for below in range(n):
+        row = n - Index(1) - below
+        lo, hi = Index(indptr[row] + 1), Index(ends[row])
+        first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, -AHEAD)
+        t0, t1, t2 = gather_edges(groups, places, x, first, last, -AHEAD_EDGES)
+        r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
+        y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
+        less = x[row, 0] - y0, x[row, 1] - y1, x[row, 2] - y2
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        r[row, 0] = r[row, 1] = r[row, 2] = 0.0
+        scatter(blocks, columns, r, lo, hi, less)
+        scatter_edges(groups, places, of_edges, first, last, less)
+
+
+@cached(fastmath=True)
+def forward_vertices(  # type: ignore[no-untyped-def]
+    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r, of_edges
+):
+    """``gauss_seidel.forward`` over the owned vertices; r of them and of the edges becomes b − L x."""
+    n, n_owned = Index(len(inverse)), Index(len(ends))
+    for row in range(n):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(n, n_owned):
+        of_edges[row, 0], of_edges[row, 1], of_edges[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(n):
+        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
+        first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        t0, t1, t2 = gather_edges(groups, places, x, first, last, AHEAD_EDGES)
+        r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
+        y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
+        scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
+
+
+class SweepsWithEdges:
+    """``gauss_seidel.BlockSweeps`` where edges carry unknowns.
+
+    Parameters
+    ----------
+    pattern : BlockPattern
+    couplings : EdgeCouplings
+    product : ProductWithEdges, optional
+        With the same rows.
+
+    Attributes
+    ----------
+    r : (n_local, 4)
+        Residual of vertices, and numbers without a meaning.
+    of_edges : (n_local, 3)
+        Residual of edges.
+    """
+
+    def __init__(
+        self, pattern: BlockPattern, couplings: EdgeCouplings, product: ProductWithEdges | None = None
+    ) -> None:
+        self._couplings, self._indptr, self._product = couplings, pattern.indptr, product
+        self._rows, self._groups = couplings.blocks, couplings.groups
+        self._numbers, self._first = couplings.numbers, 3 * couplings.n_vertices
+        n, n_local = couplings.n_vertices, pattern.n_local
+        beside = np.flatnonzero(self._rows.ends < self._rows.indptr[1:])
+        self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
+        self._values = couplings.empty(np.float32)
+        self._inverse = np.empty((n, 9), dtype=np.float32)
+        self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
+        self.r = np.zeros((n_local, 4), dtype=np.float32)
+        self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
+        self.flops = 2.0 * couplings.n_numbers
+
+    def diagonal(self, values: Array, rows: Ints) -> Array:
+        """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9): of edges the diagonal alone."""
+        found: Array = values[self._indptr[rows]]
+        found[rows >= len(self._inverse)] *= np.eye(3).ravel()
+        return found
+
+    def set(self, values: Array) -> None:
+        """Take block rows (n_blocks, 9)."""
+        wide = None if self._product is None else self._product.copied()
+        self._couplings.take(values, negligible(self._indptr, values), self._values, wide)
+        invert_diagonal(self._indptr, values, self._inverse)
+        invert_numbers(self._numbers.indptr, self._values.numbers, self._inverse_of_edges)
+
+    def shrink(self, rows: Ints, factor: Array) -> None:
+        """Divide the inverses of the diagonal of rows (n,) by ``factor`` (n, 1)."""
+        edges = rows >= len(self._inverse)
+        self._inverse[rows[~edges]] /= factor[~edges]
+        self._inverse_of_edges[rows[edges] - len(self._inverse)] /= factor[edges]
+
+    def begin(self, b: Floats) -> None:
+        """Let the residual be b (n_local, 3): x is zero."""
+        n, n_owned = len(self._inverse), len(self._rows.ends)
+        self.r[:n, :3] = b[:n]
+        self.r[n_owned:] = 0.0  # to which turns of edges are added
+        self.of_edges[n:n_owned] = b[n:n_owned]
+
+    def add(self, rows: Ints, more: Floats) -> None:
+        """Add to the residual of rows (n,)."""
+        edges = rows >= len(self._inverse)
+        self.r[rows[~edges], :3] += more[~edges]
+        self.of_edges[rows[edges]] += more[edges]
+
+    def backward(self, x: Floats) -> None:
+        """Sweep over the edges, then over the vertices."""
+        blocks, groups, numbers = self._values
+        backward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
+        rows = *self._rows, *self._groups, blocks, groups
+        backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
+
+    def subtract_ghosts(self, x: Floats) -> None:
+        """As the function, of both residuals."""
+        subtract_ghosts(self._beside, *self._rows, self._values.blocks, x, self.r)
+        subtract_ghosts(self._edges_beside, *self._rows, self._values.blocks, x, self.of_edges)
+
+    def forward(self, b: Floats, x: Floats) -> None:
+        """Sweep over the vertices, then over the edges."""
+        blocks, groups, numbers = self._values
+        rows = *self._rows, *self._groups, blocks, groups
+        forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
+        beyond = self._rows.indptr, self._rows.columns, blocks, len(self._inverse)
+        forward_edges(*beyond, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)

@@ -1,0 +1,170 @@
+"""Rows with edges in a form without the zeros of their blocks: products and sweeps against dense ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from oracle import expanded
+
+from lyra_petsc.kernels.scatter import add_mixed_elements
+from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
+from lyra_petsc.linear.edge_sweeps import SweepsWithEdges
+from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.terms.term import WithEdges
+
+N_VERTICES, N_OWNED, N_LOCAL = 20, 32, 38
+"""Rows 20 to 31 and 35 to 37 hold three edges each, all others a vertex."""
+
+RNG = np.random.default_rng(11)
+
+
+def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.ndarray]:
+    """Pattern and values of elements of three vertices and three edges, and the dense matrix."""
+    vertex_rows = np.concatenate([np.arange(N_VERTICES), np.arange(N_OWNED, N_OWNED + 3)])
+    edge_rows = np.concatenate([np.arange(N_VERTICES, N_OWNED), np.arange(N_OWNED + 3, N_LOCAL)])
+    places = (3 * edge_rows[:, None] + np.arange(3)).ravel()
+    places = places[places != 3 * N_OWNED - 1]  # this one is padding
+    vertices = np.array([RNG.choice(vertex_rows, 3, replace=False) for _ in range(40)], dtype=np.int32)
+    edges = np.array([RNG.choice(places, 3, replace=False) for _ in range(40)], dtype=np.int64)
+    pair = RNG.choice(vertex_rows, (8, 2)).astype(np.int32)
+    coupling = WithEdges(vertices, edges)
+    pattern = BlockPattern({"mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
+    half = RNG.normal(size=(40, 12, 12))
+    blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
+    values = np.zeros((pattern.n_blocks, 3, 3))
+    add_mixed_elements(np.ones(40), blocks, vertices, edges, pattern.offsets["mixed"], values)
+    values[pattern.indptr[:-1]] += 2.0 * np.eye(3)
+    dense = expanded(pattern, values, N_LOCAL).reshape(3 * N_OWNED, 3 * N_LOCAL)
+    return pattern, values, dense
+
+
+def couplings_of(pattern: BlockPattern) -> EdgeCouplings:
+    found = pattern.edge_couplings
+    assert found is not None
+    return found
+
+
+def test_rows_without_edges_have_none() -> None:
+    assert BlockPattern({"pair": np.array([[0, 1]], np.int32)}, 2, 2).edge_couplings is None
+
+
+def test_the_product_is_the_dense_one() -> None:
+    pattern, values, dense = mixed_rows()
+    x, out = RNG.normal(size=(N_LOCAL, 3)), np.full((N_OWNED, 3), np.nan)
+    product = ProductWithEdges(couplings_of(pattern), pattern, values)
+    for copied in (False, True):
+        if copied:
+            couplings, narrow = couplings_of(pattern), couplings_of(pattern).empty(np.float32)
+            couplings.take(values.reshape(-1, 9), 0.0, narrow, product.copied())
+        product(x, out)
+        np.testing.assert_allclose(out.ravel(), dense @ x.ravel(), rtol=1e-12, atol=1e-12)
+    values *= 2.0
+    product.changed()
+    product(x, out)
+    np.testing.assert_allclose(out.ravel(), 2.0 * (dense @ x.ravel()), rtol=1e-12, atol=1e-12)
+
+
+def test_zeros_of_blocks_are_left_out() -> None:
+    pattern, _, _ = mixed_rows()
+    couplings = couplings_of(pattern)
+    assert couplings.n_vertices == N_VERTICES
+    assert couplings.n_numbers < 0.7 * 9 * pattern.n_couplings
+
+
+def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the owned part what is on and above the diagonal: blocks of vertices, numbers of edges."""
+    owned = dense[:, : 3 * N_OWNED]
+    step = np.arange(3 * N_OWNED)
+    step[: 3 * N_VERTICES] -= step[: 3 * N_VERTICES] % 3
+    upper = owned * (step[None, :] >= step[:, None])
+    return owned, upper
+
+
+def test_a_sweep_before_and_one_after() -> None:
+    pattern, values, dense = mixed_rows(definite=True)
+    owned, upper = parts(dense)
+    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
+    sweeps.set(values.reshape(-1, 9))
+
+    def residual() -> np.ndarray:
+        return np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]]).ravel()
+
+    b = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)
+    right = b[:N_OWNED].astype(float).ravel()
+    x = np.zeros((N_LOCAL, 3), dtype=np.float32)
+    sweeps.begin(b)
+    sweeps.backward(x)
+    first = np.linalg.solve(upper, right)
+    np.testing.assert_allclose(x[:N_OWNED].ravel(), first, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(residual(), right - owned @ first, rtol=1e-4, atol=1e-4)
+
+    x[N_OWNED:] = RNG.normal(size=(N_LOCAL - N_OWNED, 3))
+    sweeps.subtract_ghosts(x)
+    np.testing.assert_allclose(residual(), right - dense @ x.astype(float).ravel(), rtol=1e-4, atol=1e-4)
+
+    x[:] = RNG.normal(size=x.shape)
+    before = x.astype(float).ravel()
+    sweeps.forward(b, x)
+    step = np.linalg.solve(upper.T, right - dense @ before)
+    np.testing.assert_allclose(x[:N_OWNED].ravel(), before[: 3 * N_OWNED] + step, rtol=1e-4, atol=1e-4)
+
+    # and again from there
+    before = x.astype(float).ravel()
+    sweeps.subtract_ghosts(x)
+    sweeps.backward(x)
+    step = np.linalg.solve(upper, right - dense @ before)
+    np.testing.assert_allclose(x[:N_OWNED].ravel(), before[: 3 * N_OWNED] + step, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(residual(), right - dense @ before - owned @ step, rtol=1e-4, atol=1e-3)
+
+
+def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
+    pattern, values, _ = mixed_rows(definite=True)
+    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
+    rows = np.array([1, N_VERTICES + 1])
+    vertex, edges = sweeps.diagonal(values.reshape(-1, 9), rows).reshape(2, 3, 3)
+    np.testing.assert_array_equal(vertex, values[pattern.indptr[1]])
+    np.testing.assert_array_equal(edges, np.diag(np.diag(values[pattern.indptr[N_VERTICES + 1]])))
+
+
+def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
+    pattern, values, _ = mixed_rows(definite=True)
+    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
+    sweeps.set(values.reshape(-1, 9))
+    b = np.zeros((N_LOCAL, 3), dtype=np.float32)
+    last = N_OWNED - 1  # nothing but ghosts comes after it
+    b[last] = 1.0
+    found = []
+    for factor in (1.0, 4.0):
+        sweeps.shrink(np.array([0, last]), np.full((2, 1), factor))
+        x = np.zeros_like(b)
+        sweeps.begin(b)
+        sweeps.backward(x)
+        found.append(x[last, 2])
+    assert abs(found[1] - found[0] / 4.0) < 1e-6 * abs(found[0])
+    sweeps.begin(b)
+    sweeps.add(np.array([0, last]), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], dtype=np.float32))
+    assert sweeps.r[0, :3].tolist() == [1.0, 2.0, 3.0]
+    assert sweeps.of_edges[last].tolist() == [5.0, 6.0, 7.0]
+
+
+def test_rows_of_ghosts_alone() -> None:
+    """A rank all of whose elements belong to others' rows but for one vertex."""
+    coupling = WithEdges(np.array([[0, 2, 3]], np.int32), np.array([[12, 13, 14]], np.int64))
+    pattern = BlockPattern({"mixed": coupling}, 1, 5)
+    values = RNG.normal(size=(pattern.n_blocks, 3, 3))
+    couplings, x, out = couplings_of(pattern), RNG.normal(size=(5, 3)), np.empty((1, 3))
+    assert couplings.n_vertices == 1
+    product = ProductWithEdges(couplings, pattern, values)
+    couplings.take(values.reshape(-1, 9), 0.0, product.copied())
+    product(x, out)
+    expected = sum(values[k].T @ x[column] for k, column in enumerate(pattern.columns))
+    np.testing.assert_allclose(out[0], expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_negligible_entries_are_none(kind: type) -> None:
+    pattern, values, _ = mixed_rows()
+    couplings = couplings_of(pattern)
+    copy = couplings.empty(kind)
+    couplings.take(values.reshape(-1, 9), 1e9, copy)
+    assert not any(part.any() for part in copy)
