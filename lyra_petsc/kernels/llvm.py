@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import reduce
 from typing import Any
 
@@ -69,8 +70,8 @@ class Code:
         kind = ir.VectorType(LANE, len(lanes))
         return self.builder.shuffle_vector(one, other, ir.Constant(kind, list(lanes)))
 
-    def nothing(self) -> Value:
-        return ir.Constant(self.vector, ir.Undefined)
+    def nothing(self, kind: Any = None) -> Value:
+        return ir.Constant(self.vector if kind is None else kind, ir.Undefined)
 
     def vectors(self, name: str) -> list[Value]:
         """Of a tuple of sums: each as a vector. A sum: three numbers, or pairs of a factor and three."""
@@ -94,9 +95,9 @@ class Code:
     def _unpacked(self, given: Value) -> list[Value]:
         return cgutils.unpack_tuple(self.builder, given)  # type: ignore[no-any-return, no-untyped-call]
 
-    def filled(self, numbers: list[Value]) -> Value:
-        """A vector that begins with these numbers."""
-        vector = self.nothing()
+    def filled(self, numbers: list[Value], kind: Any = None) -> Value:
+        """A vector, of four if nothing else is said, that begins with these numbers."""
+        vector = self.nothing(kind)
         for i, number in enumerate(numbers):
             vector = self.builder.insert_element(vector, number, LANE(i))
         return vector
@@ -166,10 +167,10 @@ class Code:
         last = self.builder.gep(block, [INDEX(8)])
         self.builder.store(self.plus(self.builder.load(last), ninth), last)
 
-    def six_offsets(self) -> list[Value]:
-        """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, 6)."""
-        row = self.at(self.begin("offsets"), self.integer("e"), 6)
-        return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in range(6)]
+    def six_offsets(self, pairs: Iterable[int] = range(6), width: int = 6) -> list[Value]:
+        """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, width)."""
+        row = self.at(self.begin("offsets"), self.integer("e"), width)
+        return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in pairs]
 
     def is_odd(self, offset: Value, width: int) -> Value:
         """In all lanes, as processors choose between vectors without a jump."""

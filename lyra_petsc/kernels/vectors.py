@@ -77,6 +77,59 @@ def _scatter(typing: Any, blocks: Any, columns: Any, out: Any, lo: Any, hi: Any,
     return types.void(blocks, columns, out, lo, hi, factors), generate
 
 
+def _gather_edges(typing: Any, blocks: Any, places: Any, x: Any, lo: Any, hi: Any, ahead: Any) -> Any:
+    """Sum of blocks[k] x[places[k]] for lo ≤ k < hi, three numbers; x in its flat form.
+
+    A block (3 × 4), row by row, is the coupling of a point with four edges, whose ``places`` (n, 4) are.
+    """
+    _check(blocks, x)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks places x lo hi ahead")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("places"), code.begin("x")
+        ahead = code.integer("ahead")
+        zero = ir.Constant(code.vector, [0.0] * WIDTH)
+        sums = [cgutils.alloca_once_value(builder, zero) for _ in range(3)]  # type: ignore[no-untyped-call]
+        with code.loop() as (k, _):
+            code.fetch(code.at(block_rows, builder.add(k, ahead), 12))
+            block, four = code.at(block_rows, k, 12), code.at(numbers, k, WIDTH)
+            sources = [code.at(vectors, code.number(four, INDEX(i)), 1) for i in range(WIDTH)]
+            factors = code.filled([builder.load(source) for source in sources])
+            for i in range(3):
+                part = code.times(code.load(builder.gep(block, [INDEX(WIDTH * i)])), factors)
+                builder.store(code.plus(builder.load(sums[i]), part), sums[i])
+        a, b, c = map(builder.load, sums)
+        ab = code.plus(code.pick(a, b, 0, 1, 4, 5), code.pick(a, b, 2, 3, 6, 7))
+        cc = code.plus(c, code.pick(c, c, 2, 3, 2, 3))
+        total = code.plus(code.pick(ab, cc, 0, 2, 4, 4), code.pick(ab, cc, 1, 3, 5, 5))
+        found = [builder.extract_element(total, LANE(i)) for i in range(3)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    three = types.UniTuple(blocks.dtype, 3)  # type: ignore[no-untyped-call]
+    return three(blocks, places, x, lo, hi, ahead), generate
+
+
+def _scatter_edges(typing: Any, blocks: Any, places: Any, out: Any, lo: Any, hi: Any, factors: Any) -> Any:
+    """out[places[k]] += blocks[k]ᵀ factors for lo ≤ k < hi, as ``gather_edges`` has them."""
+    _check(blocks, out)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks places out lo hi factors")
+        block_rows, numbers, vectors = code.begin("blocks"), code.begin("places"), code.begin("out")
+        factors = [code.repeat(number) for number in code.numbers("factors")]
+        with code.loop() as (k, _):
+            block, four = code.at(block_rows, k, 12), code.at(numbers, k, WIDTH)
+            rows = [code.load(builder.gep(block, [INDEX(WIDTH * i)])) for i in range(3)]
+            total = code.summed(*zip(rows, factors, strict=True))
+            for i in range(WIDTH):  # one after the other: an edge may be there twice, with a coupling of 0
+                target = code.at(vectors, code.number(four, INDEX(i)), 1)
+                more = builder.extract_element(total, LANE(i))
+                builder.store(code.plus(builder.load(target), more), target)
+        return context.get_dummy_value()
+
+    return types.void(blocks, places, out, lo, hi, factors), generate
+
+
 def _add_outer(typing: Any, blocks: Any, at: Any, diagonal: Any, left: Any, right: Any) -> Any:
     """blocks[at // 2] += diagonal I + left rightᵀ, transposed where ``at`` is odd; nothing where negative."""
 
@@ -132,16 +185,21 @@ def _add_triangle(typing: Any, blocks: Any, offsets: Any, e: Any, f: Any, three:
             a, b, c, d = (code.repeat(factor, 8) for factor in (a, b, c, d))
             eight = code.summed((a, uu), (b, uv), (c, vu), (d, vv))
             made.append((code.plus(eight, code.identity(g)), ninth))
-        (b11, one), (b12, two), (b22, three) = made
-        b21, offsets = code.transposed(b12), code.six_offsets()
-        b01 = code.minus_sum(b11, code.swapped(offsets[1], b21, b12)[0]), code.minus_sum(one, two)
-        b02 = code.minus_sum(b22, code.swapped(offsets[2], b12, b21)[0]), code.minus_sum(two, three)
-        b00 = reduce(code.plus, (b11, b12, b21, b22)), reduce(code.plus, (one, two, two, three))
-        stored = code.swapped(offsets[4], b12, b21)[0], two
-        code.add_six(offsets, [b00, b01, b02, (b11, one), stored, (b22, three)])
+        _add_balanced(code, code.six_offsets(), made)
         return context.get_dummy_value()
 
     return types.void(blocks, offsets, e, f, three), generate
+
+
+def _add_balanced(code: Code, offsets: list[Any], three: list[Any]) -> None:
+    """Add six blocks whose rows and columns sum to zero; given are those of (1, 1), (1, 2), (2, 2)."""
+    (b11, one), (b12, two), (b22, last) = three
+    b21 = code.transposed(b12)
+    b01 = code.minus_sum(b11, code.swapped(offsets[1], b21, b12)[0]), code.minus_sum(one, two)
+    b02 = code.minus_sum(b22, code.swapped(offsets[2], b12, b21)[0]), code.minus_sum(two, last)
+    b00 = reduce(code.plus, (b11, b12, b21, b22)), reduce(code.plus, (one, two, two, last))
+    stored = code.swapped(offsets[4], b12, b21)[0], two
+    code.add_six(offsets, [b00, b01, b02, (b11, one), stored, (b22, last)])
 
 
 def _put(transposed: bool, typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
@@ -185,6 +243,7 @@ def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
 
 # their callers leave out ``typing``
 gather: Any = intrinsic(_gather)
+gather_edges: Any = intrinsic(_gather_edges)
 add_outer: Any = intrinsic(_add_outer)
 add_six: Any = intrinsic(_add_six)
 add_triangle: Any = intrinsic(_add_triangle)
@@ -192,3 +251,4 @@ fetch: Any = intrinsic(_fetch)
 put_plain: Any = intrinsic(_put_plain)
 put_transposed: Any = intrinsic(_put_transposed)
 scatter: Any = intrinsic(_scatter)
+scatter_edges: Any = intrinsic(_scatter_edges)
