@@ -117,7 +117,7 @@ class Ledger:
             if entry.energy:
                 energy = float(term.energies(system.x, system.active.frozen[term]).sum())
                 local[columns.index(entry.energy)] += energy
-                self._moving += energy if entry.moving else 0.0
+                self._moving += energy if term.moving else 0.0
         for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)

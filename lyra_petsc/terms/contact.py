@@ -169,6 +169,10 @@ class Contact(Elastic):
         return places
 
     @property
+    def moving(self) -> bool:
+        return any(obstacle.motion is not None for obstacle in self.obstacles.each)
+
+    @property
     def stale(self) -> bool:  # type: ignore[override]
         moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
         return bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))

@@ -176,6 +176,11 @@ class Elastic(Term):
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
 
+    @property
+    def moving(self) -> bool:
+        """Whether its energy depends on where something stands that moves, and does work on the sheet."""
+        return self.registration.moving
+
     @abstractmethod
     def energies(self, x: Array, frozen: Any) -> Array:
         """Energy [J] of each owned element, (n_owned,)."""
