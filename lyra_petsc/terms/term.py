@@ -261,6 +261,12 @@ class Elastic(Term):
         """What an element keeps apart."""
         raise NotImplementedError
 
+    def obstacle_forces(self, x: Array, frozen: Any, count: int) -> Array | None:
+        """Force [N] on each of a scene's obstacles and its torque [N m] about the origin by this rank's
+        elements, (count, 6); None of a term that knows none.
+        """
+        return None
+
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""
 
