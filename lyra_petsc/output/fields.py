@@ -15,6 +15,7 @@ from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending import Bending
+    from lyra_petsc.terms.contact import Contact
     from lyra_petsc.terms.midedge import MidEdge
     from lyra_petsc.terms.midedge_shape import Frames
 
@@ -105,6 +106,12 @@ def _curvature_tensor(problem: Problem) -> Array:
     return six_components(out)
 
 
+def _contact_pressure(problem: Problem) -> Array:
+    contact, system = cast("Contact", problem.terms["contact"]), problem.system
+    forces = contact.normal_forces(system.x, system.active.frozen[contact])
+    return _per_area(problem, np.arange(len(forces), dtype=np.int32), forces)
+
+
 def _rank(problem: Problem) -> Array:
     return np.full(problem.points.n_vertices, float(problem.points.comm.rank))
 
@@ -146,6 +153,13 @@ FIELDS = {
             _curvature_tensor,
             ("midedge",),
         ),
+        Field(
+            "contact_pressure",
+            "vertex",
+            "normal forces of contact on both sides together, N per m² of rest area, (V,)",
+            _contact_pressure,
+            ("contact",),
+        ),
         Field("rank", "vertex", "owning rank, (V,)", _rank),
     )
 }
@@ -180,8 +194,9 @@ def check_field(field: Field, problem: Problem) -> None:
         )
     if not any(term in problem.terms for term in field.terms):
         needed = " or ".join(f"'{term}'" for term in field.terms)
+        why = "no contact?" if field.terms == ("contact",) else "bending: 0?"
         raise InputError(
-            f"'{field.name}' needs the term {needed}, which this scene does not have (bending: 0?)",
+            f"'{field.name}' needs the term {needed}, which this scene does not have ({why})",
             file=problem.scene.source,
             key="output.fields",
         )

@@ -1,4 +1,4 @@
-"""Tables with one row per accepted step: history.csv, probes.csv, reactions.csv."""
+"""Tables with rows for each accepted step: history.csv, probes.csv, reactions.csv, obstacles.csv."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ HISTORY_COLUMNS = (
     "residual",
     "wall_seconds",
 )
+
+OBSTACLE_COLUMNS = ("step", "time", "obstacle", "fx", "fy", "fz", "tx", "ty", "tz")
 
 
 def vector_columns(names: Sequence[str]) -> tuple[str, ...]:
@@ -82,23 +84,27 @@ class History:
         on_root(comm, lambda: self._open(resume_after))
         self.kept_until = comm.bcast(self.kept_until, root=0)
 
-    def append(self, values: Mapping[str, float]) -> None:
-        """Write one row; for rank 0, which may write several tables before the others hear of it.
+    def append(self, *rows: Mapping[str, float | str]) -> None:
+        """Write the rows of a step; for rank 0, which may write several tables before the others hear of it.
 
         Parameters
         ----------
-        values : mapping
-            A number for each column and nothing else.
+        rows : mapping
+            A number, or a name, for each column and nothing else.
 
         Raises
         ------
         OutputError
             On rank 0.
         """
-        if values.keys() != self._names:
-            raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
+        lines = StringIO()
+        table = csv.writer(lines, lineterminator="\n")
+        for values in rows:
+            if values.keys() != self._names:
+                raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
+            table.writerow([_text(values[name]) for name in self.columns])
         try:
-            self._write(",".join([_text(values[name]) for name in self.columns]) + "\n")
+            self._write(lines.getvalue())
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
 
@@ -175,6 +181,8 @@ def _is_row_until(line: str, last_step: int) -> bool:
         return False
 
 
-def _text(value: float) -> str:
-    """The shortest text that reads back as the same number."""
+def _text(value: float | str) -> str:
+    """The shortest text that reads back as the same number; a name in one line."""
+    if isinstance(value, str):
+        return " ".join(value.splitlines())
     return str(int(value)) if isinstance(value, int | np.integer) else repr(float(value))

@@ -39,6 +39,7 @@ Place: TypeAlias = tuple[str, str]
 ENERGIES = ("kinetic_energy", "membrane_energy", "bending_energy", "potential_energy")
 ITERATIONS = ("newton_iterations", "linear_iterations", "rejected")
 COUNTS = frozenset({"step", "newton_iterations", "linear_iterations", "rejected"})
+NAMES = frozenset({"obstacle"})
 """Columns of whole numbers."""
 
 RECENT = 0.05
@@ -235,6 +236,11 @@ class StoredRun:
     def probes(self) -> Any:
         """probes.csv [m]; empty if the scene has none."""
         return as_frame(self._table("probes.csv"))
+
+    @property
+    def obstacles(self) -> Any:
+        """obstacles.csv, a row for each obstacle and step [N], [N·m]; empty if the scene has none."""
+        return as_frame(self._table("obstacles.csv"))
 
     @cached_property
     def _history(self) -> Columns:
@@ -452,9 +458,9 @@ def read_table(path: Path, needed: Sequence[str] = ("step", "time")) -> Columns:
         if lacking := [name for name in needed if name not in header]:
             raise ValueError(f"no column {lacking[0]}")
         columns = {
-            name: np.array([row[i] for row in rows], dtype="U64").astype(
-                np.int64 if name in COUNTS else float
-            )
+            name: np.array([row[i] for row in rows])
+            if name in NAMES
+            else np.array([row[i] for row in rows], dtype="U64").astype(np.int64 if name in COUNTS else float)
             for i, name in enumerate(header)
         }
     except (ValueError, OverflowError, csv.Error) as error:

@@ -1,4 +1,4 @@
-"""The files of a run: states, checkpoints, history, probes, reactions; every method is collective."""
+"""The files of a run: states, checkpoints, history and other tables; every method is collective."""
 
 from __future__ import annotations
 
@@ -19,7 +19,13 @@ from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_check
 from lyra_petsc.output.failure_files import StateInTime, remove_failure, write_failure
 from lyra_petsc.output.fields import Field, chosen
 from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
-from lyra_petsc.output.history import HISTORY_COLUMNS, History, check_columns, vector_columns
+from lyra_petsc.output.history import (
+    HISTORY_COLUMNS,
+    OBSTACLE_COLUMNS,
+    History,
+    check_columns,
+    vector_columns,
+)
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter
@@ -203,6 +209,8 @@ class Recorder:
             moments = [f"handle{n}_m{axis}" for n in system.held.with_slopes for axis in "xyz"]
             forces = vector_columns([f"handle{n}" for n in range(len(scene.handles))])
             tables["reactions.csv"] = (*forces, *moments)
+        if scene.obstacles:
+            tables["obstacles.csv"] = OBSTACLE_COLUMNS
         return tables
 
     def _open(self, folder: Path, resume_after: int | None) -> None:
@@ -223,6 +231,7 @@ class Recorder:
         }
         self._history = opened["history.csv"]
         self._probes, self._reactions = opened.get("probes.csv"), opened.get("reactions.csv")
+        self._obstacles = opened.get("obstacles.csv")
 
     # -- a step --------------------------------------------------------------------------------------
 
@@ -251,7 +260,7 @@ class Recorder:
     def _write_row(self, report: StepReport) -> bool:
         """A row of each table; whether a checkpoint is due, by rank 0's clock."""
         budget = self._simulation.budget
-        history = {
+        history: dict[str, float | str] = {
             "step": report.step,
             "time": report.time,
             "dt": report.dt,
@@ -268,26 +277,30 @@ class Recorder:
             "wall_seconds": report.wall_seconds,
             **self._simulation.ledger.columns(),
         }
-        rows = [(self._history, history)]
+        rows: list[tuple[History, list[dict[str, float | str]]]] = [(self._history, [history])]
         if self._probes is not None:
-            rows.append((self._probes, self._vectors(report, self._probe_means())))
+            rows.append((self._probes, [self._vectors(report, self._probe_means())]))
         if self._reactions is not None:
             pulls = self._simulation.ledger.handle_forces(len(self._simulation.scene.handles))
             forces = {f"handle{n}": force for n, force in enumerate(pulls)}
             moments = self._simulation.ledger.handle_moments().items()
             turning = {f"handle{n}_m{axis}": float(m[i]) for n, m in moments for i, axis in enumerate("xyz")}
-            rows.append((self._reactions, self._vectors(report, forces) | turning))
+            rows.append((self._reactions, [{**self._vectors(report, forces), **turning}]))
+        if self._obstacles is not None:
+            names = list(self._simulation.scene.obstacles or {})
+            pushes = self._simulation.ledger.obstacle_forces(len(names))
+            rows.append((self._obstacles, [_push(report, *each) for each in zip(names, pushes, strict=True)]))
 
         def work() -> bool:
-            for table, row in rows:
-                table.append(row)
+            for table, lines in rows:
+                table.append(*lines)
             return self._due()
 
         return bool(on_root(self._comm, work))
 
     @staticmethod
-    def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float]:
-        row: dict[str, float] = {"step": report.step, "time": report.time}
+    def _vectors(report: StepReport, vectors: dict[str, Array]) -> dict[str, float | str]:
+        row: dict[str, float | str] = {"step": report.step, "time": report.time}
         for name, vector in vectors.items():
             row |= {f"{name}_{axis}": float(vector[i]) for i, axis in enumerate("xyz")}
         return row
@@ -387,9 +400,15 @@ class Recorder:
     def close(self) -> None:
         """Close the tables; for one rank. Errors of what is still being written are raised by `settle`."""
         self._background.close()
-        for table in (self._history, self._probes, self._reactions):
+        for table in (self._history, self._probes, self._reactions, self._obstacles):
             if table is not None:
                 table.close()
+
+
+def _push(report: StepReport, name: str, push: Array) -> dict[str, float | str]:
+    """A row of obstacles.csv, of a force and a torque (6,)."""
+    values: list[float | str] = [report.step, report.time, name, *map(float, push)]
+    return dict(zip(OBSTACLE_COLUMNS, values, strict=True))
 
 
 def _groups(scene: Scene) -> set[str]:

@@ -31,7 +31,7 @@ NEXT = "checkpoint-next.h5"
 # what a run writes, and nothing else: --force removes no other file
 RESULT = re.compile(
     r"(states-\d{4,}\.h5|(mesh|cells)\.h5|checkpoint(-previous|-next)?\.h5|states\.(xdmf|vtkhdf)"
-    r"|(history|probes|reactions)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
+    r"|(history|probes|reactions|obstacles)\.csv|scene\.yaml|summary\.json|failure\.(h5|xdmf|txt))(\.part)?"
 )
 
 

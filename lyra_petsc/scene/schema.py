@@ -872,6 +872,7 @@ FIELD_UNITS = {
     "bending_energy": "J/m²",
     "curvature": "1/m",
     "curvature_tensor": "1/m",
+    "contact_pressure": "Pa",
     "rank": "1",
 }
 FIELDS = tuple(FIELD_UNITS)

@@ -42,7 +42,7 @@ class ActiveTerms:
         roles = {term: term.registration.role for term in self.elastic}
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
-        self.moving = [term for term in self.sheet if term.registration.moving]
+        self.moving = [term for term in self.sheet if term.moving]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
         self.edged = [term for term in self.elastic if term.registration.edge_state]
         self.coarse: dict[Elastic, Elastic] = {}

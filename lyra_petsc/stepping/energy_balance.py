@@ -117,7 +117,7 @@ class Ledger:
             if entry.energy:
                 energy = float(term.energies(system.x, system.active.frozen[term]).sum())
                 local[columns.index(entry.energy)] += energy
-                self._moving += energy if entry.moving else 0.0
+                self._moving += energy if term.moving else 0.0
         for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)
@@ -219,6 +219,18 @@ class Ledger:
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)
         return list(total)
+
+    def obstacle_forces(self, count: int) -> Array:
+        """Force [N] of the sheets on each of a scene's ``count`` obstacles, and its torque [N m] about the
+        origin, (count, 6), at the end of the last step; collective.
+        """
+        system, total = self._system, np.zeros((count, 6))
+        for term in system.active.elastic:
+            found = term.obstacle_forces(system.x, system.active.frozen[term], count)
+            if found is not None:
+                total += found
+        system.points.comm.Allreduce(MPI.IN_PLACE, total)
+        return total
 
     def handle_moments(self) -> dict[int, Array]:
         """Moment [N·m] in the last step of each handle that holds slopes, about its mean; collective."""

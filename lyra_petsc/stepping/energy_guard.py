@@ -137,9 +137,7 @@ class EnergyGuard:
     def __init__(self, system: StageEquations) -> None:
         self._system = system
         elastic = system.active.elastic
-        self._targets = [
-            t for t in elastic if t.registration.moving or t.registration.role is Role.CONSTRAINT
-        ]
+        self._targets = [t for t in elastic if t.moving or t.registration.role is Role.CONSTRAINT]
         self._plain = [term for term in elastic if term not in self._targets]
         self._weights = [load for load in system.active.loads if load.registration.energy]
         self._forces = [load for load in system.active.loads if not load.registration.energy]

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis
+from lyra_petsc.stepping.near_pairs import NearPair
 from lyra_petsc.stepping.newton_trace import Stuck
 
 SNES = PETSc.SNES.ConvergedReason
@@ -118,6 +119,13 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
             "more handles, or a damped motion instead" if static else "more material.damping, or a finer mesh"
         ]
     return found
+
+
+def more_room(meets: NearPair, scene: Scene) -> str:
+    """What to change where two parts meet that may not."""
+    moves = bool(meets.obstacle) and bool((scene.obstacles or {})[meets.obstacle].motion)
+    who = f"obstacles.{meets.obstacle}.motion" if moves else "the motions of handles and obstacles"
+    return f"more room for the sheet: {who} must leave it some"
 
 
 def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from lyra_petsc.mesh.mesh import Source
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis
+from lyra_petsc.stepping.near_pairs import NearPair
 from lyra_petsc.stepping.newton_trace import Iteration, Stuck
 from lyra_petsc.stepping.stepper import Attempt
 
@@ -58,6 +59,8 @@ class Failure:
         Of the mesh.
     stuck : Stuck
         The last attempt's arrays, of this rank.
+    near : NearPair or None
+        With contact, what would meet in the last attempt, else what is nearest where it stands.
     """
 
     step: int
@@ -70,6 +73,7 @@ class Failure:
     advice: list[str]
     sources: list[Source]
     stuck: Stuck
+    near: NearPair | None = None
 
     @property
     def now(self) -> str:
@@ -80,11 +84,16 @@ class Failure:
     def sentence(self) -> str:
         """What happened, where, and what to try, in one line."""
         last = f"an increment of {self.dt:.3g}" if self.static else f"Δt = {self.dt:.3g} s"
+        near = f": {_apart(self.near)}" if self.near is not None and self.near.blocks else ""
+        what = f"{self.tried[-1].words}{near}"
+        if self.stuck.iterations or not near:
+            what += (
+                f" ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
+                f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
+                f"and {self._triangle()}"
+            )
         return (
-            f"step {self.step} ({self.now}) did not converge even with {last}: "
-            f"{self.tried[-1].words} ({self.kind}); last residual {self.diagnosis.norm:.3g} N, "
-            f"worst at {self._vertex()} around {_point(self.diagnosis.vertex.before, 4)} m "
-            f"and {self._triangle()}; "
+            f"step {self.step} ({self.now}) did not converge even with {last}: {what}; "
             f"the state at {self.now} is kept; try {self.advice[0]}"
         )
 
@@ -126,6 +135,7 @@ class Failure:
             "attempts": [asdict(each) for each in self.tried],
             "iterations": [asdict(each) for each in self.stuck.iterations],
             **asdict(self.diagnosis),
+            **({} if self.near is None else {"near": asdict(self.near)}),
             "advice": self.advice,
         }
 
@@ -161,6 +171,7 @@ class Failure:
         many = self.diagnosis.not_finite
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),
+            *([f"nearest, or in the way: {_apart(self.near)}"] if self.near is not None else []),
             f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
             f"residual {size:.3g} N of forces [N] {forces}",
             f"{self._triangle()} of vertices {', '.join(map(str, triangle.vertices))} around "
@@ -186,6 +197,12 @@ class Failure:
         ends = np.cumsum(counts)
         which = int(np.searchsorted(ends, number, side="right"))
         return self.sources[which].label, number - int(ends[which] - counts[which])
+
+
+def _apart(near: NearPair) -> str:
+    """A pair, and what is left between its parts."""
+    beyond = f" beside contact.thickness = {near.kept:g} m" if near.kept else ""
+    return f"{near.words} {near.gap:.3g} m apart{beyond}"
 
 
 def _iterate(each: Iteration) -> str:

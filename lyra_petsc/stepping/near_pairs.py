@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 TOUCHING = 1e-9
 """Gap over the skin of a search up to which there is none."""
 
+TIGHT = 1e-2
+"""The same, up to which next to nothing is left."""
+
 
 @dataclass(frozen=True)
 class NearPair:
@@ -34,6 +37,9 @@ class NearPair:
         Middle of the first part [m].
     gap, kept : float
         Distance less what is to be kept, and this [m].
+    blocks : bool
+        A step may not go its way because of it, or next to nothing is left of the distance at which the
+        parts begin to feel each other.
     """
 
     parts: tuple[tuple[int, ...], ...]
@@ -41,6 +47,7 @@ class NearPair:
     position: tuple[float, ...]
     gap: float
     kept: float
+    blocks: bool
 
     @property
     def words(self) -> str:
@@ -52,20 +59,22 @@ class NearPair:
         return f"{' and '.join(named)}, around ({x:.4g}, {y:.4g}, {z:.4g}) m,"
 
 
-def nearest_pair(system: StageEquations) -> NearPair | None:
-    """The pair with the smallest gap at the state; None where none is near; collective."""
+def nearest_pair(system: StageEquations, x: Array) -> NearPair | None:
+    """The pair with the smallest gap at positions x (n_local, 3); None where none is near; collective."""
 
     def nearness(term: Elastic) -> Array:
-        return 1.0 / np.maximum(_gaps(system, term, system.x), TOUCHING * term.skin)
+        return 1.0 / np.maximum(_gaps(system, term, x), TOUCHING * term.skin)
 
-    return _worst(system, system.x, nearness)
+    return _worst(system, x, nearness)
 
 
-def blocking_pair(system: StageEquations) -> NearPair | None:
-    """The pair that lets go the least of the way that the step may not go; None without one; collective."""
+def worst_pair(system: StageEquations) -> NearPair | None:
+    """Of a step that failed: the pair that lets go the least of the way that it may not go; without such a
+    way the nearest one where the solver stands; collective.
+    """
     way = system.refused_way
     if way is None:
-        return None
+        return nearest_pair(system, system.evaluated[0])
 
     def obstruction(term: Elastic) -> Array:
         return 1.0 - term.free_parts(way.x, way.ahead, system.active.frozen[term], carried=way.carried)
@@ -101,7 +110,8 @@ def _worst(system: StageEquations, x: Array, sizes: Callable[[Elastic], Array]) 
         gap = float(_gaps(system, term, x)[row])
         gap = gap if gap > TOUCHING * term.skin else min(gap, 0.0)
         parts = tuple(tuple(int(numbers[point]) for point in part) for part in pair.parts)
-        return NearPair(parts, pair.obstacle, middle, gap, pair.kept)
+        blocks = system.refused_way is not None or gap <= TIGHT * term.skin
+        return NearPair(parts, pair.obstacle, middle, gap, pair.kept, blocks)
 
     return worst(points.comm, sized, np.concatenate(first), describe)
 

@@ -124,11 +124,14 @@ class Trace:
         self._iterations.append(Iteration(norm, linear - self._linear, reason, taken))
         self._linear, self._last = linear, here
 
-    def stuck(self) -> Stuck:
-        """Where the solve that just failed stands; collective, before the next step begins."""
+    def stuck(self, velocity: Array | None = None) -> Stuck:
+        """Where the solve that just failed stands, or one that does not begin, at a velocity (n_owned, 3);
+        collective, before the next step begins.
+        """
         system, stage = self._system, self._system.stage
         n = system.points.n_owned
-        velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
+        if velocity is None:
+            velocity = self._snes.getSolution().getArray(readonly=True).reshape(n, 3).copy()
         residual = np.empty((n, 3))
         system.residual(velocity, stage.sigma * (velocity - system.history), residual)
         position = (system.x[:n] if stage.x is None else stage.x) + stage.reach * velocity

@@ -360,7 +360,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str) -> None:
     InputError
         Where it is worst.
     """
-    near = nearest_pair(system)
+    near = nearest_pair(system, system.x)
     if near is not None and not near.gap > 0.0:
         apart, remedy = "not apart", "move them apart"
         if near.kept > 0.0:

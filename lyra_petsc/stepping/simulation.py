@@ -24,11 +24,12 @@ from lyra_petsc.stepping.compression_watch import Compression
 from lyra_petsc.stepping.energy_balance import Budget, Ledger
 from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
-from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
+from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import Failure, Tried
 from lyra_petsc.stepping.local_error import LocalError
-from lyra_petsc.stepping.problem import Problem, build_problem, events
+from lyra_petsc.stepping.near_pairs import worst_pair
+from lyra_petsc.stepping.problem import Problem, build_problem, events, refuse_contact
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
@@ -410,6 +411,7 @@ class SteppedScene:
         diagnosis = diagnose(
             problem.points, problem.membrane, system.held, stuck, system.x, system.mass, problem.tags
         )
+        near = worst_pair(system)
         now = Circumstances(
             dt=end - self.time,
             nominal=self.control.step,
@@ -431,10 +433,12 @@ class SteppedScene:
             diagnosis=diagnosis,
             advice=[
                 *([f"a smaller {stepper.stopped_by}, or none"] if stepper.stopped_by else []),
+                *([more_room(near, scene)] if near is not None and near.blocks else []),
                 *advice(diagnosis, stuck, scene, now),
             ],
             sources=outline.sources,
             stuck=stuck,
+            near=near,
         )
 
     def memory(self) -> dict[str, Any]:
@@ -514,6 +518,7 @@ class SteppedScene:
         # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)
         system.rest_at(self.time)
+        refuse_contact(system, self.scene, f"at {self._now()}")
         self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)
         if isinstance(self._seek, Equilibrium):

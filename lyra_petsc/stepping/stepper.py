@@ -244,7 +244,8 @@ class Stepper:
         stuck: Stuck | None = None
         if equations.discretisation.guards and not equations.may_move():
             self._trace.begin()
-            return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=self._trace.stuck())
+            stuck = self._trace.stuck(equations.velocity_of_staying())
+            return Attempt(False, 0, 0, math.inf, words=MEETS, stuck=stuck)
         velocity, words = self._solve(t0)
         if velocity is not None and equations.discretisation.guards and not equations.may_end(velocity):
             velocity, words = None, MEETS

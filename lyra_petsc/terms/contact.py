@@ -178,6 +178,10 @@ class Contact(Elastic):
         return places
 
     @property
+    def moving(self) -> bool:
+        return any(obstacle.motion is not None for obstacle in self.obstacles.each)
+
+    @property
     def stale(self) -> bool:  # type: ignore[override]
         moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
         return bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
@@ -319,6 +323,23 @@ class Contact(Elastic):
         number = int(self.obstacle[element])
         name = self.obstacles.each[number].name if number >= 0 else ""
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
+
+    def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
+        out, number = np.zeros((count, 6)), self.obstacle[: self.n_owned]
+        for obstacle in np.unique(number[number >= 0]):
+            of = np.flatnonzero(number == obstacle)
+            gradient, pull = np.zeros_like(x), np.zeros_like(frozen.now)
+            offset, *rest = self._constants
+            pairs = self.kind[of], self.points[of], offset[of]
+            contact_pairs.add_gradient(x, frozen.now, *pairs, *rest, gradient, pull)
+            out[obstacle] = *gradient.sum(axis=0), *np.cross(x, gradient).sum(axis=0)
+        return out
+
+    def normal_forces(self, x: Array, frozen: Places) -> Array:
+        """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
+        out = np.zeros(len(x))
+        contact_pairs.add_normal_forces(x, frozen.now, self.kind, self.points, *self._constants, out)
+        return out
 
     def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
         left = self.gaps(x, frozen)

@@ -510,3 +510,21 @@ def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # t
     for e in range(len(out)):
         one = slice(e, e + 1)
         out[e] = free_way(x, others, way, others_way, kind[one], points[one], offset[one], keep, 1.0)
+
+
+@kernel()
+def add_normal_forces(x, others, kind, points, offset, gap, stiffness, parallel, out):  # type: ignore[no-untyped-def]
+    """Add the size [N] of each pair's force to its vertices in out (n_local,), by their shares |β_i|."""
+    p, beta, gamma, slope = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
+    for e in range(len(kind)):
+        _load(x, others, points, e, p)
+        d, _ = nearest(kind[e], p, beta, gamma)
+        delta = d - offset[e]
+        if delta >= gap or delta <= 0.0:
+            continue
+        force = -stiffness * barrier(delta, gap)[1]
+        if kind[e] == EDGE_EDGE:
+            force *= _mollifier(p, parallel, slope)[0]
+        for i in range(4):
+            if points[e, i] >= 0:
+                out[Index(points[e, i])] += force * abs(beta[i])

@@ -188,6 +188,11 @@ class Elastic(Term):
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
 
+    @property
+    def moving(self) -> bool:
+        """Whether its energy depends on where something stands that moves, and does work on the sheet."""
+        return self.registration.moving
+
     @abstractmethod
     def energies(self, x: Array, frozen: Any) -> Array:
         """Energy [J] of each owned element, (n_owned,)."""
@@ -267,6 +272,12 @@ class Elastic(Term):
     def pair(self, element: int) -> Pair:
         """What an element keeps apart."""
         raise NotImplementedError
+
+    def obstacle_forces(self, x: Array, frozen: Any, count: int) -> Array | None:
+        """Force [N] on each of a scene's obstacles and its torque [N m] about the origin by this rank's
+        elements, (count, 6); None of a term that knows none.
+        """
+        return None
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""
