@@ -307,7 +307,6 @@ def test_weight_at_rest(comm: MPI.Comm) -> None:
         assert 0.0 < left.min() <= left.max() < CONTACT["gap"]
 
 
-@pytest.mark.xfail(raises=SolverError, strict=True, reason="their work is not in the energy balance yet")
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 @pytest.mark.parametrize("shape", ["plane", "sphere", "box"])
 def test_obstacles_that_move_carry_the_sheet(comm: MPI.Comm, shape: str, integrator: str) -> None:
