@@ -142,11 +142,11 @@ class Discretisation:
         assert surface is not None
         corners, places = layout.global_number[surface], x[surface]
         if comm.size > 1:
-            here = x[: layout.n_vertices]
-            box = np.array([here.min(axis=0, initial=np.inf), here.max(axis=0, initial=-np.inf)])
+            low, high = places.min(axis=1), places.max(axis=1)
+            # an element may touch an owned vertex by a triangle that meets another far from that vertex
+            box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
             boxes = np.empty((comm.size, 2, 3))
             comm.Allgather(box, boxes)
-            low, high = places.min(axis=1), places.max(axis=1)
             mine = surface[:, 0] < layout.n_owned
             sent: list[tuple[Ints, Array] | None] = []
             for rank, (least, most) in enumerate(boxes):
