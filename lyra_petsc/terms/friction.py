@@ -107,6 +107,7 @@ class Friction(Elastic):
         self.skin, self.search_distance = contact.skin, contact.search_distance
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._common]
         self._coefficients = np.array(each)
+        self._on_obstacles = np.zeros((len(contact.obstacles.each), 6))  # in the last step
         self._stiffest = HALFWAY * contact.barrier.stiffness
 
     def take(self, elements: Elements) -> None:
@@ -204,11 +205,25 @@ class Friction(Elastic):
     def accept(self, x: Array, frozen: Motion) -> None:
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         state = self._state(frozen.end)
+        self._on_obstacles = self._forces(x, state)
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
         self._pairs.slip[self._number], self._pairs.slid[self._number] = self._slip, slides
         self._renew(x, frozen.places)
+
+    def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
+        """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
+        number = self._pairs.obstacle[self._number][: self.n_owned]
+        out = np.zeros((len(self._contact.obstacles.each), 6))
+        for obstacle in np.unique(number[number >= 0]):
+            of, pull = np.flatnonzero(number == obstacle), np.zeros_like(x)
+            friction_pairs.add_gradient(x, *(part[of] for part in state), pull)
+            out[obstacle] = *pull.sum(axis=0), *np.cross(x, pull).sum(axis=0)
+        return out
+
+    def obstacle_forces(self, x: Array, frozen: Motion, count: int) -> Array:
+        return self._on_obstacles
 
     def state(self) -> dict[str, Array]:
         return {"friction_work": self._heat}
