@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.overlaps import Overlaps
 from lyra_petsc.output.agreement import on_each
-from lyra_petsc.output.crossings import RunCrossings
 from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.output.run_crossings import RunCrossings
 from lyra_petsc.parallel import on_root
 
 Ints = NDArray[np.int64]

@@ -68,7 +68,7 @@ class _Carried:
 
 
 @dataclass(frozen=True, eq=False)
-class Body(_Carried):
+class Solid(_Carried):
     """An obstacle that sheets stay out of.
 
     Attributes
@@ -138,7 +138,7 @@ class Container(_Carried):
 
 def obstacles_of(
     comm: MPI.Comm, scene: Scene, mesh: Mesh | None, motion: MakesMotion
-) -> list[Body | Container]:
+) -> list[Solid | Container]:
     """The obstacles of a scene in its order, the same on all ranks; collective.
 
     Parameters
@@ -163,7 +163,7 @@ def obstacles_of(
 
 def made(
     scene: Scene, surfaces: Mapping[str, TriangleSurface], motion: MakesMotion
-) -> list[Body | Container]:
+) -> list[Solid | Container]:
     """The obstacles of a scene in its order.
 
     Parameters
@@ -179,7 +179,7 @@ def made(
 
 def _made(
     scene: Scene, name: str, surfaces: Mapping[str, TriangleSurface], motion: MakesMotion
-) -> Body | Container:
+) -> Solid | Container:
     assert scene.obstacles is not None
     assert scene.contact is not None
     obstacle = scene.obstacles[name]
@@ -202,15 +202,15 @@ def _made(
         return Container(name, "planes", points, normals, 0.0, friction, carried)
     if obstacle.box is not None:
         corners = box_corners(obstacle.box)
-        return Body(name, corners, _BOX_EDGES.copy(), BOX_TRIANGLES.copy(), 0.0, friction, carried)
+        return Solid(name, corners, _BOX_EDGES.copy(), BOX_TRIANGLES.copy(), 0.0, friction, carried)
     if obstacle.mesh is not None:
         points, triangles = surfaces[name]
-        return Body(name, points, unique_edges(triangles), triangles, 0.0, friction, carried)
+        return Solid(name, points, unique_edges(triangles), triangles, 0.0, friction, carried)
     axis, radius = axis_of(obstacle)
     if obstacle.inside:
         return Container(name, "ball", axis, np.empty((0, 3)), radius, friction, carried)
     edges = np.array([[0, 1]] * (len(axis) - 1), dtype=np.int64).reshape(-1, 2)
-    return Body(name, axis, edges, np.empty((0, 3), dtype=np.int64), radius, friction, carried)
+    return Solid(name, axis, edges, np.empty((0, 3), dtype=np.int64), radius, friction, carried)
 
 
 def axis_of(obstacle: Obstacle) -> tuple[Array, float]:

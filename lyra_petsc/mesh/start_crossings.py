@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.mesh.obstacles import Body, Container
+from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
 from lyra_petsc.scene.schema import Scene
 
@@ -23,7 +23,7 @@ NAMED = 3
 
 
 def refuse_crossings(
-    scene: Scene, mesh: Mesh, positions: Array, obstacles: Sequence[Body | Container]
+    scene: Scene, mesh: Mesh, positions: Array, obstacles: Sequence[Solid | Container]
 ) -> None:
     """Refuse a start in which triangles cross, or are in an obstacle.
 
@@ -34,7 +34,7 @@ def refuse_crossings(
     mesh : Mesh
     positions : (V, 3) float64
         Of its vertices at t = 0 [m].
-    obstacles : sequence of Body or Container
+    obstacles : sequence of Solid or Container
         As `obstacles.made` makes them.
 
     Raises
@@ -71,21 +71,21 @@ def refuse_crossings(
                 count = _counted(len(pairs), "pair", "of a triangle of the sheet and one of it", "cross")
                 refuse(key, count, named, remedy)
         elif len(inside := _overlaps(positions, triangles, obstacle).triangles):
-            where = "into it" if isinstance(obstacle, Body) else "beyond it"
+            where = "into it" if isinstance(obstacle, Solid) else "beyond it"
             named = (f"{a} {around(a)}" for a in inside[:NAMED].tolist())
             refuse(
                 key, f"{_counted(len(inside), 'triangle', 'of the sheet', 'reach')} {where}", named, remedy
             )
 
 
-def _is_mesh(obstacle: Body | Container, scene: Scene) -> TypeGuard[Body]:
+def _is_mesh(obstacle: Solid | Container, scene: Scene) -> TypeGuard[Solid]:
     return (scene.obstacles or {})[obstacle.name].mesh is not None
 
 
-def _overlaps(positions: Array, triangles: Ints, obstacle: Body | Container) -> Overlaps:
+def _overlaps(positions: Array, triangles: Ints, obstacle: Solid | Container) -> Overlaps:
     """What of a sheet is where a sphere, capsule, box or plane does not let it."""
     sheet, points = (positions, triangles), obstacle.points
-    if isinstance(obstacle, Body):
+    if isinstance(obstacle, Solid):
         return in_ball(*sheet, points, obstacle.radius) if obstacle.radius else in_box(*sheet, points)
     if obstacle.kind == "planes":
         return beyond_planes(*sheet, points, obstacle.normals)

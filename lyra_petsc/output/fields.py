@@ -15,7 +15,7 @@ from lyra_petsc.stepping.problem import Problem
 
 if TYPE_CHECKING:
     from lyra_petsc.terms.bending import Bending
-    from lyra_petsc.terms.contact import Contact
+    from lyra_petsc.terms.contact import ContactBarrier
     from lyra_petsc.terms.midedge import MidEdge
     from lyra_petsc.terms.midedge_shape import Frames
 
@@ -107,7 +107,7 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 
 def _contact_pressure(problem: Problem) -> Array:
-    contact, system = cast("Contact", problem.terms["contact"]), problem.system
+    contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
     forces = contact.normal_forces(system.x, system.active.frozen[contact])
     return _per_area(problem, np.arange(len(forces), dtype=np.int32), forces)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.mesh.obstacles import Body, Container, made
+from lyra_petsc.mesh.obstacles import Container, Solid, made
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Motion
 
 
-def run_obstacles(run: StoredRun) -> list[Body | Container]:
+def run_obstacles(run: StoredRun) -> list[Solid | Container]:
     """The obstacles of a run, in the order of its scene.
 
     Raises

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.mesh.mesh import TriangleSurface
-from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Body, Container, axis_of, box_corners
+from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Container, Solid, axis_of, box_corners
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_obstacles import run_obstacles
 from lyra_petsc.scene.schema import Obstacle
@@ -85,7 +85,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
             shown.append(ObstacleSurface(one.name, _SQUARE, place, still, True, PLANE_OPACITY))
             continue
         if obstacle.mesh is not None:
-            assert isinstance(one, Body)
+            assert isinstance(one, Solid)
             surface = TriangleSurface(one.points, one.triangles)
         else:
             surface = shape_surface(obstacle)
@@ -96,7 +96,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
     return shown
 
 
-def _carried(obstacle: Body | Container, points: Array, time: float) -> Array:
+def _carried(obstacle: Solid | Container, points: Array, time: float) -> Array:
     rotation, translation = obstacle.displacement(time)
     carried: Array = points @ rotation.T + translation
     return carried

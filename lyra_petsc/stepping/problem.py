@@ -277,15 +277,15 @@ def _set_up_contact(
     if outline.barrier is None or scene.contact is None:
         return
     from lyra_petsc.mesh.obstacles import obstacles_of
-    from lyra_petsc.terms.contact import Contact
+    from lyra_petsc.terms.contact import ContactBarrier
 
     obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
-    contact = next(term for term in terms.values() if isinstance(term, Contact))
+    contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
     contact.set_up(outline.barrier, obstacles, itself=scene.contact.self)
     if "friction" in terms:
-        from lyra_petsc.terms.friction import Friction
+        from lyra_petsc.terms.friction import CoulombFriction
 
-        cast(Friction, terms["friction"]).set_up(contact)
+        cast(CoulombFriction, terms["friction"]).set_up(contact)
 
 
 def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Problem:

@@ -21,7 +21,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import overlapping
-from lyra_petsc.mesh.obstacles import Body, Container
+from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
@@ -84,7 +84,7 @@ class Obstacles:
         Offset [m] of each; the last, 0, is that of sheets.
     """
 
-    def __init__(self, obstacles: Sequence[Body | Container]) -> None:
+    def __init__(self, obstacles: Sequence[Solid | Container]) -> None:
         self.each = list(obstacles)
         parts: dict[str, list[Ints]] = {
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
@@ -97,7 +97,7 @@ class Obstacles:
                 filled = np.concatenate([of, np.repeat(of[:, :1], 3 - of.shape[1], axis=1)], axis=1)
                 return np.column_stack([filled + first, np.full(len(of), number)])
 
-            if isinstance(obstacle, Body):
+            if isinstance(obstacle, Solid):
                 radius[number] = obstacle.radius
                 parts["triangles"].append(rows(obstacle.triangles))
                 parts["edges"].append(rows(obstacle.edges))
@@ -134,7 +134,7 @@ class Obstacles:
         return found
 
 
-class Contact(Elastic):
+class ContactBarrier(Elastic):
     """The barrier between all near pairs.
 
     Parameters
@@ -151,7 +151,7 @@ class Contact(Elastic):
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
         self._places = np.empty((0, 3))
 
-    def set_up(self, barrier: Barrier, obstacles: Sequence[Body | Container], *, itself: bool) -> None:
+    def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
         """Take what all ranks know alike; before anything else is asked.
 
         ``itself`` says whether sheets meet sheets.
@@ -376,6 +376,6 @@ def barrier(rest: RestShape) -> Barrier:
     return Barrier(gap, thickness, stiffness, PARALLEL * shortest**4)
 
 
-def make(elements: Elements, scene: Scene, mass: Array) -> Contact:
-    """The term on one rank; `Contact.set_up` must follow."""
-    return Contact(elements.stencil.astype(np.int32))
+def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
+    """The term on one rank; `ContactBarrier.set_up` must follow."""
+    return ContactBarrier(elements.stencil.astype(np.int32))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import contact_pairs, friction_pairs
-from lyra_petsc.terms.contact import HALFWAY, Contact
+from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -60,7 +60,7 @@ class Pairs(NamedTuple):
     slid: Mask
 
 
-class Motion(NamedTuple):
+class ObstacleMoves(NamedTuple):
     """How obstacles move in a step.
 
     Attributes
@@ -83,7 +83,7 @@ def _no_pairs() -> Pairs:
     return Pairs(*nothing, np.empty(0), np.empty(0, dtype=np.bool_))
 
 
-class Friction(Elastic):
+class CoulombFriction(Elastic):
     """Friction in a step.
 
     Parameters
@@ -101,7 +101,7 @@ class Friction(Elastic):
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 1))}))
 
-    def set_up(self, contact: Contact) -> None:
+    def set_up(self, contact: ContactBarrier) -> None:
         """Know the contact whose pairs rub."""
         self._contact, self.surface = contact, contact.surface
         self.skin, self.search_distance = contact.skin, contact.search_distance
@@ -168,13 +168,13 @@ class Friction(Elastic):
 
     # -- a step ------------------------------------------------------------------------------------
 
-    def freeze(self, step: UpcomingStep) -> Motion:
+    def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles = self._contact.obstacles
         if not self._began:
             self._began = True
             self._renew(step.x, obstacles.at(step.start))
         stage, end = obstacles.moved(step.start, step.at), obstacles.moved(step.start, step.end)
-        return Motion(stage, end, obstacles.at(step.end))
+        return ObstacleMoves(stage, end, obstacles.at(step.end))
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
@@ -188,21 +188,21 @@ class Friction(Elastic):
             self._moved, self._start = moved, start
         return self.stencil, self._beta, self._normal, self._start, self._slip, self._spring, self._limit
 
-    def energies(self, x: Array, frozen: Motion) -> Array:
+    def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
         out = np.empty(self.n_owned)
         friction_pairs.energies(x, *self._state(frozen.stage), out)
         return out
 
-    def add_gradient(self, x: Array, frozen: Motion, out: Array) -> None:
+    def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
         friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
 
-    def hessians(self, x: Array, frozen: Motion, lo: int, hi: int, blend: float, out: Array) -> None:
+    def hessians(self, x: Array, frozen: ObstacleMoves, lo: int, hi: int, blend: float, out: Array) -> None:
         friction_pairs.hessians(x, *self._state(frozen.stage), lo, out)
 
     def force_scale(self, size: float) -> Array:
         return self._spring * size
 
-    def accept(self, x: Array, frozen: Motion) -> None:
+    def accept(self, x: Array, frozen: ObstacleMoves) -> None:
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         state = self._state(frozen.end)
         self._on_obstacles = self._forces(x, state)
@@ -222,7 +222,7 @@ class Friction(Elastic):
             out[obstacle] = *pull.sum(axis=0), *np.cross(x, pull).sum(axis=0)
         return out
 
-    def obstacle_forces(self, x: Array, frozen: Motion, count: int) -> Array:
+    def obstacle_forces(self, x: Array, frozen: ObstacleMoves, count: int) -> Array:
         return self._on_obstacles
 
     def state(self) -> dict[str, Array]:
@@ -231,7 +231,7 @@ class Friction(Elastic):
     def restore(self, state: Mapping[str, Array]) -> None:
         self._heat = state["friction_work"].copy()
 
-    def history(self, x: Array, frozen: Motion) -> Mapping[str, float]:
+    def history(self, x: Array, frozen: ObstacleMoves) -> Mapping[str, float]:
         return {"friction_work": float(self._heat[:, 0].sum())}
 
 
@@ -239,6 +239,6 @@ def elements(rest: RestShape) -> None:
     """There are none before anything touches."""
 
 
-def make(elements: None, scene: Scene, mass: Array) -> Friction:
-    """The term on one rank; `Friction.set_up` must follow."""
-    return Friction(scene, len(mass))
+def make(elements: None, scene: Scene, mass: Array) -> CoulombFriction:
+    """The term on one rank; `CoulombFriction.set_up` must follow."""
+    return CoulombFriction(scene, len(mass))

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import mesh_of
-from lyra_petsc.mesh.obstacles import Body, Container, obstacles_of
+from lyra_petsc.mesh.obstacles import Container, Solid, obstacles_of
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.load import scene_of
 from lyra_petsc.scene.schema import Scene
@@ -65,7 +65,7 @@ def scene(obstacle: dict[str, Any], **more: Any) -> Scene:
     return scene_of(blocks | more)
 
 
-def built(comm: MPI.Comm, obstacle: dict[str, Any], **more: Any) -> Body | Container:
+def built(comm: MPI.Comm, obstacle: dict[str, Any], **more: Any) -> Solid | Container:
     whole = scene(obstacle, **more)
     mesh = on_root(comm, lambda: mesh_of(whole), share=False)
     (one,) = obstacles_of(comm, whole, mesh, Motion)
@@ -79,7 +79,7 @@ def signed_volume(x: np.ndarray, triangles: np.ndarray) -> float:
 
 def test_a_box_is_a_closed_body(comm: MPI.Comm) -> None:
     box = built(comm, BOX)
-    assert isinstance(box, Body)
+    assert isinstance(box, Solid)
     assert box.radius == 0.0
     assert (len(box.points), len(box.edges), len(box.triangles)) == (8, 12, 12)
     assert signed_volume(box.points, box.triangles) == pytest.approx(1 * 4 * 2)
@@ -104,8 +104,8 @@ def test_a_box_is_a_container_of_six_planes(comm: MPI.Comm) -> None:
 
 def test_sphere_and_capsule_keep_a_distance_from_point_and_edge(comm: MPI.Comm) -> None:
     ball, rod = built(comm, SPHERE), built(comm, CAPSULE)
-    assert isinstance(ball, Body)
-    assert isinstance(rod, Body)
+    assert isinstance(ball, Solid)
+    assert isinstance(rod, Solid)
     assert (ball.points.tolist(), ball.edges.shape, ball.triangles.shape) == ([[3, 2, 1]], (0, 2), (0, 3))
     assert (rod.points.tolist(), rod.edges.tolist()) == ([[0, 0, 1], [0, 2, 1]], [[0, 1]])
     assert rod.triangles.shape == (0, 3)
@@ -178,8 +178,8 @@ def test_every_kind_of_mesh_file(comm: MPI.Comm, shared_tmp: Path, name: str) ->
     plain, placed = (
         built(comm, {"mesh": {"file": str(shared_tmp / name), "transform": each}}) for each in ({}, transform)
     )
-    assert isinstance(plain, Body)
-    assert isinstance(placed, Body)
+    assert isinstance(plain, Solid)
+    assert isinstance(placed, Solid)
     assert plain.radius == 0.0
     x, y, z = plain.points.T
     np.testing.assert_allclose(placed.points, np.stack([-2 * y, 2 * x, z + 5], axis=1), atol=1e-14)

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from physics import Simulation, grid, obj_file
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.terms.contact import Contact
+from lyra_petsc.terms.contact import ContactBarrier
 
 pytestmark = pytest.mark.parallel
 
@@ -100,7 +100,7 @@ def test_nearer_than_thickness(comm: MPI.Comm) -> None:
     scene = obstacle(plane={"point": [0, 0, -0.003], "normal": [0, 0, 1]})
     with Simulation(scene | {"contact": {"gap": 0.02, "thickness": 0.002}}, comm) as simulation:
         system, contact = simulation.system, simulation.problem.terms["contact"]
-        assert isinstance(contact, Contact)
+        assert isinstance(contact, ContactBarrier)
         energies = contact.energies(system.x, system.active.frozen[contact])
         total = comm.allreduce(float(energies.sum()))
     # of 25 vertices at the first state, of which no step has been taken

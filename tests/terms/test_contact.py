@@ -15,10 +15,10 @@ from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
-from lyra_petsc.mesh.obstacles import Body, Container
+from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import beyond_planes, in_ball, out_of_ball
 from lyra_petsc.stepping.simulation import SteppedScene
-from lyra_petsc.terms.contact import Contact
+from lyra_petsc.terms.contact import ContactBarrier
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -47,7 +47,7 @@ class Watched:
         content = {"material": MATERIAL, "contact": CONTACT, "solver": TIGHT} | scene
         self.comm, self.simulation = comm, SteppedScene(comm, scene_of(content))
         term = self.simulation.problem.terms["contact"]
-        assert isinstance(term, Contact)
+        assert isinstance(term, ContactBarrier)
         self.term = term
         self.system = self.simulation.problem.system
         layout = self.system.points
@@ -92,7 +92,7 @@ class Watched:
             found.append(self._in(x, obstacle))
         assert not any(found), f"t = {self.simulation.time}: {found} cross"
 
-    def _in(self, x: Array, obstacle: Body | Container) -> int:
+    def _in(self, x: Array, obstacle: Solid | Container) -> int:
         at = obstacle.positions(self.simulation.time)
         if isinstance(obstacle, Container) and obstacle.kind == "planes":
             normals = obstacle.normals_at(self.simulation.time)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.mesh.crossings import have_common_vertex, mutual_crossings, self_crossings
-from lyra_petsc.mesh.obstacles import Body, Container
+from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_obstacles import run_obstacles
@@ -68,7 +68,7 @@ class RunCrossings:
         return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 
 
-def _overlap(obstacle: Body | Container, triangles: Ints, *, is_box: bool) -> Overlap:
+def _overlap(obstacle: Solid | Container, triangles: Ints, *, is_box: bool) -> Overlap:
     """The function that finds what of a sheet with some triangles is in an obstacle."""
 
     def overlap(x: Array, time: float) -> Overlaps:
