@@ -63,7 +63,7 @@ def test_gather_is_the_transpose(bent: tuple[Simulation, MidEdge, EdgeTurns]) ->
     force = np.where(vertices, 0.0, np.sin(17.0 * np.arange(x.size)).reshape(x.shape)).astype(np.float32)
     followed, gathered = movement.copy(), np.column_stack([force, np.zeros(len(x), dtype=np.float32)])
     turns.follow(followed)
-    turns.gather(gathered)
+    turns.gather(force, gathered)
     there, back = np.vdot(followed - movement, force), np.vdot(movement, gathered[:, :3] - force)
     assert there == pytest.approx(back, rel=1e-4)
     assert abs(there) > 0.1

@@ -21,7 +21,7 @@ GAP, STEP = 0.01, 0.01
 CLEAR = 0.94
 """Part of the gap at which the sheet starts, near where its weight holds it."""
 
-SETTLED, END, SLID = 1.0, 3.0, 0.8
+SETTLED, END, SLID = 1.0, 3.0, 1.5
 """Times [s]: from when a sheet that sticks must stand, its end, that of a sheet that slides."""
 
 
