@@ -122,7 +122,7 @@ class Newton:
             useless = self._useless(residual, y)
         if self.globalisation.trusts:
             changed |= self._follow_triangles(x, residual, y)
-        if self._equations.active.limiting:
+        if self._equations.limits_steps:
             fraction = self._equations.largest_step(self._array(x), -self._array(y))
             y.scale(fraction)
             changed |= fraction < 1.0

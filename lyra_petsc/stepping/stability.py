@@ -142,9 +142,8 @@ class Examination:
                 best, lowest = length, value
         if best == 0.0:
             return None
-        way = best * mode
-        if self._system.active.limiting:
-            system = self._system
+        way, system = best * mode, self._system
+        if system.limits_steps:
             way *= system.largest_step(np.zeros_like(mode), way / system.stage.reach)
         return way
 

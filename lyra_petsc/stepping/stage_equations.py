@@ -42,6 +42,9 @@ from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
+FARTHEST_TURN = 0.5
+"""Angle [rad] by which a Newton iteration of a static analysis may turn a director."""
+
 LEAST = 1e-6
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
 
@@ -400,11 +403,22 @@ class StageEquations:
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
 
+    @property
+    def limits_steps(self) -> bool:
+        """Whether `largest_step` may be less than 1: also in statics with directors, which would else go to
+        quite another equilibrium.
+        """
+        return bool(self.active.limiting) or (bool(self.active.edged) and not self.integrator.moves)
+
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
         x, ahead = self._ahead(v, way)
-        fraction = min(t.largest_step(x, ahead, self.active.frozen[t]) for t in self.active.limiting)
-        fraction = min(fraction, self.discretisation.largest_step(x, ahead))
+        fraction = self.discretisation.largest_step(x, ahead)
+        for term in self.active.limiting:
+            fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
+        for term in () if self.integrator.moves else self.active.edged:
+            turn = term.largest_turn(ahead[: len(way)])
+            fraction = min(fraction, FARTHEST_TURN / turn) if turn > 0.0 else fraction
         return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
 
     def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:

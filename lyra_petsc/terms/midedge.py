@@ -264,6 +264,11 @@ class MidEdge(Elastic):
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
         )
 
+    def largest_turn(self, way: Array) -> float:
+        places, length = self.of_edges.places, self.of_edges.length
+        own = places < way.size
+        return float(np.abs(way.ravel()[places[own]] / length[own]).max(initial=0.0))
+
     def force_scale(self, size: float) -> Array:
         data = self.elements.data
         trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)

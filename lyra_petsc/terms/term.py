@@ -306,6 +306,10 @@ class Elastic(Term):
     def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
         """Go on with a state of edges at positions x (n_local, 3)."""
 
+    def largest_turn(self, way: Array) -> float:
+        """Largest angle [rad] by which directors of owned edges turn on a way (n_owned, 3)."""
+        return 0.0
+
     @property
     def edge_stiffness(self) -> Array:
         """Of their unknowns at rest, (n,) [N/m]."""
