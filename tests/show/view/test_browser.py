@@ -81,7 +81,19 @@ class Seen:
         self.elements(f".v-select:has(#{list_name})")[0].click()
         items = ".v-overlay--active .v-list-item"
         self.until(lambda: any(item.text == words for item in self.elements(items)))
-        next(item for item in self.elements(items) if item.text == words).click()
+        wanted = next(item for item in self.elements(items) if item.text == words)
+
+        def clicked():
+            from selenium.common.exceptions import ElementClickInterceptedException
+
+            self.browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", wanted)
+            try:
+                wanted.click()
+            except ElementClickInterceptedException:  # the list is still opening
+                return False
+            return True
+
+        self.until(clicked)
         self.until(lambda: not self.elements(items))
 
     def complaints(self):
