@@ -119,50 +119,28 @@ class Discretisation:
         """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices;
         collective.
         """
-        layout = self.layout
-        here = x[: layout.n_vertices]
-        numbers, positions = self._near(here, term.search_distance)
-        candidates = np.concatenate([layout.start + np.arange(len(here)), numbers])
-        points = np.concatenate([here, positions])
+        layout, n = self.layout, self.layout.n_vertices
+        own, here = layout.start + np.arange(n), x[:n]
         triangles = np.empty((0, 3), dtype=np.int64)
-        if term.surface is not None:
-            candidates, points, triangles = self._with_triangles(term, x, candidates, points)
-        stencil, what = term.neighbours(points, candidates, triangles)
-        own = (stencil < len(here)).any(axis=1)
-        return candidates[stencil[own]], what[own]
-
-    def _with_triangles(
-        self, term: Elastic, x: Array, candidates: Ints, points: Array
-    ) -> tuple[Ints, Array, Ints]:
-        """Further points, owned ones first, and the triangles (F, 3) of the surface that are near;
-        collective.
-        """
-        layout = self.layout
-        comm, surface, distance = layout.comm, term.surface, term.search_distance
-        assert surface is not None
-        corners, places = layout.global_number[surface], x[surface]
-        if comm.size > 1:
+        if term.surface is None:
+            numbers, positions = self._with_near(own, here[:, None], term.search_distance, own >= 0)
+            points = positions[:, 0]
+        else:
+            corners, places = layout.global_number[term.surface], x[term.surface]
+            mine = term.surface[:, 0] < layout.n_owned  # each triangle is sent once
             # who meets a triangle that reaches out to a ghost counts for its owned vertices, too
-            low, high = places.min(axis=1), places.max(axis=1)
-            box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
-            boxes = np.empty((comm.size, 2, 3))
-            comm.Allgather(box, boxes)
-            mine = surface[:, 0] < layout.n_owned
-            sent: list[tuple[Ints, Array] | None] = []
-            for rank, (least, most) in enumerate(boxes):
-                near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
-                sent.append((corners[near], places[near]) if rank != comm.rank and near.any() else None)
-            received = [part for part in comm.alltoall(sent) if part is not None]
-            corners = np.concatenate([corners, *(part[0] for part in received)])
-            places = np.concatenate([places, *(part[1] for part in received)])
+            corners, places = self._with_near(corners, places, term.search_distance, mine)
             _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
             corners, places = corners[np.sort(first)], places[np.sort(first)]
-        numbers, first = np.unique(corners, return_index=True)
-        more = ~np.isin(numbers, candidates)
-        candidates = np.concatenate([candidates, numbers[more]])
-        points = np.concatenate([points, places.reshape(-1, 3)[first[more]]])
-        order = np.argsort(candidates)
-        return candidates, points, order[np.searchsorted(candidates, corners, sorter=order)]
+            others, first = np.unique(corners, return_index=True)
+            more = ~np.isin(others, own)
+            numbers = np.concatenate([own, others[more]])
+            points = np.concatenate([here, places.reshape(-1, 3)[first[more]]])
+            order = np.argsort(numbers)
+            triangles = order[np.searchsorted(numbers, corners, sorter=order)]
+        stencil, what = term.neighbours(points, numbers, triangles)
+        touching = (stencil < n).any(axis=1)
+        return numbers[stencil[touching]], what[touching]
 
     def _moved(self, here: Array) -> bool:
         """Whether points of this rank may be near that were not when stencils were looked for."""
@@ -172,24 +150,35 @@ class Discretisation:
         farthest = float(np.einsum("ij,ij->i", way, way).max(initial=0.0))
         return not np.sqrt(farthest) <= 0.5 * min(term.skin for term in self._changing)
 
-    def _near(self, here: Array, distance: float) -> tuple[Ints, Array]:
-        """Global numbers (n,) and positions (n, 3) of others' vertices near this rank's box; collective."""
-        layout = self.layout
-        comm = layout.comm
+    def _with_near(
+        self, numbers: Ints, places: Array, distance: float, mine: NDArray[np.bool_]
+    ) -> tuple[Ints, Array]:
+        """This rank's vertices or triangles and those of others that are near its box; collective.
+
+        Parameters
+        ----------
+        numbers, places : (n, …), (n, m, 3)
+            Global numbers of their points, and where these are [m].
+        distance : float [m]
+        mine : (n,)
+            Which of them this rank sends.
+        """
+        comm = self.layout.comm
         if comm.size == 1:
-            return np.empty(0, dtype=np.int64), np.empty((0, 3))
-        box = np.array([here.min(axis=0, initial=np.inf), here.max(axis=0, initial=-np.inf)])
+            return numbers, places
+        low, high = places.min(axis=1), places.max(axis=1)
+        box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
         boxes = np.empty((comm.size, 2, 3))
         comm.Allgather(box, boxes)
         sent: list[tuple[Ints, Array] | None] = []
-        for rank, (low, high) in enumerate(boxes):
-            inside = ((here >= low - distance) & (here <= high + distance)).all(axis=1)
-            near = np.flatnonzero(inside) if rank != comm.rank else np.empty(0, dtype=np.int64)
-            sent.append((layout.start + near, here[near]) if len(near) else None)
+        for rank, (least, most) in enumerate(boxes):
+            near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
+            sent.append((numbers[near], places[near]) if rank != comm.rank and near.any() else None)
         received = [part for part in comm.alltoall(sent) if part is not None]
-        numbers = [np.empty(0, dtype=np.int64), *(part[0] for part in received)]
-        positions = [np.empty((0, 3)), *(part[1] for part in received)]
-        return np.concatenate(numbers), np.concatenate(positions)
+        return (
+            np.concatenate([numbers, *(part[0] for part in received)]),
+            np.concatenate([places, *(part[1] for part in received)]),
+        )
 
     def _elements(self, stencil: Ints, what: Ints) -> Elements:
         """Elements of rows given by global numbers (E, n), and what goes with them (E, m), in local numbers;

@@ -484,6 +484,15 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
     return most
 
 
+@kernel(inline="always")
+def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-untyped-def]
+    """Normal force [N] of a pair; 0 out of the barrier's reach."""
+    if not 0.0 < delta < gap:
+        return 0.0
+    force = -stiffness * barrier(delta, gap)[1]
+    return force * _mollifier(p, parallel, slope)[0] if kind == EDGE_EDGE else force
+
+
 @kernel()
 def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, normal, force):  # type: ignore[no-untyped-def]  # fmt: skip
     """β (E, 4), unit normals (E, 3) towards the first simplex and normal forces (E,) [N] of pairs."""
@@ -492,11 +501,7 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, no
         _load(x, others, points, e, p)
         d, _ = nearest(kind[e], p, beta[e], gamma)
         delta = d - offset[e]
-        force[e] = 0.0
-        if 0.0 < delta < gap:
-            force[e] = -stiffness * barrier(delta, gap)[1]
-            if kind[e] == EDGE_EDGE:
-                force[e] *= _mollifier(p, parallel, slope)[0]
+        force[e] = _force(p, kind[e], delta, gap, stiffness, parallel, slope)
         for k in range(3):
             g = 0.0
             for i in range(4):
@@ -519,12 +524,7 @@ def add_normal_forces(x, others, kind, points, offset, gap, stiffness, parallel,
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         d, _ = nearest(kind[e], p, beta, gamma)
-        delta = d - offset[e]
-        if delta >= gap or delta <= 0.0:
-            continue
-        force = -stiffness * barrier(delta, gap)[1]
-        if kind[e] == EDGE_EDGE:
-            force *= _mollifier(p, parallel, slope)[0]
+        force = _force(p, kind[e], d - offset[e], gap, stiffness, parallel, slope)
         for i in range(4):
             if points[e, i] >= 0:
                 out[Index(points[e, i])] += force * abs(beta[i])
