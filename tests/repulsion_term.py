@@ -39,7 +39,7 @@ class Repulsion(Elastic):
         distance = np.linalg.norm(way, axis=1)
         return way / distance[:, None], distance, np.maximum(DISTANCE - distance, 0.0)
 
-    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         """Pairs of points, the one with the smaller number first."""
         near = ((x[:, None] - x[None]) ** 2).sum(axis=2) < self.search_distance**2
         one, other = np.nonzero(near & (numbers[:, None] < numbers[None]))

@@ -1,28 +1,50 @@
 """Which rows a rank knows and which of them the matrix couples: made anew as stencils change.
 
 Terms with fixed stencils give a pattern once. Terms whose stencils change (``Registration.neighbours``) look
-for their elements anew when a vertex has moved by more than half their skin; points of other ranks that they
-need become further ghosts, after the present ones, so that what fixed stencils refer to stays where it is.
-The pattern behind follows when a matrix is wanted (`Discretisation.renew_pattern`). Code that keeps arrays of
-n_local rows or of n_blocks blocks compares them with ``layout`` and ``rows``.
+for their elements anew when a vertex has moved by more than half their skin from the way that it was expected
+to go; points of other ranks that they need become further ghosts, after the present ones, so that what fixed
+stencils refer to stays where it is. The pattern behind follows when a matrix is wanted
+(`Discretisation.renew_pattern`), and is kept while it has all blocks. Code that keeps arrays of n_local rows
+or of n_blocks blocks compares them with ``layout`` and ``rows``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.kernels.cache import cached
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.linear.pattern import BlockPattern
+from lyra_petsc.linear.pattern import BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+FEW = 0.1
+"""Blocks that are of no use any longer, over all of fixed stencils, up to which they are kept."""
+
+
+@cached()
+def _farthest(x, to, start, end, out):  # type: ignore[no-untyped-def]
+    """Squares of the farthest from start to x, from end to ``to``, from start to ``to``, from end to x."""
+    out[:] = 0.0
+    for i in range(len(x)):
+        s = e = m = n = 0.0
+        for k in range(3):
+            s += (x[i, k] - start[i, k]) ** 2
+            e += (to[i, k] - end[i, k]) ** 2
+            m += (to[i, k] - start[i, k]) ** 2
+            n += (x[i, k] - end[i, k]) ** 2
+        for k, square in enumerate((s, e, m, n)):
+            if not square <= out[k]:  # or no number
+                out[k] = square
 
 
 class Discretisation:
@@ -57,41 +79,80 @@ class Discretisation:
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
         self.place: Ints | None = None
-        self._current = not self._changing  # their offsets are not in the fixed pattern
-        self._searched: Array | None = None
+        self._located = False  # whether the pattern has the offsets of the present stencils
+        self._searching = [term for term in self._changing if term.search_distance > 0.0]
+        self._way: tuple[Array, Array] | None = None  # along which what is near is known
+        self._found: dict[Elastic, tuple[Ints, Ints]] = {}
+        self._extra = np.empty(0, dtype=np.int64)  # keys of the blocks that ``fixed`` has not
 
     @property
     def changes(self) -> bool:
         """Whether any stencils depend on the positions."""
         return bool(self._changing)
 
-    def follow(self, x: Array) -> bool:
-        """Let stencils be those at positions x (n_local, 3) [m]; whether ghosts are others; collective."""
-        layout = self.layout
-        comm, here = layout.comm, x[: layout.n_vertices]
+    def follow(self, x: Array, ahead: Array | None = None) -> bool:
+        """Let stencils be those at positions x (n_local, 3) [m]; whether ghosts are others; collective.
+
+        ``ahead`` (n_local, 3) [m] is the way that points are expected to go together from there.
+        """
         if not self._changing:
             return False
-        moved = self._moved(here) or any([term.stale for term in self._changing])
-        if not comm.allreduce(int(moved), MPI.MAX):
+        here = x[: self.layout.n_vertices]
+        to = here if ahead is None else here + ahead[: len(here)]
+        asked = self._renewed(here, to)
+        if not asked:
             return False
-        self._searched = here.copy()
-        found = [self._search(term, x) for term in self._changing]
-        every = np.unique(np.concatenate([stencil.ravel() for stencil, _ in found]))
+        comm, layout = self.layout.comm, self.layout
+        if self._searching and asked[0] is self._searching[0]:
+            self._way = here.copy(), to.copy()
+        way = np.zeros_like(x) if ahead is None else ahead
+        for term in asked:
+            searches = term.search_distance > 0.0
+            self._found[term] = self._search(term, x, way) if searches else term.known()
+        every = np.unique(np.concatenate([stencil.ravel() for stencil, _ in self._found.values()]))
         end = layout.start + layout.n_owned
         more = np.setdiff1d(every[(every < layout.start) | (every >= end)], self._fixed_layout.ghosts)
         present = layout.ghosts[len(self._fixed_layout.ghosts) :]
-        others = bool(comm.allreduce(int(not np.array_equal(more, present)), MPI.MAX))
+        others = bool(comm.allreduce(int(not np.isin(more, present).all()), MPI.MAX))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()
             self.layout = layout = self._fixed_layout.with_ghosts(more)
         changed = others
-        for term, (stencil, what) in zip(self._changing, found, strict=True):
-            elements = self._elements(stencil, what)
+        for term in self._changing if others else asked:
+            elements = self._elements(*self._found[term])
             changed |= not np.array_equal(elements.stencil, term.stencil)
             term.take(elements)
-        self._current &= not comm.allreduce(int(changed), MPI.MAX)
+        self._located &= not changed
         return others
+
+    def _renewed(self, here: Array, to: Array) -> list[Elastic]:
+        """Terms whose elements may be others along the way of owned vertices; collective.
+
+        If any that search, then all that do, and they come first.
+        """
+        flags = [True, True, True]
+        if self._way is not None:
+            reach = 0.5 * min([term.skin for term in self._searching], default=np.inf)
+            # all are at one and the same part of the way that was searched
+            from_start, from_end, along, back = self._from_way(here, to) > reach**2
+            flags = [from_start or along, from_end or back, from_start or from_end]
+        stale = [term.stale for term in self._changing]
+        found = np.array([*flags, *stale], dtype=np.int64)
+        self.layout.comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
+        searches = bool(self._searching) and bool(found[:3].all())
+        told = [term for term, new in zip(self._changing, found[3:], strict=True) if new]
+        searches |= any(term in self._searching for term in told)
+        if not self._found:
+            return [*self._searching, *(term for term in self._changing if term not in self._searching)]
+        return [*(self._searching if searches else []), *(t for t in told if t not in self._searching)]
+
+    def _from_way(self, x: Array, to: Array) -> Array:
+        """What `_farthest` finds on this rank of a way from x to ``to``; infinite where it is no number."""
+        assert self._way is not None
+        out = np.empty(4)
+        _farthest(x, to, *self._way, out)
+        return np.where(np.isnan(out), np.inf, out)
 
     @property
     def guards(self) -> bool:
@@ -99,34 +160,45 @@ class Discretisation:
         return any(np.isfinite(term.unseen) for term in self._changing)
 
     def largest_step(self, x: Array, way: Array) -> float:
-        """Fraction, up to 1, of the way (n_owned, 3) [m] from x that this rank's vertices may go until
-        stencils are looked for again.
+        """Fraction, up to 1, of the way (n_owned, 3) [m] from x that vertices may go until stencils are
+        looked for again; collective.
         """
-        if not self.guards or self._searched is None:
+        if not self.guards or self._way is None:
             return 1.0
         n = self.layout.n_vertices
-        reach = 0.5 * min(term.unseen for term in self._changing)
-        gone, way = x[:n] - self._searched, way[:n]
+        reach = 0.5 * min(term.unseen for term in self._searching)
+        x, way = x[:n], way[:n]
+        start, end = self._way
+        from_start, from_end, _, back = self._from_way(x, x + way) > reach**2
+        flags = np.array([back, from_start or from_end], dtype=np.int64)
+        self.layout.comm.Allreduce(MPI.IN_PLACE, flags, MPI.MAX)
+        at_start, apart = flags
+        if at_start and not apart:
+            return 1.0
+        gone = x - (start if at_start else end)
         # |gone + f way| = reach
         square, mixed = np.einsum("ij,ij->i", way, way), np.einsum("ij,ij->i", gone, way)
         left = np.maximum(reach**2 - np.einsum("ij,ij->i", gone, gone), 0.0)
         root = np.sqrt(mixed**2 + square * left)
         with np.errstate(divide="ignore", invalid="ignore"):
             fraction = np.where(mixed > 0.0, left / (mixed + root), (root - mixed) / square)
-        return float(np.nanmin(np.where(square > 0.0, fraction, 1.0), initial=1.0))
+        least = float(np.nanmin(np.where(square > 0.0, fraction, 1.0), initial=1.0))
+        return float(self.layout.comm.allreduce(least, MPI.MIN))
 
-    def _search(self, term: Elastic, x: Array) -> tuple[Ints, Ints]:
-        """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices;
-        collective.
+    def _search(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints]:
+        """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on
+        their ways (n_local, 3); collective.
         """
         layout, n = self.layout, self.layout.n_vertices
-        own, here = layout.start + np.arange(n), x[:n]
+        own, moves = layout.start + np.arange(n), np.stack([x, way], axis=1)
         triangles = np.empty((0, 3), dtype=np.int64)
         if term.surface is None:
-            numbers, positions = self._with_near(own, here[:, None], term.search_distance, own >= 0)
-            points = positions[:, 0]
+            numbers, moves = self._with_near(own, moves[:n, None], term.search_distance, own >= 0)
+            moves = moves[:, 0]
+        elif layout.comm.size == 1:
+            numbers, moves, triangles = own, moves[:n], term.surface.astype(np.int64)
         else:
-            corners, places = layout.global_number[term.surface], x[term.surface]
+            corners, places = layout.global_number[term.surface], moves[term.surface]
             mine = term.surface[:, 0] < layout.n_owned  # each triangle is sent once
             # who meets a triangle that reaches out to a ghost counts for its owned vertices, too
             corners, places = self._with_near(corners, places, term.search_distance, mine)
@@ -135,49 +207,43 @@ class Discretisation:
             others, first = np.unique(corners, return_index=True)
             more = ~np.isin(others, own)
             numbers = np.concatenate([own, others[more]])
-            points = np.concatenate([here, places.reshape(-1, 3)[first[more]]])
+            moves = np.concatenate([moves[:n], places.reshape(-1, 2, 3)[first[more]]])
             order = np.argsort(numbers)
             triangles = order[np.searchsorted(numbers, corners, sorter=order)]
-        stencil, what = term.neighbours(points, numbers, triangles)
+        points, ways = np.ascontiguousarray(moves[:, 0]), np.ascontiguousarray(moves[:, 1])
+        stencil, what = term.neighbours(points, ways, numbers, triangles)
         touching = (stencil < n).any(axis=1)
         return numbers[stencil[touching]], what[touching]
 
-    def _moved(self, here: Array) -> bool:
-        """Whether points of this rank may be near that were not when stencils were looked for."""
-        if self._searched is None:
-            return True
-        way = here - self._searched
-        farthest = float(np.einsum("ij,ij->i", way, way).max(initial=0.0))
-        return not np.sqrt(farthest) <= 0.5 * min(term.skin for term in self._changing)
-
     def _with_near(
-        self, numbers: Ints, places: Array, distance: float, mine: NDArray[np.bool_]
+        self, numbers: Ints, moves: Array, distance: float, mine: NDArray[np.bool_]
     ) -> tuple[Ints, Array]:
         """This rank's vertices or triangles and those of others that are near its box; collective.
 
         Parameters
         ----------
-        numbers, places : (n, …), (n, m, 3)
-            Global numbers of their points, and where these are [m].
+        numbers, moves : (n, …), (n, m, 2, 3)
+            Global numbers of their points, and where these are and which way they go [m].
         distance : float [m]
         mine : (n,)
             Which of them this rank sends.
         """
         comm = self.layout.comm
         if comm.size == 1:
-            return numbers, places
-        low, high = places.min(axis=1), places.max(axis=1)
+            return numbers, moves
+        passed = np.concatenate([moves[:, :, 0], moves.sum(axis=2)], axis=1)
+        low, high = passed.min(axis=1), passed.max(axis=1)
         box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
         boxes = np.empty((comm.size, 2, 3))
         comm.Allgather(box, boxes)
         sent: list[tuple[Ints, Array] | None] = []
         for rank, (least, most) in enumerate(boxes):
             near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
-            sent.append((numbers[near], places[near]) if rank != comm.rank and near.any() else None)
+            sent.append((numbers[near], moves[near]) if rank != comm.rank and near.any() else None)
         received = [part for part in comm.alltoall(sent) if part is not None]
         return (
             np.concatenate([numbers, *(part[0] for part in received)]),
-            np.concatenate([places, *(part[1] for part in received)]),
+            np.concatenate([moves, *(part[1] for part in received)]),
         )
 
     def _elements(self, stencil: Ints, what: Ints) -> Elements:
@@ -196,17 +262,29 @@ class Discretisation:
             int(counted.sum()),
         )
 
-    def renew_pattern(self) -> bool:
-        """Let ``rows`` have the blocks of the present stencils; whether they are others than before."""
-        if self._current:
+    def renew_pattern(self, acting: Callable[[Elastic], NDArray[np.bool_]]) -> bool:
+        """Let ``rows`` have the blocks of those elements that act (E,); whether they are others than before.
+
+        Blocks of earlier ones stay while they are `FEW`; other elements have an offset where there is one.
+        Collective.
+        """
+        if not self._changing:
             return False
-        couplings: dict[str, Coupling] = {}
-        for term in self._changing:
-            couplings |= term.couplings
-        pattern, self.place = self.fixed.pattern.extended(couplings, self.layout.n_local)
-        self.rows = BlockRows(pattern)
-        self._current = True
-        return True
+        n_local, extra, before = self.layout.n_local, self._extra, self.rows
+        stencils = [term.stencil[acting(term)] for term in self._changing]
+        needed = self.fixed.pattern.missing(stencils, n_local)
+        every = union(needed, extra) if self.rows.pattern.n_local == n_local else needed
+        fits = self.place is not None and len(every) == len(extra) and n_local == self.rows.pattern.n_local
+        if self.layout.comm.allreduce(int(not fits), MPI.MAX):
+            few = len(every) <= 2 * len(needed) + FEW * self.fixed.pattern.n_blocks
+            self._extra = every if few else needed
+            pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
+            self.rows = BlockRows(pattern)
+            self._located = False
+        if not self._located:
+            self.rows.pattern.locate({term.name: term.stencil for term in self._changing})
+            self._located = True
+        return self.rows is not before
 
     def destroy(self) -> None:
         """Free the communication objects; collective."""

@@ -5,6 +5,7 @@ The matrices are symmetric: of two blocks that are each other's transpose one is
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.kernels.cache import cached
 from lyra_petsc.terms.term import Across, Coupling, Couplings, WithEdges
 
 if TYPE_CHECKING:
@@ -22,6 +24,33 @@ Ints = NDArray[np.int64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 LARGEST_INT32 = 2**31 - 1
+
+
+MISSING = -2
+"""Offset of a coupling that has no block."""
+
+
+@cached()
+def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
+    """Offsets (E, n (n + 1) / 2) of all couplings of elements (E, n)."""
+    for e in range(len(stencil)):
+        pair = 0
+        for a in range(stencil.shape[1]):
+            for b in range(a, stencil.shape[1]):
+                row, column = min(stencil[e, a], stencil[e, b]), max(stencil[e, a], stencil[e, b])
+                found = -1
+                if row < len(indptr) - 1:
+                    lo, hi = indptr[row], indptr[row + 1]
+                    while hi - lo > 1:
+                        middle = (lo + hi) // 2
+                        if columns[middle] <= column:
+                            lo = middle
+                        else:
+                            hi = middle
+                    same = columns[lo] == column
+                    found = 2 * lo + (1 if stencil[e, a] < stencil[e, b] else 0) if same else MISSING
+                out[e, pair] = found
+                pair += 1
 
 
 class BlockPattern:
@@ -67,8 +96,28 @@ class BlockPattern:
                 self.offsets[alike[0]] if alike else _offsets(coupling, keys, self.n_owned, n_local)
             )
 
-    def extended(self, couplings: Couplings, n_local: int) -> tuple[BlockPattern, Ints]:
-        """The pattern with further couplings, among more ghosts than before.
+    def missing(self, stencils: Iterable[NDArray[np.int32]], n_local: int) -> Ints:
+        """Keys row · n_local + column, ascending, of blocks that further elements couple and this has not."""
+        found = [np.empty(0, dtype=np.int64)]
+        for stencil in stencils:
+            one, other = (stencil[:, side] for side in np.array(_pairs(stencil)).T.reshape(2, -1))
+            at = np.flatnonzero(self._find(stencil).ravel() == MISSING)
+            found.append(_keys(one.ravel()[at], other.ravel()[at], n_local))
+        return union(*found)
+
+    def locate(self, stencils: Mapping[str, NDArray[np.int32]]) -> None:
+        """Take the offsets of further elements; `MISSING` where a coupling has no block."""
+        for name, stencil in stencils.items():
+            self.offsets[name] = self._find(stencil)
+
+    def _find(self, stencil: NDArray[np.int32]) -> Offsets:
+        n = stencil.shape[1]
+        out = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
+        _look_up(self.indptr, self.columns, stencil, out)
+        return out
+
+    def extended(self, more: Ints, n_local: int) -> tuple[BlockPattern, Ints]:
+        """The pattern with further blocks ``more``, keys as `missing` gives them, among more ghosts.
 
         Returns
         -------
@@ -78,15 +127,15 @@ class BlockPattern:
         """
         rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
         own = rows * n_local + self.columns
-        keys = _with(couplings, own, self.n_owned, n_local)
+        place: Ints = np.arange(len(own)) + np.searchsorted(more, own)
+        keys = np.empty(len(own) + len(more), dtype=np.int64)
+        keys[place], keys[np.arange(len(more)) + np.searchsorted(own, more)] = own, more
         made = BlockPattern.of_keys(keys, self.n_owned, n_local)
         made.edges = self.edges
-        place = np.searchsorted(keys, own)
         kind = index_type(2 * len(keys))
         for name, offsets in self.offsets.items():
             moved = 2 * place[offsets >> 1] + (offsets & 1)
             made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
-        made._locate(couplings, keys, n_local)
         return made, place
 
     def offsets_of(self, stencil: NDArray[np.int32], n_local: int) -> Offsets:

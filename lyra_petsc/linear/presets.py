@@ -111,12 +111,18 @@ TWICE_FROM = 30.0
 
 
 def candidates(
-    n_vertices: int, ranks: int, *, static: bool = False, newton: bool = True, iterations: float = 0.0
+    n_vertices: int,
+    ranks: int,
+    *,
+    static: bool = False,
+    newton: bool = True,
+    iterations: float = 0.0,
+    contact: bool = False,
 ) -> list[str]:
     """Presets to try in order; only ``user`` when the user chose the preconditioner.
 
     ``newton`` says that a step is more than one linear solve; ``iterations`` is what conjugate gradients
-    with block Jacobi are expected to take.
+    with block Jacobi are expected to take while there is no ``contact``.
     """
     if is_set("pc_type"):
         return ["user"]
@@ -133,7 +139,7 @@ def candidates(
         return [*factors, *last]
     if not small:
         return [cycle, *factors, incomplete, "gamg", "block-jacobi"]
-    if newton and iterations <= INCOMPLETE_FROM:
+    if newton and iterations <= INCOMPLETE_FROM and not contact:
         return ["block-jacobi", *factors, *last[:-1]]
     return [incomplete, *factors, "block-jacobi", *last[:-1]]
 

@@ -1,4 +1,4 @@
-"""Which boxes overlap: the broad phase of searches for contacts."""
+"""Which boxes are near each other: the broad phase of searches for contacts."""
 
 from __future__ import annotations
 
@@ -21,58 +21,52 @@ def _cell(place, origin, size, n):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _pairs(low, high, other_low, other_high, origin, size, n, same, first, items, out):  # type: ignore[no-untyped-def]
-    """Overlapping pairs into out (m, 2), of which only as many are written as fit; how many there are.
-
-    The others stand in the cells of a grid: ``first`` (cells + 1,) and ``items``. A pair is found in the
-    first cell that both have.
-    """
-    found = 0
-    lo, hi, other = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
-    for a in range(len(low)):
+def _swept(x, way, simplices, low, high):  # type: ignore[no-untyped-def]
+    for s in range(len(simplices)):
         for k in range(3):
-            lo[k] = _cell(low[a, k], origin[k], size[k], n[k])
-            hi[k] = _cell(high[a, k], origin[k], size[k], n[k])
-        for i in range(lo[0], hi[0] + 1):
-            for j in range(lo[1], hi[1] + 1):
-                for k in range(lo[2], hi[2] + 1):
-                    cell = (i * n[1] + j) * n[2] + k
-                    for at in range(first[cell], first[cell + 1]):
-                        b = items[at]
-                        if same and b <= a:
-                            continue
-                        apart = False
-                        for m in range(3):
-                            if other_low[b, m] > high[a, m] or other_high[b, m] < low[a, m]:
-                                apart = True
-                        if apart:
-                            continue
-                        for m in range(3):
-                            other[m] = _cell(other_low[b, m], origin[m], size[m], n[m])
-                        if (
-                            i == max(lo[0], other[0])
-                            and j == max(lo[1], other[1])
-                            and k == max(lo[2], other[2])
-                        ):
-                            if found < len(out):
-                                out[found, 0], out[found, 1] = a, b
-                            found += 1
-    return found
+            least = most = x[simplices[s, 0], k]
+            for i in range(simplices.shape[1]):
+                at = x[simplices[s, i], k]
+                to = at + way[simplices[s, i], k]
+                least, most = min(least, at, to), max(most, at, to)
+            low[s, k], high[s, k] = least, most
+
+
+def swept_boxes(x: Array, way: Array, simplices: Ints) -> tuple[Array, Array]:
+    """Low and high corners (n, 3) [m] of what simplices (n, m) of points x pass on their ways (N, 3) [m]."""
+    low, high = np.empty((len(simplices), 3)), np.empty((len(simplices), 3))
+    _swept(x, way, simplices, low, high)
+    return low, high
 
 
 @cached()
-def _cells(low, high, origin, size, n, first, items, fill):  # type: ignore[no-untyped-def]
-    """Count the boxes of each cell into first (cells + 1,), or put them into ``items`` from there on."""
+def _common(corners, other):  # type: ignore[no-untyped-def]
+    """Whether two simplices (n,) and (m,) have a vertex in common."""
+    for i in range(len(corners)):
+        for j in range(len(other)):
+            if corners[i] == other[j]:
+                return True
+    return False
+
+
+@cached()
+def _of_boxes(low, high, origin, size, n):  # type: ignore[no-untyped-def]
+    """The first and the last cell (k, 2, 3) that boxes reach into."""
+    out = np.empty((len(low), 2, 3), np.int32)
     for b in range(len(low)):
-        lo0 = _cell(low[b, 0], origin[0], size[0], n[0])
-        lo1 = _cell(low[b, 1], origin[1], size[1], n[1])
-        lo2 = _cell(low[b, 2], origin[2], size[2], n[2])
-        hi0 = _cell(high[b, 0], origin[0], size[0], n[0])
-        hi1 = _cell(high[b, 1], origin[1], size[1], n[1])
-        hi2 = _cell(high[b, 2], origin[2], size[2], n[2])
-        for i in range(lo0, hi0 + 1):
-            for j in range(lo1, hi1 + 1):
-                for k in range(lo2, hi2 + 1):
+        for k in range(3):
+            out[b, 0, k] = _cell(low[b, k], origin[k], size[k], n[k])
+            out[b, 1, k] = _cell(high[b, k], origin[k], size[k], n[k])
+    return out
+
+
+@cached()
+def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
+    """Count the boxes of each cell into first (cells + 1,), or put them into ``items`` from there on."""
+    for b in range(len(cells)):
+        for i in range(cells[b, 0, 0], cells[b, 1, 0] + 1):
+            for j in range(cells[b, 0, 1], cells[b, 1, 1] + 1):
+                for k in range(cells[b, 0, 2], cells[b, 1, 2] + 1):
                     cell = (i * n[1] + j) * n[2] + k
                     if fill:
                         items[first[cell]] = b
@@ -81,33 +75,86 @@ def _cells(low, high, origin, size, n, first, items, fill):  # type: ignore[no-u
                         first[cell + 1] += 1
 
 
-def overlapping(low: Array, high: Array, other: tuple[Array, Array] | None = None) -> Ints:
-    """Pairs (m, 2) of boxes ``low``, ``high`` (n, 3) and ``other`` ones, (k, 3) each, that overlap or touch.
+@cached()
+def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
 
-    Without ``other`` among themselves, the lesser number first.
+    The others, low and high corners (2, k, 3), stand in cells of a grid: ``first`` (cells + 1,) and
+    ``items``. A pair is found in the first cell that both have.
     """
-    same = other is None
-    other_low, other_high = (low, high) if other is None else other
+    found, square = 0, reach * reach
+    for a in range(len(low)):
+        for i in range(cells[a, 0, 0], cells[a, 1, 0] + 1):
+            for j in range(cells[a, 0, 1], cells[a, 1, 1] + 1):
+                for k in range(cells[a, 0, 2], cells[a, 1, 2] + 1):
+                    cell = (i * n[1] + j) * n[2] + k
+                    for at in range(first[cell], first[cell + 1]):
+                        b = items[at]
+                        if (
+                            (same and b <= a)
+                            or i != max(cells[a, 0, 0], other_cells[b, 0, 0])
+                            or j != max(cells[a, 0, 1], other_cells[b, 0, 1])
+                            or k != max(cells[a, 0, 2], other_cells[b, 0, 2])
+                        ):
+                            continue
+                        left = square
+                        for m in range(3):
+                            apart = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
+                            left -= apart * apart
+                        if left < 0.0 or _common(corners[a], other_corners[b]):
+                            continue
+                        if found < len(out):
+                            out[found, 0], out[found, 1] = a, b
+                        found += 1
+    return found
+
+
+def near(
+    boxes: tuple[Array, Array],
+    others: tuple[Array, Array] | None = None,
+    *,
+    reach: float = 0.0,
+    corners: Ints | None = None,
+    other_corners: Ints | None = None,
+) -> Ints:
+    """Pairs (m, 2) of boxes and other ones that are not farther from each other than ``reach`` [m].
+
+    Parameters
+    ----------
+    boxes, others : pairs of (n, 3), (k, 3)
+        Their low and high corners [m]. Without others the boxes themselves; the lesser number is first.
+    corners, other_corners : (n, i), (k, j)
+        Numbers of which those of a pair have none in common.
+    """
+    same = others is None
+    low, high = boxes
+    other_low, other_high = boxes if others is None else others
     if not len(low) or not len(other_low):
         return np.empty((0, 2), dtype=np.int64)
+    mine = np.empty((len(low), 0), dtype=np.int64) if corners is None else corners
+    theirs = np.empty((len(other_low), 0), dtype=np.int64) if other_corners is None else other_corners
+    theirs = mine if same else theirs
     origin, end = other_low.min(axis=0), other_high.max(axis=0)
     extent = np.maximum(end - origin, 1e-300)
-    size = np.maximum((other_high - other_low).mean(axis=0), extent * 1e-6)
+    size = np.maximum((other_high - other_low).mean(axis=0) + reach, extent * 1e-6)
     n = np.maximum(extent / size, 1.0)
     while np.prod(np.floor(n)) > min(MOST_CELLS, 8 * len(other_low) + 64):
         n[np.argmax(n)] *= 0.5
     n = np.floor(n).astype(np.int64)
     size = extent / n
+    other_cells = _of_boxes(other_low, other_high, origin, size, n)
+    cells = _of_boxes(low - reach, high + reach, origin, size, n)
     first = np.zeros(int(np.prod(n)) + 1, dtype=np.int64)
-    _cells(other_low, other_high, origin, size, n, first, np.empty(0, dtype=np.int64), False)
+    _sort(other_cells, n, first, np.empty(0, dtype=np.int64), False)
     np.cumsum(first, out=first)
     items = np.empty(first[-1], dtype=np.int64)
     at = first[:-1].copy()
-    _cells(other_low, other_high, origin, size, n, at, items, True)
-    out = np.empty((8 * len(low) + 64, 2), dtype=np.int64)
-    rest = low, high, other_low, other_high, origin, size, n, same, first, items
-    found = _pairs(*rest, out)
+    _sort(other_cells, n, at, items, True)
+    out = np.empty((4 * len(low) + 64, 2), dtype=np.int64)
+    stacked = np.stack([other_low, other_high])
+    given = low, high, mine, stacked, theirs, reach, cells, other_cells, n, same, first, items
+    found = _pairs(*given, out)
     if found > len(out):
         out = np.empty((found, 2), dtype=np.int64)
-        _pairs(*rest, out)
+        _pairs(*given, out)
     return out[:found]

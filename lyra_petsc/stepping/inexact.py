@@ -11,6 +11,9 @@ from petsc4py import PETSc
 LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
+LOOSEST_IN_CONTACT = 1e-3
+"""With contact; looser solves cost more Newton iterations, each of which evaluates all pairs."""
+
 STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
@@ -29,16 +32,18 @@ class Forcing:
     ksp : PETSc.KSP
     fixed : bool
         Leave it alone.
+    contact : bool
+        Whether parts may touch.
     """
 
-    def __init__(self, ksp: PETSc.KSP, *, fixed: bool) -> None:
+    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, contact: bool) -> None:
         self._ksp, self._fixed = ksp, fixed
-        self.tolerance = LOOSEST
+        self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact else LOOSEST
         self._norm = 0.0
 
     def begin(self) -> None:
         """A new solve: begin a little looser than the last one ended."""
-        self.tolerance = min(LOOSEST, 10.0 * self.tolerance)
+        self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
 
     def before_solve(self, norm: float) -> None:
@@ -48,6 +53,6 @@ class Forcing:
         if self._norm > 0.0 and norm > SLOW * self._norm:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
-            self.tolerance = min(LOOSEST, 10.0 * self.tolerance)
+            self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = norm
         self._ksp.setTolerances(rtol=self.tolerance)

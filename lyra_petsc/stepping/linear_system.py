@@ -65,7 +65,7 @@ class LinearSystem:
 
     def _create(self) -> None:
         discretisation = self._equations.discretisation
-        discretisation.renew_pattern()  # stencils may have changed since the last matrix
+        self._equations.renew_pattern()  # stencils may have changed since the last matrix
         self._rows = discretisation.rows
         layout, pattern = discretisation.layout, discretisation.rows.pattern
         kind = presets.matrix_type(self._preset)
@@ -117,7 +117,7 @@ class LinearSystem:
     def renew(self) -> bool:
         """Follow changed stencils; whether the matrices are others."""
         discretisation = self._equations.discretisation
-        if not discretisation.renew_pattern() and discretisation.rows is self._rows:
+        if not self._equations.renew_pattern() and discretisation.rows is self._rows:
             return False
         self._free(for_good=False)
         self._create()

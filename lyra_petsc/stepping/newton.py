@@ -59,7 +59,8 @@ class Newton:
         self._shape = (equations.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
         self._began_convex = False
-        self.forcing = Forcing(self._ksp, fixed=is_set("ksp_rtol") or not equations.integrator.moves)
+        fixed = is_set("ksp_rtol") or not equations.integrator.moves
+        self.forcing = Forcing(self._ksp, fixed=fixed, contact=equations.discretisation.guards)
 
     def begin_step(self) -> None:
         """Forget the step before."""

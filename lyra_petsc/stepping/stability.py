@@ -87,6 +87,7 @@ class Examination:
                 reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
                 "that factors are made for"
             )
+        system.renew_pattern()
         values = system.discretisation.rows.zeros()
         system.exact_hessian(values)
         self._inertia = Inertia(points, system.discretisation.rows.pattern, values)

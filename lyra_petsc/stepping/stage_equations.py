@@ -187,11 +187,13 @@ class StageEquations:
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
         self.refused_way = None
         self.new_iterate(None)
-        self._follow(self.x)
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
+        ahead = self._expected() if self.discretisation.guards else None
+        self._follow(self.x, ahead)
         self._freeze(t0 + after)
-        self._follow(self.x)  # obstacles may have come near
+        ahead = None if ahead is None else self._expected()  # with the ghosts that there are now
+        self._follow(self.x, ahead)  # obstacles may have come near
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
@@ -205,6 +207,13 @@ class StageEquations:
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
+
+    def _expected(self) -> Array:
+        """How far (n_local, 3) [m] points would go in the step if they went on as they do."""
+        ahead, n = self.dt * self.v, self.points.n_owned
+        self.prescribed.put(ahead[:n], self.prescribed.goal - self.x[:n].take(self.prescribed.at))
+        self.points.update_ghosts(ahead)
+        return ahead
 
     def _accelerations(self) -> Array:
         v = self.v.copy()
@@ -434,8 +443,9 @@ class StageEquations:
         there = here.copy()
         self.prescribe(there)
         x, ahead = self._ahead(here, there - here)
+        reach = self.discretisation.largest_step(x, ahead)
         free = all(term.lets_pass(x, ahead, self.active.frozen[term]) for term in self.active.limiting)
-        free &= self.discretisation.largest_step(x, ahead) == 1.0
+        free &= reach == 1.0
         if not self.points.comm.allreduce(int(not free), MPI.MAX):
             return True
         self.refused_way = RefusedWay(x.copy(), ahead, carried=True)
@@ -462,9 +472,9 @@ class StageEquations:
 
     # -- what Newton asks for ----------------------------------------------------------------------
 
-    def _follow(self, x: Array) -> None:
-        """Let stencils be those at positions x (n_owned or more, 3), and make room for their ghosts."""
-        if not self.discretisation.changes or not self.discretisation.follow(x):
+    def _follow(self, x: Array, ahead: Array | None = None) -> None:
+        """Let stencils be those at positions x (n_local, 3), and make room for their ghosts."""
+        if not self.discretisation.changes or not self.discretisation.follow(x, ahead):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
@@ -524,6 +534,13 @@ class StageEquations:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
         parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
+
+    def renew_pattern(self) -> bool:
+        """Let block rows have all blocks of the Jacobian where it was last evaluated; whether they are
+        others; collective.
+        """
+        x, frozen = self._xs, self.active.frozen
+        return self.discretisation.renew_pattern(lambda term: term.acting(x, frozen.get(term)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

@@ -101,7 +101,12 @@ class Stepper:
         static = scene.time.scheme == "static"
         expected = 0.0 if static else expected_iterations(equations, step)
         self.presets = presets.candidates(
-            points.n_global, points.comm.size, static=static, newton=self._iterates, iterations=expected
+            points.n_global,
+            points.comm.size,
+            static=static,
+            newton=self._iterates,
+            iterations=expected,
+            contact=equations.discretisation.guards,
         )
         self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
         self.our_options: list[str] = []

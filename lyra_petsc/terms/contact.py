@@ -18,25 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
-from lyra_petsc.mesh.near import overlapping
+from lyra_petsc.mesh.near import near, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Pair, UpcomingStep
+from lyra_petsc.terms.term import Elastic, Offsets, Pair, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Swept = tuple[Ints, tuple[Array, Array]]
+"""Simplices (n, m), and the low and high corners (n, 3) [m] of what they pass."""
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""
 
 PARALLEL = 1e-3
 """Squared sine of the angle of two of the shortest edges below which they count as nearly parallel."""
+
+AT_ONCE = 256
+"""Pairs whose Hessians are in memory at a time."""
 
 HALFWAY = 6.386
 """b″ / k in the middle of the gap: 2 ln 2 + 5."""
@@ -149,7 +155,9 @@ class ContactBarrier(Elastic):
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
-        self._places = np.empty((0, 3))
+        self._places = np.empty((2, 0, 3))
+        none = np.empty((0, 1), dtype=np.int64)
+        self._simplices = none, none, none  # vertices, edges and triangles of the last search
 
     def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
         """Take what all ranks know alike; before anything else is asked.
@@ -188,14 +196,17 @@ class ContactBarrier(Elastic):
 
     # -- search ------------------------------------------------------------------------------------
 
-    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         self._places = self._swept
-        vertices, edges = np.unique(triangles), unique_edges(triangles)
+        if not np.array_equal(triangles, self._simplices[2]):
+            self._simplices = np.unique(triangles)[:, None], unique_edges(triangles), triangles
+        vertices, edges, triangles = self._simplices
         edges = np.where((numbers[edges[:, 0]] < numbers[edges[:, 1]])[:, None], edges, edges[:, ::-1])
+        sheets = [(of, swept_boxes(x, way, of)) for of in (vertices, edges, triangles)]
         found = [np.empty((0, 6), dtype=np.int64)]
         if self.itself:
-            found += self._among_sheets(x, numbers, vertices, edges, triangles)
-        found += self._at_obstacles(x, vertices, edges, triangles)
+            found += self._among_sheets(x, way, numbers, sheets)
+        found += self._at_obstacles(x, way, sheets)
         every = np.concatenate(found)
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:]
         sheet = points >= 0
@@ -203,68 +214,58 @@ class ContactBarrier(Elastic):
         what = np.column_stack([kind, obstacle, np.where(sheet, 0, points)])
         return np.where(sheet, points, first[:, None]), what
 
-    def _among_sheets(
-        self, x: Array, numbers: Ints, vertices: Ints, edges: Ints, triangles: Ints
-    ) -> list[Ints]:
-        distance = self.search_distance
-        low, high = x[triangles].min(axis=1), x[triangles].max(axis=1)
-        near = overlapping(x[vertices] - distance, x[vertices] + distance, (low, high))
-        vertex, corners = vertices[near[:, 0]], triangles[near[:, 1]]
-        apart = (corners != vertex[:, None]).all(axis=1)
-        to_triangles = np.column_stack([vertex, corners])[apart]
-        ends = x[edges]
-        low, high = ends.min(axis=1) - 0.5 * distance, ends.max(axis=1) + 0.5 * distance
-        one, other = edges[overlapping(low, high)].transpose(1, 0, 2)
-        apart = (one[:, :, None] != other[:, None, :]).all(axis=(1, 2))
-        one, other = one[apart], other[apart]
-        first = (numbers[one[:, 0]] < numbers[other[:, 0]])[:, None]
-        to_edges = np.concatenate([np.where(first, one, other), np.where(first, other, one)], axis=1)
-        return [
-            self._nearer(x, VERTEX_TRIANGLE, np.full(len(to_triangles), -1), to_triangles),
-            self._nearer(x, EDGE_EDGE, np.full(len(to_edges), -1), to_edges),
-        ]
+    def _among_sheets(self, x: Array, way: Array, numbers: Ints, sheets: Sequence[Swept]) -> list[Ints]:
+        (vertices, at), (edges, along), (triangles, over) = sheets
+        reach = self.search_distance
+        met = near(at, over, reach=reach, corners=vertices, other_corners=triangles)
+        to_triangles = np.concatenate([vertices[met[:, 0]], triangles[met[:, 1]]], axis=1)
+        met = near(along, reach=reach, corners=edges)
+        to_edges = edges[met].reshape(len(met), 4)
+        nearer = self._nearer(x, way, EDGE_EDGE, np.full(len(to_edges), -1), to_edges)
+        swapped = numbers[nearer[:, 2]] > numbers[nearer[:, 4]]
+        nearer[swapped, 2:] = nearer[swapped][:, [4, 5, 2, 3]]
+        return [self._nearer(x, way, VERTEX_TRIANGLE, np.full(len(to_triangles), -1), to_triangles), nearer]
 
-    def _nearer(self, x: Array, kind: int, obstacle: Ints, points: Ints) -> Ints:
-        """Rows of those pairs that are within the search distance."""
+    def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints) -> Ints:
+        """Rows of those pairs that may come within the search distance on their ways."""
         points, found = points.astype(np.int64), np.empty(len(points))
         kinds = np.full(len(points), kind)
-        contact_pairs.distances(x, self._places[1], kinds, points, found)
-        met = found - self.obstacles.radius[obstacle] < self.search_distance
-        return np.column_stack([kinds, obstacle, points])[met]
+        reach = self.search_distance + self.obstacles.radius[obstacle]
+        theirs = self._places[1] - self._places[0]
+        contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
+        return np.column_stack([kinds, obstacle, points])[found < reach]
 
-    def _at_obstacles(self, x: Array, vertices: Ints, edges: Ints, triangles: Ints) -> list[Ints]:
+    def _at_obstacles(self, x: Array, way: Array, sheets: Sequence[Swept]) -> list[Ints]:
         """Pairs with obstacles, wherever on their way in the step these are near."""
         of, found = self.obstacles, []
-        still = np.array_equal(self._places[0], self._places[1])
+        vertices, edges, triangles = sheets
 
-        def near(kind: int, sheet: Ints, others: Ints, size: int, *, sheet_first: bool) -> None:
-            if not len(others) or not len(sheet):
+        def meet(kind: int, sheet: Swept, others: Ints, size: int, *, sheet_first: bool) -> None:
+            if not len(others):
                 return
             places = self._places[:, others[:, :size]]
             reach = (self.search_distance + of.radius[others[:, 3]])[:, None]
-            low, high = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
-            pairs = overlapping(x[sheet].min(axis=1), x[sheet].max(axis=1), (low, high))
-            mine, theirs = sheet[pairs[:, 0]], ~others[pairs[:, 1], :size]
+            boxes = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
+            pairs = near(sheet[1], boxes)
+            mine, theirs = sheet[0][pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
-            obstacle = others[pairs[:, 1], 3]
-            if still:
-                found.append(self._nearer(x, kind, obstacle, points))
-            else:
-                found.append(np.column_stack([np.full(len(points), kind), obstacle, points]))
+            found.append(self._nearer(x, way, kind, others[pairs[:, 1], 3], points))
 
-        near(VERTEX_TRIANGLE, vertices[:, None], of.triangles, 3, sheet_first=True)
-        near(VERTEX_TRIANGLE, triangles, of.points, 1, sheet_first=False)
-        near(EDGE_EDGE, edges, of.edges, 2, sheet_first=True)
+        meet(VERTEX_TRIANGLE, vertices, of.triangles, 3, sheet_first=True)
+        meet(VERTEX_TRIANGLE, triangles, of.points, 1, sheet_first=False)
+        meet(EDGE_EDGE, edges, of.edges, 2, sheet_first=True)
+        single = vertices[0][:, 0]
         for kind, others in ((VERTEX_PLANE, of.planes), (VERTEX_INSIDE, of.segments)):
             for one in others:
-                points = np.column_stack([vertices, np.tile(~one[:3], (len(vertices), 1))])
+                points = np.column_stack([single, np.tile(~one[:3], (len(single), 1))])
                 obstacle = np.full(len(points), one[3])
                 rows = np.column_stack([np.full(len(points), kind), obstacle, points])
                 close = np.zeros(len(points), dtype=bool)
-                for places in self._places:
-                    distance = np.empty(len(points))
-                    contact_pairs.distances(x, places, rows[:, 0], rows[:, 2:], distance)
-                    close |= distance - of.radius[obstacle] < self.search_distance
+                for at in (x, x + way):  # along straight ways these distances are least at an end
+                    for places in self._places:
+                        distance = np.empty(len(points))
+                        contact_pairs.distances(at, places, rows[:, 0], rows[:, 2:], distance)
+                        close |= distance - of.radius[obstacle] < self.search_distance
                 found.append(rows[close])
         return found
 
@@ -283,9 +284,31 @@ class ContactBarrier(Elastic):
         pull = np.zeros_like(frozen.now)
         contact_pairs.add_gradient(x, frozen.now, self.kind, self.points, *self._constants, out, pull)
 
-    def hessians(self, x: Array, frozen: Places, lo: int, hi: int, blend: float, out: Array) -> None:
-        pairs = self.kind, self.points, *self._constants
-        contact_pairs.hessians(x, frozen.now, *pairs, lo, blend, out)
+    def acting(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
+        out = np.empty(self.n_elements, dtype=np.bool_)
+        if self.n_elements:
+            pairs = self.kind, self.points, self.offset, self.barrier.gap
+            contact_pairs.acting(x, frozen.now, *pairs, out)
+        return out
+
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: Places,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        before: Array | None = None,
+    ) -> None:
+        at = np.flatnonzero(self.acting(x, frozen))
+        offset, *constants = self._constants
+        pairs, places = (self.kind[at], self.points[at], offset[at]), offsets[self.name][at]
+        for lo in range(0, len(at), AT_ONCE):
+            part = slice(lo, lo + AT_ONCE)
+            blocks = np.empty((len(at[part]), 4, 4, 3, 3))
+            contact_pairs.hessians(x, frozen.now, *pairs, *constants, lo, blend, blocks)
+            add_elements(weight[at[part]], blocks, places[part], values)
 
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)

@@ -211,6 +211,26 @@ def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def _at_least(p, kind):  # type: ignore[no-untyped-def]
+    """What the distance of a pair at p (4, 3) is not below: that of the boxes around both; −∞ of others
+    than simplices.
+    """
+    if kind > EDGE_EDGE:
+        return -math.inf
+    square = 0.0
+    for k in range(3):
+        if kind == EDGE_EDGE:
+            low, high = min(p[0, k], p[1, k]), max(p[0, k], p[1, k])
+            other_low, other_high = min(p[2, k], p[3, k]), max(p[2, k], p[3, k])
+        else:
+            low = high = p[0, k]
+            other_low, other_high = min(p[1, k], p[2, k], p[3, k]), max(p[1, k], p[2, k], p[3, k])
+        apart = max(other_low - high, low - other_high, 0.0)
+        square += apart * apart
+    return math.sqrt(square)
+
+
+@kernel()
 def _around_foot(p):  # type: ignore[no-untyped-def]
     """Let p1 p2 p3 be a triangle around the foot of p0 in the plane of point p1 and normal p2; whether p0
     lies behind it.
@@ -277,10 +297,13 @@ def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  #
     p, beta, gamma, slope = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
     for e in range(len(out)):
         _load(x, others, points, e, p)
+        out[e] = 0.0
+        if _at_least(p, kind[e]) - offset[e] >= gap:
+            continue
         d, _ = nearest(kind[e], p, beta, gamma)
         delta = d - offset[e]
         if delta >= gap:
-            out[e] = 0.0
+            pass
         elif delta > 0.0:
             out[e] = stiffness * barrier(delta, gap)[0]
             if kind[e] == EDGE_EDGE:
@@ -290,11 +313,25 @@ def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  #
 
 
 @kernel()
+def acting(x, others, kind, points, offset, gap, out):  # type: ignore[no-untyped-def]
+    """Whether each pair is nearer than the gap, (E,)."""
+    p, beta, gamma = np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    for e in range(len(out)):
+        _load(x, others, points, e, p)
+        out[e] = _at_least(p, kind[e]) - offset[e] < gap
+        if out[e]:
+            d, _ = nearest(kind[e], p, beta, gamma)
+            out[e] = d - offset[e] < gap
+
+
+@kernel()
 def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, out, pull):  # type: ignore[no-untyped-def]
     """Add the gradient [N] to rows of out (n_local, 3), that of obstacles' points to pull (m, 3)."""
     p, beta, gamma, more = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
     for e in range(len(kind)):
         _load(x, others, points, e, p)
+        if _at_least(p, kind[e]) - offset[e] >= gap:
+            continue
         d, _ = nearest(kind[e], p, beta, gamma)
         delta = d - offset[e]
         if delta >= gap:
@@ -449,6 +486,37 @@ def _plane_speed(p, w, most):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def _longest(w, lo, hi):  # type: ignore[no-untyped-def]
+    square = 0.0
+    for i in range(lo, hi):
+        square = max(square, w[i, 0] ** 2 + w[i, 1] ** 2 + w[i, 2] ** 2)
+    return math.sqrt(square)
+
+
+@kernel()
+def approaches(x, others, way, others_way, kind, points, reach, out):  # type: ignore[no-untyped-def]
+    """What the distances [m] of pairs of simplices are not below, (E,), on ways (n_local, 3), (m, 3) [m].
+
+    Both parts of a sheet are as far on their ways as each other, obstacles anywhere on theirs. From
+    ``reach`` (E,) on it may be any number beyond.
+    """
+    p, w, beta, gamma = np.empty((4, 3)), np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    for e in range(len(out)):
+        _load(x, others, points, e, p)
+        _load(way, others_way, points, e, w)
+        if points[e].min() >= 0:
+            speed = _speed(kind[e], w)
+        else:
+            begins = 2 if kind[e] == EDGE_EDGE else 1
+            speed = _longest(w, 0, begins) + _longest(w, begins, 4)
+        out[e] = _at_least(p, kind[e]) - speed
+        if out[e] >= reach[e]:
+            continue
+        d, _ = nearest(kind[e], p, beta, gamma)
+        out[e] = d - speed
+
+
+@kernel()
 def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
     """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
 
@@ -462,6 +530,8 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
         _load(x, others, points, e, p)
         _load(way, others_way, points, e, w)
         speed = _plane_speed(p, w, most) if kind[e] == VERTEX_PLANE else _speed(kind[e], w)
+        if most * speed <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
+            continue
         d, _ = nearest(kind[e], p, beta, gamma)
         left = d - offset[e]
         if left - most * speed >= keep * left or speed == 0.0:

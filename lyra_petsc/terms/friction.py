@@ -32,8 +32,9 @@ class Pairs(NamedTuple):
 
     Attributes
     ----------
-    key : (E, 9)
-        Kind, numbers of the vertices, of obstacles' points: what tells a pair from others.
+    key : (E, 11)
+        Whether others count it, numbers of the vertices, kind, obstacle, its points: what tells a pair from
+        others; ascending.
     vertices : (E, 4)
         Their global numbers.
     obstacle : (E,)
@@ -79,7 +80,7 @@ class ObstacleMoves(NamedTuple):
 def _no_pairs() -> Pairs:
     ints, three = np.empty(0, dtype=np.int64), np.empty((0, 3))
     four = np.empty((0, 4), dtype=np.int64)
-    nothing = np.empty((0, 9), dtype=np.int64), four, ints, np.empty((0, 4)), three, three, three, three
+    nothing = np.empty((0, 11), dtype=np.int64), four, ints, np.empty((0, 4)), three, three, three, three
     return Pairs(*nothing, np.empty(0), np.empty(0, dtype=np.bool_))
 
 
@@ -103,8 +104,7 @@ class CoulombFriction(Elastic):
 
     def set_up(self, contact: ContactBarrier) -> None:
         """Know the contact whose pairs rub."""
-        self._contact, self.surface = contact, contact.surface
-        self.skin, self.search_distance = contact.skin, contact.search_distance
+        self._contact = contact
         each = [*(obstacle.friction for obstacle in contact.obstacles.each), self._common]
         self._coefficients = np.array(each)
         self._on_obstacles = np.zeros((len(contact.obstacles.each), 6))  # in the last step
@@ -128,12 +128,10 @@ class CoulombFriction(Elastic):
 
     # -- pairs -------------------------------------------------------------------------------------
 
-    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def known(self) -> tuple[Ints, Ints]:
         self.stale = False
-        order = np.argsort(numbers)
         vertices = self._pairs.vertices
-        stencil = order[np.searchsorted(numbers, vertices.ravel(), sorter=order)].reshape(vertices.shape)
-        return stencil, np.arange(len(vertices))[:, None]
+        return vertices, np.arange(len(vertices))[:, None]
 
     def _renew(self, x: Array, places: Array) -> None:
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points."""
@@ -145,18 +143,17 @@ class CoulombFriction(Elastic):
         met = np.flatnonzero(force > 0.0)
         points, stencil = contact.points[met], contact.stencil[met]
         sheet = points >= 0
-        key = np.column_stack([contact.kind[met], contact.number[met], np.where(sheet, 0, points)])
+        # in this order contact's pairs are sorted
+        order = [met >= contact.n_owned, contact.number[met], contact.kind[met], contact.obstacle[met]]
+        key = np.column_stack([*order, np.where(sheet, 0, points)])
         beta = np.where(sheet, beta[met], 0.0)
         start = np.einsum("ei,eik->ek", beta, x[stencil])
         side = beta.sum(axis=1)[:, None]  # 1 or −1 where the other side is an obstacle
         foot = np.where(np.abs(side) > 0.5, start * side, 0.0)
         slip, slid = np.zeros((len(met), 3)), np.zeros(len(met), dtype=np.bool_)
         if len(old.key) and len(met):
-            _, where = np.unique(np.concatenate([old.key, key]), axis=0, return_inverse=True)
-            where = where.ravel()
-            known = np.full(len(old.key) + len(met), -1)
-            known[where[: len(old.key)]] = np.arange(len(old.key))
-            same = known[where[len(old.key) :]]
+            same = np.empty(len(met), dtype=np.int64)
+            friction_pairs.find(key, old.key, same)
             went = same >= 0
             slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
             slip -= np.sum(slip * normal[met], axis=1, keepdims=True) * normal[met]

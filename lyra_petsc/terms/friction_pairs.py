@@ -95,3 +95,22 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
                 u[k] *= elastic / m
         for k in range(3):
             slip[e, k] = u[k]
+
+
+@kernel()
+def find(keys, among, place):  # type: ignore[no-untyped-def]
+    """Which row of ``among`` (M, n) each row of keys (N, n) is, −1 where none is; both are ascending."""
+    b = 0
+    for a in range(len(keys)):
+        place[a] = -1
+        while b < len(among):
+            order = 0
+            for k in range(keys.shape[1]):
+                if keys[a, k] != among[b, k]:
+                    order = 1 if keys[a, k] > among[b, k] else -1
+                    break
+            if order == 0:
+                place[a] = b
+            if order <= 0:
+                break
+            b += 1

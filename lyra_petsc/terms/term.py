@@ -174,10 +174,10 @@ class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
     search_distance: float = 0.0
-    """Distance [m] within which ``neighbours`` looks for elements; 0 where stencils never change."""
+    """Distance [m] within which ``neighbours`` looks for elements; 0 where nothing is looked for."""
 
     stale: bool = False
-    """Whether ``neighbours`` has others to name, though no point has moved far."""
+    """Whether ``neighbours`` or ``known`` has others to name, though no point has moved far."""
 
     unseen: float = np.inf
     """Distance [m] by which points that ``neighbours`` did not name may come nearer to each other at most."""
@@ -238,14 +238,23 @@ class Elastic(Term):
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
-    def neighbours(self, x: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
 
         And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
-        the points' global numbers, ``triangles`` (F, 3) those of ``surface`` that are near. Ranks that see
-        the same points must name them in the same order within an element; the owner of the first counts it.
+        the points' global numbers, ``triangles`` (F, 3) those of ``surface`` that are near. Where ``unseen``
+        is given, also those that come so near on their straight ways (N, 3) [m]. Ranks that see the same
+        points must name them in the same order within an element; the owner of the first counts it.
         """
         raise NotImplementedError
+
+    def known(self) -> tuple[Ints, Ints]:
+        """The same by global numbers, of a term without a ``search_distance``, whenever it is ``stale``."""
+        raise NotImplementedError
+
+    def acting(self, x: Array, frozen: Any) -> NDArray[np.bool_]:
+        """Which elements (E,) have a Hessian that is not 0 at positions x (n_local, 3)."""
+        return np.ones(self.n_elements, dtype=np.bool_)
 
     def largest_step(self, x: Array, way: Array, frozen: Any) -> float:
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""

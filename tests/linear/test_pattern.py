@@ -138,13 +138,18 @@ def test_further_couplings_extend_a_pattern(monkeypatch: pytest.MonkeyPatch, lar
     fixed, more = random_stencil(rng, 8, 3), random_stencil(rng, 5, 2)
     more[0] = N_LOCAL + 1, 2  # with a ghost that is new
     small = BlockPattern({"fixed": fixed}, N_OWNED, N_LOCAL)
-    made, place = small.extended({"more": more}, N_LOCAL + 2)
+    needed = small.missing([more], N_LOCAL + 2)
+    made, place = small.extended(needed, N_LOCAL + 2)
+    assert not len(made.missing([more], N_LOCAL + 2))
+    made.locate({"more": more})
     once = BlockPattern({"fixed": fixed, "more": more}, N_OWNED, N_LOCAL + 2)
     np.testing.assert_array_equal(made.columns, once.columns)
     np.testing.assert_array_equal(made.indptr, once.indptr)
     for name in ("fixed", "more"):
         np.testing.assert_array_equal(made.offsets[name], once.offsets[name])
         assert made.offsets[name].dtype == once.offsets[name].dtype
+    made.locate({"more": np.array([[0, N_LOCAL]], dtype=np.int32)})
+    assert made.offsets["more"][0, 1] == room.MISSING
     # and blocks of the small one are found again
     values = np.zeros((made.n_blocks, 3, 3))
     values[place] = before = rng.random((small.n_blocks, 3, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.mesh.near import overlapping
+from lyra_petsc.mesh.near import near, swept_boxes
 
 Array = NDArray[np.float64]
 
@@ -41,9 +41,9 @@ def test_against_brute_force(n: int, size: str) -> None:
     rng = np.random.default_rng(n)
     low, high = boxes(rng, n, SIZES[size])
     others = boxes(rng, n + 7, SIZES[size])
-    assert as_set(overlapping(low, high, others)) == as_set(np.argwhere(brute(low, high, *others)))
+    assert as_set(near((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
     mutual = np.argwhere(np.triu(brute(low, high, low, high), 1))
-    assert as_set(overlapping(low, high)) == as_set(mutual)
+    assert as_set(near((low, high))) == as_set(mutual)
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
@@ -53,7 +53,7 @@ def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
     low = rng.random((400, 3)) * [1.0, 1.0, thickness]
     high = low + rng.random((400, 3)) * [0.05, 0.05, 0.0]
     mine = rng.random((60, 3)) * [1.0, 1.0, 0.2]
-    found = overlapping(mine - 0.1, mine + 0.1, (low, high))
+    found = near((mine - 0.1, mine + 0.1), (low, high))
     assert as_set(found) == as_set(np.argwhere(brute(mine - 0.1, mine + 0.1, low, high)))
     assert len(found) > 60
 
@@ -61,20 +61,51 @@ def test_others_in_a_plane_but_for_rounding(thickness: float) -> None:
 def test_one_box_among_many_is_far_away() -> None:
     low = np.vstack([np.random.default_rng(2).random((500, 3)), [[1e6, -1e6, 1e6]]])
     high = low + 0.05
-    assert as_set(overlapping(low, high)) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
+    assert as_set(near((low, high))) == as_set(np.argwhere(np.triu(brute(low, high, low, high), 1)))
 
 
 def test_what_touches_overlaps() -> None:
     low, high = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]])
-    assert overlapping(low, high).tolist() == [[0, 1]]
+    assert near((low, high)).tolist() == [[0, 1]]
 
 
 def test_more_pairs_than_there_is_room_for_at_first() -> None:
     low = np.zeros((200, 3))
-    assert len(overlapping(low, low + 1.0)) == 200 * 199 // 2
+    assert len(near((low, low + 1.0))) == 200 * 199 // 2
 
 
 @pytest.mark.parametrize("n", [(0, 3), (3, 0), (0, 0)])
 def test_none(n: tuple[int, int]) -> None:
     mine, others = np.zeros((n[0], 3)), np.zeros((n[1], 3))
-    assert overlapping(mine, mine, (others, others)).shape == (0, 2)
+    assert near((mine, mine), (others, others)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.05, 0.4])
+def test_boxes_within_reach_that_have_no_corner_in_common(reach: float) -> None:
+    rng = np.random.default_rng(3)
+    low, high = boxes(rng, 80, 1.0)
+    other_low, other_high = boxes(rng, 90, 0.8)
+    corners, other_corners = rng.integers(0, 60, (80, 2)), rng.integers(0, 60, (90, 3))
+    way = np.maximum(np.maximum(other_low - high[:, None], low[:, None] - other_high), 0.0)
+    close = np.linalg.norm(way, axis=2) <= reach
+    common = (corners[:, None, :, None] == other_corners[None, :, None, :]).any(axis=(2, 3))
+    found = near(
+        (low, high), (other_low, other_high), reach=reach, corners=corners, other_corners=other_corners
+    )
+    assert as_set(found) == as_set(np.argwhere(close & ~common))
+    assert (close & common).any()
+    way = np.maximum(low[:, None] - high, 0.0)
+    close = np.linalg.norm(np.maximum(way, way.transpose(1, 0, 2)), axis=2) <= reach
+    common = (corners[:, None, :, None] == corners[None, :, None, :]).any(axis=(2, 3))
+    assert as_set(near((low, high), reach=reach, corners=corners)) == as_set(
+        np.argwhere(np.triu(close & ~common, 1))
+    )
+
+
+def test_boxes_of_what_simplices_pass() -> None:
+    rng = np.random.default_rng(4)
+    x, way, simplices = rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), rng.integers(0, 9, (5, 3))
+    low, high = swept_boxes(x, way, simplices)
+    both = np.concatenate([x[simplices], (x + way)[simplices]], axis=1)
+    np.testing.assert_array_equal(low, both.min(axis=1))
+    np.testing.assert_array_equal(high, both.max(axis=1))

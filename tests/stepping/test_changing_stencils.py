@@ -267,7 +267,7 @@ def test_derivatives(comm: MPI.Comm) -> None:
     for _ in range(12):
         simulation.step()
     layout, term = system.points, term_of(simulation)
-    system.discretisation.renew_pattern()
+    system.renew_pattern()
     rng = np.random.default_rng(2)
     random = rng.standard_normal((layout.n_vertices_global, 3))
     way = np.zeros((layout.n_local, 3))
