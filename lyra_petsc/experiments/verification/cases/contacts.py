@@ -1,15 +1,16 @@
-"""Sheets in contact: friction on a slope."""
+"""Sheets in contact: at rest, and with friction on a slope."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import Exact, Measured, case
+from lyra_petsc.experiments.verification.answers import Exact, Measured, case, farthest, grid
+from lyra_petsc.output.fields import FIELDS
 
 G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
@@ -79,3 +80,57 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
         Measured("creep", creep, 0.0, "m", scale=1.0),
         Measured("acceleration", off[1], off[2], "m/s²"),
     ]
+
+
+# -- at rest ---------------------------------------------------------------------------------------------
+
+SIDE = 0.4
+"""[m]"""
+
+FLOORS: dict[str, tuple[dict[str, Any], float, float]] = {
+    # edges carry less and rise above the inside: in the narrow gap by too little to be felt there
+    "plane": ({"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}, 0.0, 1e-4),
+    "sphere": ({"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}, 0.0, 1e-3),
+    "box": ({"box": {"min": [-0.18, -0.22, 0.0], "max": [0.18, 0.22, 1.0]}, "inside": True}, 30.0, 1e-3),
+}
+"""What a sheet comes to rest on or in; by how many degrees it is tilted at first; the gap [m]."""
+
+
+@case(
+    "Sheet at rest on a plane, on a sphere's top, in a box that is narrower: force on the obstacle over the "
+    "weight; pressure on the plane inside of the sheet, where it differs most from the weight per area",
+    source="equilibrium",
+    resolutions=(4, 8, 12),
+    claim=Exact(1e-9),
+    claims={"pressure on the plane": Exact(1e-3)},
+    counts="cells a side",
+    quick=1,
+)
+def rest(bench: Bench, n: float) -> Iterator[Measured]:
+    cells, half = round(n), 0.5 * SIDE
+    for words, (floor, tilt, gap) in FLOORS.items():
+        turn = {"axis": [0.0, 1.0, 0.0], "degrees": tilt}
+        middle = half * math.cos(math.radians(tilt))
+        place = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
+        content = {
+            "mesh": grid(SIDE, SIDE, cells, cells) | {"transform": {"rotate": turn, "translate": place}},
+            "material": {"cloth": "gray-interlock"},
+            "gravity": [0.0, 0.0, -G],
+            "contact": {"gap": gap, "friction": 0.3, "self": False},
+            "obstacles": {words: floor},
+            # long steps of backward Euler damp all motion
+            "time": {"end": 4.0, "step": 0.1},
+        }
+        pressure = np.empty(0)
+        with bench.simulation(content) as trial:
+            force = trial.run().simulation.ledger.obstacle_forces(1)[0, :3]
+            weight = G * float(trial.mass.sum())
+            if words == "plane":
+                inside = (np.abs(trial.start[:, :2]) < half - 1e-9).all(axis=1)
+                compute = FIELDS["contact_pressure"].compute
+                pressure = trial.gather(compute(trial.simulation.problem))[inside]
+        off = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
+        yield Measured(f"force on the {words} besides the weight", off, 0.0, scale=1.0)
+        if words == "plane":
+            exact = weight / SIDE**2
+            yield Measured("pressure on the plane", farthest(pressure, exact), exact, "Pa")
