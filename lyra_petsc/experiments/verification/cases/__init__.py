@@ -51,5 +51,6 @@ CASES: Registry[VerificationCase] = Registry(
         "strip-vibration": "hinges",
         "incline": "contacts",
         "rest": "contacts",
+        "capstan": "contacts",
     },
 )
