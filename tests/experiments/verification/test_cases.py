@@ -18,7 +18,7 @@ SOME = (
 LONG = (
     "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang", "slit-annulus", "sze-end-moment",
-    "pinched-cylinder", "incline",
+    "pinched-cylinder", "incline", "rest", "capstan",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""
 
@@ -43,10 +43,14 @@ def test_is_in_the_docs(name: str) -> None:
     assert any(f"`{name}`" in page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md"))
 
 
-@pytest.mark.parallel(2)
-@pytest.mark.parametrize(
-    "name", [name if name in SOME else pytest.param(name, marks=pytest.mark.slow) for name in CASES.modules]
-)
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    """Whether a case is slow, and on how many ranks it also runs: contact on two and three, others on two."""
+    contact = CASES.modules[name] == "contacts"
+    ranks = pytest.mark.parallel if contact else pytest.mark.parallel(2)
+    return [ranks] if name in SOME else [ranks, pytest.mark.slow]
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in CASES.modules])
 def test_passes(comm: MPI.Comm, name: str) -> None:
     # on several ranks, those resolutions that show that they give the same
     outcome = run_case(comm, CASES.load(name), quick=comm.size > 1 or name in LONG, warm=False)

@@ -50,5 +50,7 @@ CASES: Registry[VerificationCase] = Registry(
         "cloth-overhang": "cantilevers",
         "strip-vibration": "hinges",
         "incline": "contacts",
+        "rest": "contacts",
+        "capstan": "contacts",
     },
 )

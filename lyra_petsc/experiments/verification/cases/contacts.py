@@ -1,15 +1,27 @@
-"""Sheets in contact: friction on a slope."""
+"""Sheets in contact: at rest, and with friction on a slope and over a cylinder."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
-from lyra_petsc.experiments.verification.answers import Exact, Measured, case
+from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.verification.answers import (
+    STATIC,
+    Exact,
+    Measured,
+    at_finest,
+    case,
+    farthest,
+    grid,
+    isotropic,
+    scene,
+)
+from lyra_petsc.output.fields import FIELDS
 
 G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
@@ -79,3 +91,133 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
         Measured("creep", creep, 0.0, "m", scale=1.0),
         Measured("acceleration", off[1], off[2], "m/s²"),
     ]
+
+
+# -- at rest ---------------------------------------------------------------------------------------------
+
+SIDE = 0.4
+"""[m]"""
+
+FLOORS: dict[str, tuple[dict[str, Any], float, float]] = {
+    # edges carry less and rise above the inside: in the narrow gap by too little to be felt there
+    "plane": ({"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}, 0.0, 1e-4),
+    "sphere": ({"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}, 0.0, 1e-3),
+    "box": ({"box": {"min": [-0.18, -0.22, 0.0], "max": [0.18, 0.22, 1.0]}, "inside": True}, 30.0, 1e-3),
+}
+"""What a sheet comes to rest on or in; by how many degrees it is tilted at first; the gap [m]."""
+
+
+@case(
+    "Sheet at rest on a plane, on a sphere's top, in a box that is narrower: force on the obstacle over the "
+    "weight; pressure on the plane inside of the sheet, where it differs most from the weight per area",
+    source="equilibrium",
+    resolutions=(4, 8, 12),
+    claim=Exact(1e-9),
+    claims={"pressure on the plane": Exact(1e-3)},
+    counts="cells a side",
+    quick=1,
+)
+def rest(bench: Bench, n: float) -> Iterator[Measured]:
+    cells, half = round(n), 0.5 * SIDE
+    for words, (floor, tilt, gap) in FLOORS.items():
+        turn = {"axis": [0.0, 1.0, 0.0], "degrees": tilt}
+        middle = half * math.cos(math.radians(tilt))
+        place = [-middle, -half, 0.5 * gap + SIDE * math.sin(math.radians(tilt))]
+        content = {
+            "mesh": grid(SIDE, SIDE, cells, cells) | {"transform": {"rotate": turn, "translate": place}},
+            "material": {"cloth": "gray-interlock"},
+            "gravity": [0.0, 0.0, -G],
+            "contact": {"gap": gap, "friction": 0.3, "self": False},
+            "obstacles": {words: floor},
+            # long steps of backward Euler damp all motion
+            "time": {"end": 4.0, "step": 0.1},
+        }
+        pressure = np.empty(0)
+        with bench.simulation(content) as trial:
+            force = trial.run().simulation.ledger.obstacle_forces(1)[0, :3]
+            weight = G * float(trial.mass.sum())
+            if words == "plane":
+                inside = (np.abs(trial.start[:, :2]) < half - 1e-9).all(axis=1)
+                compute = FIELDS["contact_pressure"].compute
+                pressure = trial.gather(compute(trial.simulation.problem))[inside]
+        off = float(np.linalg.norm(force + [0.0, 0.0, weight])) / weight
+        yield Measured(f"force on the {words} besides the weight", off, 0.0, scale=1.0)
+        if words == "plane":
+            exact = weight / SIDE**2
+            yield Measured("pressure on the plane", farthest(pressure, exact), exact, "Pa")
+
+
+# -- belt over a cylinder --------------------------------------------------------------------------------
+
+DRUM, BELT_GAP = 0.1, 5e-4
+"""Radius and gap [m]"""
+
+WRAPS = ((0.5, 0.1), (0.5, 0.5), (1.0, 0.3), (1.5, 0.1), (1.5, 0.5))
+"""Angle of wrap over π, and μ"""
+
+PULLED, PULL, TURN = 0.2, 0.01, 10.0
+"""Load factor at which the belt is stretched, by how much, and by how many degrees the drum then turns"""
+
+
+def _belt(bench: Bench, angle: float, friction: float, n: int) -> tuple[dict[str, Any], list[list[int]]]:
+    """The belt, n cells to a quarter of the drum, and the vertices of slack and tight end; collective.
+
+    At first its edges are as far from the drum as the gap.
+    """
+    quarter = 0.5 * math.pi / n
+    radius, wrapped, tail = (DRUM + BELT_GAP) / math.cos(0.5 * quarter), round(angle / quarter), n // 2
+    cells, size = wrapped + 2 * tail, 2.0 * radius * math.sin(0.5 * quarter)
+    flat, faces = rectangle(cells, 1, cells * size, size)
+    along = np.tile(np.arange(cells + 1.0) - tail, 2)
+    on = np.clip(along, 0.0, wrapped)
+    cos, sin, beyond = np.cos(on * quarter), np.sin(on * quarter), size * (along - on)
+    start = np.column_stack([radius * sin + beyond * cos, flat[:, 1], radius * cos - beyond * sin])
+    ends = [[0, cells + 1], [cells, 2 * cells + 1]]
+    way = PULL * cells * size
+    pull = [way * math.cos(angle), 0.0, -way * math.sin(angle)]
+    axis = [0.0, 1.0, 0.0]
+    drum = {
+        "capsule": {"from": [0.0, -1.0, 0.0], "to": axis, "radius": DRUM},
+        "motion": [
+            {"time": 0.0},
+            {"time": PULLED},
+            {"time": 1.0, "rotate": {"axis": axis, "degrees": -TURN}},
+        ],
+        "interpolation": "linear",
+    }
+    content = scene(
+        bench.mesh(start, faces, rest=flat[:, :2]),
+        {"density": 0.1, "membrane": isotropic(1000.0)},
+        STATIC | {"step": 0.04},
+        petsc={"ts_adapt_dt_max": 0.04},
+        handles=[
+            {"nodes": ends[0]},
+            {"nodes": ends[1], "motion": "pull", "interpolation": "linear"},
+            {"nodes": list(range(len(flat))), "axes": ["y"]},
+        ],
+        motions={
+            "pull": [{"time": 0.0}, {"time": PULLED, "translate": pull}, {"time": 1.0, "translate": pull}]
+        },
+        contact={"gap": BELT_GAP, "friction": friction, "self": False},
+        obstacles={"drum": drum},
+    )
+    return content, ends
+
+
+@case(
+    "Belt without weight and bending over a drum that turns under it, π/2 to 3π/2 of it, μ 0.1 to 0.5: ratio "
+    "of the forces at its ends, static",
+    source="L. Euler and J. A. Eytelwein: T2/T1 = exp(μ φ)",
+    resolutions=(8, 16),
+    claim=at_finest(6e-3),
+    counts="cells to a quarter of the drum",
+    quick=1,
+)
+def capstan(bench: Bench, n: float) -> Iterator[Measured]:
+    for turns, friction in WRAPS:
+        content, ends = _belt(bench, math.pi * turns, friction, round(n))
+        with bench.simulation(content) as trial:
+            pull = trial.gather(trial.run().simulation.ledger.reaction)[:, ::2]
+        slack, tight = (float(np.linalg.norm(pull[end].sum(axis=0))) for end in ends)
+        words = f"T2/T1, φ = {turns:g} π, μ = {friction:g}"
+        yield Measured(words, tight / slack, math.exp(math.pi * turns * friction))
