@@ -36,7 +36,7 @@ KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""
 
 PARALLEL = 1e-3
-"""Squared sine of the angle of two of the shortest edges below which they count as nearly parallel."""
+"""Squared sine of the angle of two edges below which they count as nearly parallel."""
 
 HALFWAY = 6.386
 """b″ / k in the middle of the gap: 2 ln 2 + 5."""
@@ -50,8 +50,8 @@ class Barrier(NamedTuple):
     gap, thickness : float [m]
     stiffness : float [N/m]
         k.
-    parallel : float [m⁴]
-        |u × v|² of edges below which their energy fades.
+    parallel : float
+        Squared sine of the angle of edges below which their energy fades.
     """
 
     gap: float
@@ -373,7 +373,7 @@ def barrier(rest: RestShape) -> Barrier:
             key="contact",
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells) / HALFWAY
-    return Barrier(gap, thickness, stiffness, PARALLEL * shortest**4)
+    return Barrier(gap, thickness, stiffness, PARALLEL)
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
