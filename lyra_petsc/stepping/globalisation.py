@@ -33,13 +33,14 @@ class Globalisation:
     def begin(self) -> None:
         """A new solve."""
         self._at, self._at_norm = (0.0, 0.0), 0.0
-        self._slope, self._returns = 0.0, False
+        self._slope, self._returns, self._near = 0.0, False, False
         self._watchdog.begin()
 
     def remember(self, u: PETSc.Vec) -> None:
         """Note energy and residual of the present iterate, against which trial points are judged."""
         self._at = self._equations.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
+        self._near = self._equations.anything_near
         energy, size = self._at
         self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
 
@@ -53,8 +54,8 @@ class Globalisation:
 
     @property
     def trusts(self) -> bool:
-        """Whether the next step is taken in full."""
-        return self._watchdog.trusts
+        """Whether the next step is taken in full; not where contact has kinks, over which full steps jump."""
+        return self._watchdog.trusts and not self._near
 
     def search_along(self, slope: float) -> None:
         """The next trial points lie along a direction in which the energy falls by ``slope`` [W]."""
@@ -65,7 +66,7 @@ class Globalisation:
         v = u.getArray(readonly=True).reshape(self._shape)
         value, size = self._equations.objective(v)
         here, here_size = self._at
-        if value != here and np.isfinite(value) and (self._returns or self._watchdog.trusts):
+        if value != here and np.isfinite(value) and (self._returns or self.trusts):
             return min(value, here - self._slope)
         noise = ENERGY_ROUNDOFF * max(size, here_size)
         if value == here or not abs(value - here) < noise:

@@ -419,6 +419,13 @@ class StageEquations:
         """
         return bool(self.active.limiting) or (bool(self.active.edged) and not self.integrator.moves)
 
+    @property
+    def anything_near(self) -> bool:
+        """Whether there is anything that terms keep apart; collective."""
+        if not self.active.limiting:
+            return False
+        return bool(self.points.summed(sum(term.n_owned for term in self.active.limiting))[0])
+
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
         x, ahead = self._ahead(v, way)

@@ -61,8 +61,10 @@ class Watchdog:
             self._searches -= 1
         if not energy > self._energy + noise:
             if energy < self._energy - noise:
-                self._left = PATIENCE
-            self._energy, self._excess = energy, math.inf
+                self._left, self._excess = PATIENCE, math.inf
+            elif self._left > 1:  # two iterates may take turns
+                self._left -= 1
+            self._energy = energy
             self._forget()
             self.best = u.copy()
             return

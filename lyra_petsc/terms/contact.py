@@ -39,7 +39,7 @@ KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""
 
 PARALLEL = 1e-3
-"""Squared sine of the angle of two of the shortest edges below which they count as nearly parallel."""
+"""Squared sine of the angle of two edges below which they count as nearly parallel."""
 
 AT_ONCE = 256
 """Pairs whose Hessians are in memory at a time."""
@@ -56,8 +56,8 @@ class Barrier(NamedTuple):
     gap, thickness : float [m]
     stiffness : float [N/m]
         k.
-    parallel : float [m⁴]
-        |u × v|² of edges below which their energy fades.
+    parallel : float
+        Squared sine of the angle of edges below which their energy fades.
     """
 
     gap: float
@@ -396,7 +396,7 @@ def barrier(rest: RestShape) -> Barrier:
             key="contact",
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells) / HALFWAY
-    return Barrier(gap, thickness, stiffness, PARALLEL * shortest**4)
+    return Barrier(gap, thickness, stiffness, PARALLEL)
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:

@@ -13,9 +13,9 @@ potential contact, ACM Trans. Graph. 39 (2020) 49)::
 
     b(δ) = −k (δ − gap)² ln(δ / gap)  for 0 < δ < gap, 0 beyond, infinite at δ ≤ 0
 
-The nearest points of parallel edges are not unique. Energies of pairs of edges u and v have the factor
-m = c (2 − c), c = |u × v|² / parallel up to 1, with which forces stay continuous; where they lie side by side
-pairs of vertices and triangles are as near (same source, section 5.2).
+The nearest points of parallel edges are not unique. Energies of pairs of edges u and v at an angle θ have the
+factor m = c (2 − c), c = sin² θ / parallel up to 1, with which forces stay continuous; where they lie side by
+side pairs of vertices and triangles are as near (same source, section 5.2, with |u × v|² over rest lengths).
 
 Points of obstacles have numbers below 0: ~number among the obstacles' points.
 """
@@ -265,19 +265,30 @@ def barrier(delta, gap):  # type: ignore[no-untyped-def]
     return -less * less * log, -less * (2.0 * log + ratio), -2.0 * log - 4.0 * ratio + ratio * ratio
 
 
-@kernel()
-def _mollifier(p, parallel, slope):  # type: ignore[no-untyped-def]
-    """m of edges p0 p1 and p2 p3, m′, m″ with respect to |u × v|², whose gradient goes to slope (12,)."""
+@kernel(inline="always")
+def _of_edges(p):  # type: ignore[no-untyped-def]
+    """u·u, u·v and v·v of edges p0 p1 and p2 p3."""
     uu = uv = vv = 0.0
     for k in range(3):
         u, v = p[1, k] - p[0, k], p[3, k] - p[2, k]
         uu, uv, vv = uu + u * u, uv + u * v, vv + v * v
-    c = (uu * vv - uv * uv) / parallel
+    return uu, uv, vv
+
+
+@kernel()
+def _mollifier(p, parallel, slope):  # type: ignore[no-untyped-def]
+    """m of edges p0 p1 and p2 p3, m′, m″ with respect to sin² θ, whose gradient goes to slope (12,)."""
+    uu, uv, vv = _of_edges(p)
+    square = uu * vv
+    if not square > 0.0:
+        return 0.0, 0.0, 0.0
+    c = (square - uv * uv) / (square * parallel)
     if c >= 1.0:
         return 1.0, 0.0, 0.0
+    factor = -2.0 * uv / square
     for k in range(3):
         u, v = p[1, k] - p[0, k], p[3, k] - p[2, k]
-        to_u, to_v = 2.0 * (u * vv - v * uv), 2.0 * (v * uu - u * uv)
+        to_u, to_v = factor * (v - uv / uu * u), factor * (u - uv / vv * v)
         slope[k], slope[3 + k], slope[6 + k], slope[9 + k] = -to_u, to_u, -to_v, to_v
     return c * (2.0 - c), 2.0 * (1.0 - c) / parallel, -2.0 / (parallel * parallel)
 
@@ -417,18 +428,22 @@ def pair_hessian(p, kind, offset, gap, stiffness, parallel, blend, beta, gamma, 
 
 @kernel()
 def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
-    """Add factor times the Hessian of |u × v|² to h (12, 12)."""
-    uu = uv = vv = 0.0
-    u, v = np.empty(3), np.empty(3)
+    """Add factor times the Hessian of sin² θ to h (12, 12)."""
+    uu, uv, vv = _of_edges(p)
+    square = uu * vv
+    if not square > 0.0:
+        return
     for k in range(3):
-        u[k], v[k] = p[1, k] - p[0, k], p[3, k] - p[2, k]
-        uu, uv, vv = uu + u[k] * u[k], uv + u[k] * v[k], vv + v[k] * v[k]
-    for k in range(3):
+        uk, vk = p[1, k] - p[0, k], p[3, k] - p[2, k]
+        a, b = vk - uv / uu * uk, uk - uv / vv * vk
         for m in range(3):
             same = 1.0 if k == m else 0.0
-            one = 2.0 * factor * (vv * same - v[k] * v[m])
-            other = 2.0 * factor * (uu * same - u[k] * u[m])
-            mixed = 2.0 * factor * (2.0 * u[k] * v[m] - v[k] * u[m] - uv * same)
+            um, vm = p[1, m] - p[0, m], p[3, m] - p[2, m]
+            to_u, to_v = vm - 2.0 * uv / uu * um, um - 2.0 * uv / vv * vm
+            scale = -2.0 * factor / square
+            one = scale * (a * to_u - uv / uu * (uk * to_u + uv * same))
+            other = scale * (b * to_v - uv / vv * (vk * to_v + uv * same))
+            mixed = scale * (a * to_v + uv * (same - uk * um / uu))
             for i in range(2):
                 for j in range(2):
                     sign = 1.0 if i == j else -1.0

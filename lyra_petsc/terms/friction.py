@@ -194,7 +194,7 @@ class CoulombFriction(Elastic):
         friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
 
     def hessians(self, x: Array, frozen: ObstacleMoves, lo: int, hi: int, blend: float, out: Array) -> None:
-        friction_pairs.hessians(x, *self._state(frozen.stage), lo, out)
+        friction_pairs.hessians(x, *self._state(frozen.stage), lo, blend, out)
 
     def force_scale(self, size: float) -> Array:
         return self._spring * size

@@ -64,15 +64,19 @@ def add_gradient(x, stencil, beta, normal, start, slip, stiffness, limit, out): 
 
 
 @kernel()
-def hessians(x, stencil, beta, normal, start, slip, stiffness, limit, lo, out):  # type: ignore[no-untyped-def]
-    """Hessians [N/m] of pairs lo, lo + 1, … into out (n, 4, 4, 3, 3): all positive semidefinite."""
+def hessians(x, stencil, beta, normal, start, slip, stiffness, limit, lo, blend, out):  # type: ignore[no-untyped-def]
+    """Hessians [N/m] of pairs lo, lo + 1, … into out (n, 4, 4, 3, 3): all positive semidefinite.
+
+    ``blend`` 0 is exact; 1 takes a spring of the stiffness μ N / |u| for what slides, whose energy is nowhere
+    less.
+    """
     u = np.empty(3)
     for n in range(len(out)):
         e = lo + n
         m = way(x, e, stencil, beta, normal, start, slip, u)
         sticks = stiffness[e] * m <= limit[e]
         factor = stiffness[e] if sticks else limit[e] / m
-        less = 0.0 if sticks else factor / (m * m)
+        less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
         for k in range(3):
             for j in range(3):
                 block = factor * ((1.0 if k == j else 0.0) - normal[e, k] * normal[e, j]) - less * u[k] * u[j]

@@ -128,7 +128,7 @@ def balls(n: int) -> Pairs:
 KINDS: dict[str, tuple[Callable[[], Pairs], float]] = {
     "vertex and triangle": (lambda: among_sheets(VERTEX_TRIANGLE, 1000), NOWHERE),
     "edges": (lambda: among_sheets(EDGE_EDGE, 1000), NOWHERE),
-    "edges that fade": (lambda: among_sheets(EDGE_EDGE, 1000), 20.0),
+    "edges that fade": (lambda: among_sheets(EDGE_EDGE, 1000), 0.5),
     "edges nearly parallel": (lambda: nearly_parallel(1000), 0.1),
     "vertex and plane": (lambda: planes(500), NOWHERE),
     "vertex inside": (lambda: balls(500), NOWHERE),
@@ -216,6 +216,17 @@ def test_derivatives(name: str) -> None:
     # second derivatives jump where another corner or edge becomes the nearest
     assert np.median(error[usable]) < 1e-7
     assert np.percentile(error[usable], 99) < 1e-4
+
+
+def test_edges_fade_alike_whatever_their_length() -> None:
+    pairs = nearly_parallel(100)
+    p = pairs.x.reshape(-1, 4, 3).copy()
+    p[:, 3] = p[:, 2] + 30.0 * (p[:, 3] - p[:, 2])
+    longer = replace(pairs, x=p.reshape(-1, 3))
+    for parallel in (1e-3, 1e-6):
+        faded = [each.energies(each.x, parallel) / each.energies(each.x) for each in (pairs, longer)]
+        np.testing.assert_allclose(*faded, rtol=1e-6)
+        assert 0.1 < (faded[0] < 1.0).mean() < 0.9
 
 
 @pytest.mark.parametrize("name", KINDS)

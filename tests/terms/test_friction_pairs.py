@@ -46,7 +46,7 @@ def gradient(x: Array, state: tuple[Array, ...]) -> Array:
 
 def test_derivatives_are_those_of_the_potential(x: Array, state: tuple[Array, ...]) -> None:
     hessian, h = np.empty((N, 4, 4, 3, 3)), 1e-6
-    friction_pairs.hessians(x, *state, 0, hessian)
+    friction_pairs.hessians(x, *state, 0, 0.0, hessian)
     way = np.random.default_rng(2).normal(size=x.shape)
     slope = (energies(x + h * way, state) - energies(x - h * way, state)) / (2 * h)
     np.testing.assert_allclose(
@@ -57,6 +57,18 @@ def test_derivatives_are_those_of_the_potential(x: Array, state: tuple[Array, ..
     np.testing.assert_allclose(expected, change, rtol=1e-5, atol=1e-7)
     flat = hessian.transpose(0, 1, 3, 2, 4).reshape(N, 12, 12)
     assert np.linalg.eigvalsh(flat).min() > -1e-12
+
+
+def test_no_energy_is_above_that_of_regularised_springs(x: Array, state: tuple[Array, ...]) -> None:
+    hessian = np.empty((N, 4, 4, 3, 3))
+    friction_pairs.hessians(x, *state, 0, 1.0, hessian)
+    flat = hessian.transpose(0, 1, 3, 2, 4).reshape(N, 12, 12)
+    assert np.linalg.eigvalsh(flat).min() > -1e-12
+    here, slope = energies(x, state), gradient(x, state).reshape(N, 12)
+    for length in (0.01, 0.1, 1.0, 10.0):
+        way = length * np.random.default_rng(3).normal(size=(N, 12))
+        bound = here + (slope * way).sum(axis=1) + 0.5 * np.einsum("ei,eij,ej->e", way, flat, way)
+        assert (energies(x + way.reshape(-1, 3), state) <= bound + 1e-12 * np.abs(bound)).all()
 
 
 def test_forces_lie_in_the_plane_and_in_the_cone(x: Array, state: tuple[Array, ...]) -> None:

@@ -1,0 +1,35 @@
+"""When trust in full steps is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+from petsc4py import PETSc
+
+from lyra_petsc.stepping.watchdog import PATIENCE, Watchdog
+
+
+def seen(energies: Iterable[float]) -> int:
+    """After how many iterates of these energies trust is lost; 0 if it never is."""
+    watchdog, u = Watchdog(), PETSc.Vec().createSeq(1)
+    watchdog.begin()
+    lost = 0
+    for number, energy in enumerate(energies, start=1):
+        watchdog.see(u, energy, 1e-14)
+        if watchdog.lost:
+            lost = number
+            break
+    watchdog.begin()
+    u.destroy()
+    return lost
+
+
+def test_iterates_that_take_turns_are_not_trusted() -> None:
+    assert 0 < seen([2.0, 1.0] * 20) <= 2 * PATIENCE
+    assert 0 < seen([3.0, 2.0, 1.0] * 20) <= 3 * PATIENCE
+
+
+@pytest.mark.parametrize("energies", [[1.0] * 50, [1.0 / n for n in range(1, 50)], [0.0, 9.0, 4.0, 1.9, 0.9]])
+def test_what_falls_or_stays_is_trusted(energies: list[float]) -> None:
+    assert seen(energies) == 0
