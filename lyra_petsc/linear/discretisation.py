@@ -10,7 +10,7 @@ or of n_blocks blocks compares them with ``layout`` and ``rows``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from mpi4py import MPI
@@ -262,7 +262,7 @@ class Discretisation:
             int(counted.sum()),
         )
 
-    def renew_pattern(self, acting: Callable[[Elastic], NDArray[np.bool_]]) -> bool:
+    def renew_pattern(self, acting: Mapping[Elastic, NDArray[np.bool_]]) -> bool:
         """Let ``rows`` have the blocks of those elements that act (E,); whether they are others than before.
 
         Blocks of earlier ones stay while they are `FEW`; other elements have an offset where there is one.
@@ -271,7 +271,7 @@ class Discretisation:
         if not self._changing:
             return False
         n_local, extra, before = self.layout.n_local, self._extra, self.rows
-        stencils = [term.stencil[acting(term)] for term in self._changing]
+        stencils = [term.stencil[acting[term]] for term in self._changing]
         needed = self.fixed.pattern.missing(stencils, n_local)
         every = union(needed, extra) if self.rows.pattern.n_local == n_local else needed
         fits = self.place is not None and len(every) == len(extra) and n_local == self.rows.pattern.n_local

@@ -26,9 +26,10 @@ class ActiveTerms:
     ----------
     elastic, viscous, loads : list of Term
         By kind.
-    sheet, constraints, moving, limiting, edged : list of Elastic
+    sheet, constraints, moving, limiting, near, edged : list of Elastic
         Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
-        those that limit the length of Newton's steps, and those with unknowns on edges.
+        those that limit the length of Newton's steps, those whose stencils change, and those with unknowns on
+        edges.
     coarse : dict of Elastic → Elastic
         Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
     frozen : dict of Term
@@ -44,6 +45,7 @@ class ActiveTerms:
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.moving = [term for term in self.sheet if term.moving]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
+        self.near = [term for term in self.elastic if term.registration.neighbours]
         self.edged = [term for term in self.elastic if term.registration.edge_state]
         self.coarse: dict[Elastic, Elastic] = {}
         self.frozen: dict[Term, Any] = dict.fromkeys(terms)

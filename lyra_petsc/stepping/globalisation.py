@@ -40,7 +40,7 @@ class Globalisation:
         """Note energy and residual of the present iterate, against which trial points are judged."""
         self._at = self._equations.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
-        self._near = self._equations.anything_near
+        self._near = self._equations.touches
         energy, size = self._at
         self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
 

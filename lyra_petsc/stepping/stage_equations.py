@@ -100,11 +100,14 @@ class StageEquations:
         Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
     active : ActiveTerms
     applied : AppliedLoads
+    touches : bool
+        Whether anything acted that changes its stencils, where the block rows were last renewed.
     refused_way : RefusedWay or None
         What the present step may not go.
     """
 
     refused_way: RefusedWay | None = None
+    touches = False
 
     def __init__(
         self,
@@ -419,13 +422,6 @@ class StageEquations:
         """
         return bool(self.active.limiting) or (bool(self.active.edged) and not self.integrator.moves)
 
-    @property
-    def anything_near(self) -> bool:
-        """Whether there is anything that terms keep apart; collective."""
-        if not self.active.limiting:
-            return False
-        return bool(self.points.summed(sum(term.n_owned for term in self.active.limiting))[0])
-
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
         x, ahead = self._ahead(v, way)
@@ -547,7 +543,11 @@ class StageEquations:
         others; collective.
         """
         x, frozen = self._xs, self.active.frozen
-        return self.discretisation.renew_pattern(lambda term: term.acting(x, frozen.get(term)))
+        acting = {term: term.acting(x, frozen.get(term)) for term in self.active.near}
+        if acting:
+            number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
+            self.touches = bool(self.points.comm.allreduce(number, MPI.MAX))
+        return self.discretisation.renew_pattern(acting)
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
