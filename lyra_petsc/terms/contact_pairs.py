@@ -52,162 +52,163 @@ def _at(x, others, number):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _clear(beta, gamma):  # type: ignore[no-untyped-def]
-    for i in range(4):
-        beta[i] = 0.0
-        gamma[0, i] = gamma[1, i] = 0.0
-
-
-@kernel()
-def _to_segment(p, a, b, at, first, second, beta, gamma):  # type: ignore[no-untyped-def]
-    """Nearest point of segment a b to p, its weights at ``first`` and ``second``; how many are free."""
+def _along(p, a, b):  # type: ignore[no-untyped-def]
+    """Where the nearest point of segment a b to p is: 0 at a, 1 at b."""
     way = minus(b, a)
     square = dot(way, way)
     t = dot(minus(p, a), way) / square if square > 0.0 else 0.0
-    beta[at] = 1.0
-    if t <= 0.0:
-        beta[first] = -1.0
-        return 0
-    if t >= 1.0:
-        beta[second] = -1.0
-        return 0
-    beta[first], beta[second] = t - 1.0, -t
-    gamma[0, first], gamma[0, second] = 1.0, -1.0
-    return 1
+    return min(max(t, 0.0), 1.0)
+
+
+@kernel(inline="always")
+def _to_side(p, a, b):  # type: ignore[no-untyped-def]
+    """The same, and the square of the distance."""
+    t = _along(p, a, b)
+    g = p[0] - a[0] - t * (b[0] - a[0]), p[1] - a[1] - t * (b[1] - a[1]), p[2] - a[2] - t * (b[2] - a[2])
+    return t, dot(g, g)
 
 
 @kernel()
-def _vertex_triangle(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
-    """β (4,) and γ (2, 4) of a vertex and a triangle; how many coordinates are free.
+def _in_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
+    """Barycentric coordinates of the nearest point of a triangle to p: the second and the third.
 
     Regions as in Ericson, Real-time collision detection (2005), 5.1.5.
     """
-    _clear(beta, gamma)
     ab, ac, ap = minus(b, a), minus(c, a), minus(p, a)
     normal = cross(ab, ac)
     if not dot(normal, normal) > PARALLEL * dot(ab, ab) * dot(ac, ac):
-        return _nearest_side(p, a, b, c, beta, gamma)  # as near; what follows would be rounding
+        # the nearest of the sides is as near; what follows would be rounding
+        t, to_ab = _to_side(p, a, b)
+        u, to_bc = _to_side(p, b, c)
+        v, to_ca = _to_side(p, c, a)
+        if to_ab <= to_bc and to_ab <= to_ca:
+            return t, 0.0
+        return (1.0 - u, u) if to_bc <= to_ca else (0.0, 1.0 - v)
     d1, d2 = dot(ab, ap), dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
-        beta[0], beta[1] = 1.0, -1.0
-        return 0
+        return 0.0, 0.0
     bp = minus(p, b)
     d3, d4 = dot(ab, bp), dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
-        beta[0], beta[2] = 1.0, -1.0
-        return 0
+        return 1.0, 0.0
     cp = minus(p, c)
     d5, d6 = dot(ab, cp), dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
-        beta[0], beta[3] = 1.0, -1.0
-        return 0
+        return 0.0, 1.0
     if d1 * d4 - d3 * d2 <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
+        return _along(p, a, b), 0.0
     if d5 * d2 - d1 * d6 <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return _to_segment(p, a, c, 0, 1, 3, beta, gamma)
+        return 0.0, _along(p, a, c)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        return _to_segment(p, b, c, 0, 2, 3, beta, gamma)
+        t = _along(p, b, c)
+        return 1.0 - t, t
     total = va + vb + vc
-    v, w = vb / total, vc / total
-    beta[0], beta[1], beta[2], beta[3] = 1.0, v + w - 1.0, -v, -w
-    gamma[0, 1], gamma[0, 2] = 1.0, -1.0
-    gamma[1, 1], gamma[1, 3] = 1.0, -1.0
-    return 2
+    return vb / total, vc / total
 
 
 @kernel()
-def _nearest_side(p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
-    best, found = math.inf, 0
-    for side in range(3):
-        _to_side(side, p, a, b, c, beta, gamma)
-        square = 0.0
-        for k in range(3):
-            g = beta[0] * p[k] + beta[1] * a[k] + beta[2] * b[k] + beta[3] * c[k]
-            square += g * g
-        if square < best:
-            best, found = square, side
-    return _to_side(found, p, a, b, c, beta, gamma)
+def _on_edges(a, b, c, d):  # type: ignore[no-untyped-def]
+    """Where the nearest points of edges a b and c d are: 0 at a and c, 1 at b and d.
 
-
-@kernel()
-def _to_side(side, p, a, b, c, beta, gamma):  # type: ignore[no-untyped-def]
-    _clear(beta, gamma)
-    if side == 0:
-        return _to_segment(p, a, b, 0, 1, 2, beta, gamma)
-    if side == 1:
-        return _to_segment(p, b, c, 0, 2, 3, beta, gamma)
-    return _to_segment(p, c, a, 0, 3, 1, beta, gamma)
-
-
-@kernel()
-def _edge_edge(a, b, c, d, beta, gamma):  # type: ignore[no-untyped-def]
-    """The same of edges a b and c d."""
-    _clear(beta, gamma)
+    As in Ericson, 5.1.9.
+    """
     u, v, w = minus(b, a), minus(d, c), minus(a, c)
     uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
     det = uu * vv - uv * uv
-    if det > PARALLEL * uu * vv:
-        s, t = (uv * vw - vv * uw) / det, (uu * vw - uv * uw) / det
-        if 0.0 < s < 1.0 and 0.0 < t < 1.0:
-            beta[0], beta[1], beta[2], beta[3] = 1.0 - s, s, t - 1.0, -t
-            gamma[0, 0], gamma[0, 1] = -1.0, 1.0
-            gamma[1, 2], gamma[1, 3] = 1.0, -1.0
-            return 2
-    # else an end of one of them is nearest
-    best, found = math.inf, 0
-    for end in range(4):
-        g, _ = _end_distance(end, a, b, c, d, beta, gamma)
-        if g < best:
-            best, found = g, end
-    _, free = _end_distance(found, a, b, c, d, beta, gamma)
-    return free
+    if not det > PARALLEL * uu * vv:
+        # an end of one of them is as near
+        t, to_a = _to_side(a, c, d)
+        best, s = to_a, 0.0
+        more, to_b = _to_side(b, c, d)
+        if to_b < best:
+            best, s, t = to_b, 1.0, more
+        more, to_c = _to_side(c, a, b)
+        if to_c < best:
+            best, s, t = to_c, more, 0.0
+        more, to_d = _to_side(d, a, b)
+        if to_d < best:
+            s, t = more, 1.0
+        return s, t
+    s = min(max((uv * vw - vv * uw) / det, 0.0), 1.0)
+    t = (uv * s + vw) / vv
+    if t < 0.0:
+        s, t = min(max(-uw / uu, 0.0), 1.0), 0.0
+    elif t > 1.0:
+        s, t = min(max((uv - uw) / uu, 0.0), 1.0), 1.0
+    return s, t
 
 
 @kernel()
-def _end_distance(end, a, b, c, d, beta, gamma):  # type: ignore[no-untyped-def]
-    """Squared distance of an end of one edge from the other; free coordinates."""
-    _clear(beta, gamma)
-    if end == 0:
-        free = _to_segment(a, c, d, 0, 2, 3, beta, gamma)
-    elif end == 1:
-        free = _to_segment(b, c, d, 1, 2, 3, beta, gamma)
-    elif end == 2:
-        free = _to_segment(c, a, b, 2, 0, 1, beta, gamma)
-    else:
-        free = _to_segment(d, a, b, 3, 0, 1, beta, gamma)
+def _weights(kind, p):  # type: ignore[no-untyped-def]
+    """β of the nearest points of p (4, 3)."""
+    a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
+    c, d = (p[2, 0], p[2, 1], p[2, 2]), (p[3, 0], p[3, 1], p[3, 2])
+    if kind == EDGE_EDGE:
+        s, t = _on_edges(a, b, c, d)
+        return 1.0 - s, s, t - 1.0, -t
+    if kind == VERTEX_INSIDE:
+        t = _along(a, b, c)
+        return 1.0, t - 1.0, -t, 0.0
+    v, w = _in_triangle(a, b, c, d)
+    return 1.0, v + w - 1.0, -v, -w
+
+
+@kernel(inline="always")
+def _length(p, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
+    """|g|."""
     square = 0.0
     for k in range(3):
-        g = beta[0] * a[k] + beta[1] * b[k] + beta[2] * c[k] + beta[3] * d[k]
+        g = b0 * p[0, k] + b1 * p[1, k] + b2 * p[2, k] + b3 * p[3, k]
         square += g * g
-    return square, free
+    return math.sqrt(square)
+
+
+@kernel()
+def distance(kind, p):  # type: ignore[no-untyped-def]
+    """Distance of points p (4, 3): |g|, or −|g| inside.
+
+    Of a plane, whose distance is negative behind it, p1 to p3 become a triangle around the nearest point.
+    """
+    behind = kind == VERTEX_INSIDE
+    if kind == VERTEX_PLANE:
+        behind = _around_foot(p)
+    b0, b1, b2, b3 = _weights(kind, p)
+    length = _length(p, b0, b1, b2, b3)
+    return -length if behind else length
 
 
 @kernel()
 def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
     """Distance of points p (4, 3), their β (4,) and γ (2, 4); how many coordinates are free.
 
-    It is |g|, or −|g| inside. Of a plane, whose distance is negative behind it, p1 to p3 become a triangle
-    around the nearest point.
+    p may change as in `distance`.
     """
-    behind = False
+    behind = kind == VERTEX_INSIDE
     if kind == VERTEX_PLANE:
         behind = _around_foot(p)
-    a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
-    c, d = (p[2, 0], p[2, 1], p[2, 2]), (p[3, 0], p[3, 1], p[3, 2])
+    b0, b1, b2, b3 = _weights(kind, p)
+    beta[0], beta[1], beta[2], beta[3] = b0, b1, b2, b3
+    gamma[:] = 0.0
+    free = 0
     if kind == EDGE_EDGE:
-        free = _edge_edge(a, b, c, d, beta, gamma)
-    elif kind == VERTEX_INSIDE:
-        _clear(beta, gamma)
-        free = _to_segment(a, b, c, 0, 1, 2, beta, gamma)
-        behind = True
+        if b0 != 0.0 and b1 != 0.0:
+            gamma[0, 0], gamma[0, 1] = -1.0, 1.0
+            free = 1
+        if b2 != 0.0 and b3 != 0.0:
+            gamma[free, 2], gamma[free, 3] = 1.0, -1.0
+            free += 1
     else:
-        free = _vertex_triangle(a, b, c, d, beta, gamma)
-    square = 0.0
-    for k in range(3):
-        g = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
-        square += g * g
-    return -math.sqrt(square) if behind else math.sqrt(square), free
+        last = -1
+        for i in range(1, 4):
+            if beta[i] != 0.0:
+                if last > 0:
+                    gamma[free, last], gamma[free, i] = 1.0, -1.0
+                    free += 1
+                else:
+                    last = i
+    length = _length(p, b0, b1, b2, b3)
+    return (-length if behind else length), free
 
 
 @kernel()
@@ -296,22 +297,22 @@ def _mollifier(p, parallel, slope):  # type: ignore[no-untyped-def]
 @kernel()
 def distances(x, others, kind, points, out):  # type: ignore[no-untyped-def]
     """|g| [m] of each pair, (E,)."""
-    p, beta, gamma = np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    p = np.empty((4, 3))
     for e in range(len(out)):
         _load(x, others, points, e, p)
-        out[e], _ = nearest(kind[e], p, beta, gamma)
+        out[e] = distance(kind[e], p)
 
 
 @kernel()
 def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) pairs."""
-    p, beta, gamma, slope = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
+    p, slope = np.empty((4, 3)), np.zeros(12)
     for e in range(len(out)):
         _load(x, others, points, e, p)
         out[e] = 0.0
         if _at_least(p, kind[e]) - offset[e] >= gap:
             continue
-        d, _ = nearest(kind[e], p, beta, gamma)
+        d = distance(kind[e], p)
         delta = d - offset[e]
         if delta >= gap:
             pass
@@ -326,12 +327,12 @@ def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  #
 @kernel()
 def acting(x, others, kind, points, offset, gap, out):  # type: ignore[no-untyped-def]
     """Whether each pair is nearer than the gap, (E,)."""
-    p, beta, gamma = np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    p = np.empty((4, 3))
     for e in range(len(out)):
         _load(x, others, points, e, p)
         out[e] = _at_least(p, kind[e]) - offset[e] < gap
         if out[e]:
-            d, _ = nearest(kind[e], p, beta, gamma)
+            d = distance(kind[e], p)
             out[e] = d - offset[e] < gap
 
 
@@ -515,7 +516,7 @@ def approaches(x, others, way, others_way, kind, points, reach, out):  # type: i
     Both parts of a sheet are as far on their ways as each other, obstacles anywhere on theirs. From
     ``reach`` (E,) on it may be any number beyond.
     """
-    p, w, beta, gamma = np.empty((4, 3)), np.empty((4, 3)), np.empty(4), np.empty((2, 4))
+    p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(out)):
         _load(x, others, points, e, p)
         _load(way, others_way, points, e, w)
@@ -527,8 +528,19 @@ def approaches(x, others, way, others_way, kind, points, reach, out):  # type: i
         out[e] = _at_least(p, kind[e]) - speed
         if out[e] >= reach[e]:
             continue
-        d, _ = nearest(kind[e], p, beta, gamma)
+        d = distance(kind[e], p)
         out[e] = d - speed
+
+
+@kernel()
+def _farthest(ways):  # type: ignore[no-untyped-def]
+    """Length [m] of the longest of ways (n, 3)."""
+    most = 0.0
+    for i in range(len(ways)):
+        square = ways[i, 0] ** 2 + ways[i, 1] ** 2 + ways[i, 2] ** 2
+        if not square <= most:  # or no number
+            most = square
+    return math.sqrt(most)
 
 
 @kernel()
@@ -539,15 +551,22 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
     detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
     170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
+    both = _farthest(way) + max(_farthest(way), _farthest(others_way))
+    return _free_way(x, others, way, others_way, both, kind, points, offset, keep, most)
+
+
+@kernel()
+def _free_way(x, others, way, others_way, both, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+    """The same; no two points go farther together than ``both`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
-    beta, gamma = np.empty(4), np.empty((2, 4))
     for e in range(len(kind)):
         _load(x, others, points, e, p)
-        _load(way, others_way, points, e, w)
-        speed = _plane_speed(p, w, most) if kind[e] == VERTEX_PLANE else _speed(kind[e], w)
-        if most * speed <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
+        plane = kind[e] == VERTEX_PLANE
+        if not plane and most * both <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
             continue
-        d, _ = nearest(kind[e], p, beta, gamma)
+        _load(way, others_way, points, e, w)
+        speed = _plane_speed(p, w, most) if plane else _speed(kind[e], w)
+        d = distance(kind[e], p)
         left = d - offset[e]
         if left - most * speed >= keep * left or speed == 0.0:
             continue
@@ -563,7 +582,7 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
             for i in range(4):
                 for k in range(3):
                     p[i, k] += t * w[i, k]
-            d, _ = nearest(kind[e], p, beta, gamma)
+            d = distance(kind[e], p)
             left = d - offset[e]
         most = min(most, t)
     return most
@@ -597,9 +616,11 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, no
 @kernel()
 def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
     """What `free_way` gives for each of the first len(out) pairs alone."""
+    both = _farthest(way) + max(_farthest(way), _farthest(others_way))
     for e in range(len(out)):
         one = slice(e, e + 1)
-        out[e] = free_way(x, others, way, others_way, kind[one], points[one], offset[one], keep, 1.0)
+        pair = kind[one], points[one], offset[one]
+        out[e] = _free_way(x, others, way, others_way, both, *pair, keep, 1.0)
 
 
 @kernel()
