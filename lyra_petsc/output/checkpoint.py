@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
@@ -46,6 +47,8 @@ class Checkpoint:
         Why it is not the newest one, for the user.
     edges : dict of str to (n_edges,) array
         Unknowns of edges by name, in this rank's numbering.
+    elements : dict of str to (n, m) array
+        Rows of elements that change, by name; this rank has as good a share of them as any other.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -53,6 +56,7 @@ class Checkpoint:
     file: Path
     note: str | None = None
     edges: dict[str, NDArray[Any]] = field(default_factory=dict)
+    elements: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
 def checkpoint_file(
@@ -62,6 +66,7 @@ def checkpoint_file(
     scalars: Mapping[str, Any],
     edge_order: FileOrder | None = None,
     edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> NewFile:
     """A newer checkpoint, to be written; then the old one is kept as the previous.
 
@@ -77,6 +82,8 @@ def checkpoint_file(
         Order of the edges each rank owns that carry an unknown; None: there are none.
     edge_arrays : mapping of str to (n_edges,) array of float64
         The same of the unknowns of edges.
+    elements : mapping of str to (n, m) array of float64
+        Rows of this rank's elements that change, in any order.
     scalars : mapping
         What JSON can hold (numbers, text, lists, mappings): ``step``, ``time``, ``dt``, cumulative
         works, …; the same on every rank.
@@ -85,6 +92,7 @@ def checkpoint_file(
     slabs = {f"vertices/{name}": order.to_slab(np.asarray(rows)) for name, rows in arrays.items()}
     if edge_order is not None:
         slabs |= {f"edges/{name}": edge_order.to_slab(np.asarray(v)) for name, v in edge_arrays.items()}
+    slabs |= {f"elements/{name}": rows for name, rows in elements.items()}
     if any(slab.dtype.itemsize != 8 for slab in slabs.values()):
         raise ValueError("checkpoints hold float64 and int64")
     sums = dict(zip(slabs, check_sums(slabs.values(), order.comm).tolist(), strict=True))
@@ -131,7 +139,7 @@ def read_checkpoint(
     newest: InputError | None = None
     for file in checkpoint_files(folder, order.comm):
         try:
-            scalars, sums = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
+            scalars, sums, counts = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
             arrays, edges = (
                 {
                     name.split("/", 1)[1]: _rows(file, name, sums[name], by)
@@ -140,11 +148,15 @@ def read_checkpoint(
                 }
                 for kind, by in (("vertices/", order), ("edges/", edge_order))
             )
+            elements = {
+                name.split("/", 1)[1]: _rows(file, name, sums[name], _shares(order.comm, count))
+                for name, count in sorted(counts.items())
+            }
         except InputError as error:
             newest = newest or error
             continue
         note = f"{newest}; going on from the one before" if newest else None
-        return Checkpoint(arrays, scalars, file, note, edges)
+        return Checkpoint(arrays, scalars, file, note, edges, elements)
     if newest is None:
         raise InputError("holds no checkpoint to resume from; run without --resume", file=folder)
     raise InputError(
@@ -153,7 +165,7 @@ def read_checkpoint(
     )
 
 
-def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:
+def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int], dict[str, int]]:
     with open_stored(file) as content:
         version, n_vertices = int(content.attrs["format"]), int(content.attrs["n_vertices"])
         if version not in (FIRST_FORMAT, FORMAT):
@@ -164,9 +176,10 @@ def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:
         scalars = json.loads(text)
         found = {
             f"{kind}/{name}": (data.dtype.str, data.shape[1:], int(text_of(data, "sum")))
-            for kind in ("vertices", "edges")
+            for kind in ("vertices", "edges", "elements")
             for name, data in content.get(kind, {}).items()
         }
+        counts = {f"elements/{name}": len(data) for name, data in content.get("elements", {}).items()}
         told = text_of(content, "digest") if version != FIRST_FORMAT else None
     if told is not None and told != _digest(version, n_vertices, text, found):
         raise InputError("checkpoint is damaged: its check sum does not fit", file=file)
@@ -178,7 +191,13 @@ def _head(file: Path, order: FileOrder) -> tuple[Scalars, dict[str, int]]:
             "resume with the scene it was written by",
             file=file,
         )
-    return scalars, {name: total for name, (_, _, total) in found.items()}
+    return scalars, {name: total for name, (_, _, total) in found.items()}, counts
+
+
+def _shares(comm: MPI.Comm, count: int) -> FileOrder:
+    """An order in which each rank has the rows of its slab."""
+    starts = np.arange(comm.size + 1, dtype=np.int64) * count // comm.size
+    return FileOrder(comm, np.arange(starts[comm.rank], starts[comm.rank + 1]), count)
 
 
 def _plausible(scalars: Any) -> bool:

@@ -103,6 +103,18 @@ class FileOrder:
         rows[self._outgoing] = arrived
         return rows
 
+    def look_up(self, rows: NDArray[Any], numbers: NDArray[np.int64]) -> NDArray[Any]:
+        """Of any file rows (n,), whatever rank owns them, what ``rows`` (n_owned, ...) hold. Collective."""
+        slab = self.to_slab(rows)
+        holder = np.searchsorted(self.starts, numbers, side="right") - 1
+        asked = [np.flatnonzero(holder == rank) for rank in range(self.comm.size)]
+        wanted = self.comm.alltoall([numbers[at] - self.starts[rank] for rank, at in enumerate(asked)])
+        answers = self.comm.alltoall([slab[at] for at in wanted])
+        found = np.empty((len(numbers), *slab.shape[1:]), dtype=slab.dtype)
+        for at, answer in zip(asked, answers, strict=True):
+            found[at] = answer
+        return found
+
     @staticmethod
     def _expect(rows: NDArray[Any], count: int, what: str) -> None:
         if len(rows) != count:

@@ -38,6 +38,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 MOST_CHANGES = 12
 """Changes of a resumed scene that are listed one by one."""
@@ -162,8 +163,24 @@ class Recorder:
         for number, start in enumerate(memory["late_starts"]):
             system.reference.resume(float(start), arrays[f"start_{number}"])
         system.state.set(arrays["position"], arrays["velocity"])
-        simulation.resume(memory, arrays, checkpoint.edges)
+        terms = simulation.problem.terms
+        elements = {
+            name: self._elements(terms[name].registration.element_vertices, rows)
+            for name, rows in checkpoint.elements.items()
+            if name in terms
+        }
+        simulation.resume(memory, arrays, checkpoint.edges, elements)
         int(memory["last_state"])
+
+    def _elements(self, n: int, rows: Array) -> tuple[Ints, Array]:
+        """Vertices (E, n) of elements of a checkpoint, by global numbers, and what it holds of them."""
+        layout = self._simulation.problem.points
+        numbers = rows[:, :n].astype(np.int64)
+        known = bool(((numbers >= 0) & (numbers < layout.n_vertices_global)).all())
+        if not self._comm.allreduce(known, MPI.LAND):
+            raise ValueError("elements are of vertices that there are not")
+        own = layout.start + np.arange(layout.n_vertices)
+        return self._vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
 
     def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
         """Refuse what cannot go on from the checkpoint (rank 0)."""
@@ -362,7 +379,8 @@ class Recorder:
             "scheme": simulation.scene.time.scheme,
         }
         began = clock.monotonic()
-        yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges)
+        elements = simulation.element_states()
+        yield checkpoint_file(self._folder, self._vertices, arrays, scalars, self._edges, edges, elements)
         self._last_checkpoint = clock.monotonic()
         self._steps_since = 0
         self._checkpoint_seconds = self._last_checkpoint - began

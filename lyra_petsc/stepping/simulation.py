@@ -38,6 +38,7 @@ from lyra_petsc.stepping.ts_options import with_ts_options
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 SMALLEST_FRACTION = 2.0**-12
 """Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""
@@ -492,6 +493,31 @@ class SteppedScene:
                 found[f"{term.name}.{name}"] = rows[layout.edge_places]
         return found
 
+    def element_states(self) -> dict[str, Array]:
+        """What terms keep in a checkpoint of elements that change: (E, n + m) each, of which the first n are
+        numbers of vertices in the mesh.
+        """
+        layout, found = self.problem.points, {}
+        for term in self.problem.system.active.near:
+            if term.registration.element_vertices:
+                known = np.zeros((layout.n_local, 3))
+                known[: layout.n_vertices, 0] = layout.original
+                layout.update_ghosts(known)
+                vertices, values = term.element_state()
+                numbers = known[layout.local(vertices.ravel()), 0].reshape(vertices.shape)
+                found[term.name] = np.concatenate([numbers, values], axis=1)
+        return found
+
+    def _restore_elements(self, term: Elastic, vertices: Ints, values: Array) -> None:
+        """Let a term go on with elements given by global numbers (E, n), on any rank; collective."""
+        layout, comm = self.problem.points, self.comm
+        owner = np.searchsorted(layout.bounds, vertices, side="right") - 1
+        sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
+        came = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
+        vertices, values = (np.concatenate(part) for part in zip(*came, strict=True))
+        first = vertices[:, 0] - layout.start
+        term.restore_elements(vertices, values, (first >= 0) & (first < layout.n_owned))
+
     def _restore_edges(self, term: Elastic, edges: Mapping[str, Array]) -> None:
         """Let a term go on with what a checkpoint holds of edges, those of ghosts too; collective."""
         layout, state = self.problem.points, {}
@@ -507,6 +533,7 @@ class SteppedScene:
         memory: Mapping[str, Any],
         arrays: Mapping[str, Array],
         edges: Mapping[str, Array] = MappingProxyType({}),
+        elements: Mapping[str, tuple[Ints, Array]] = MappingProxyType({}),
     ) -> None:
         """Go on from a state already put into ``problem.system`` (x and v of owned rows)."""
         system = self.problem.system
@@ -534,6 +561,9 @@ class SteppedScene:
             names = term.registration.state
             if names:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
+            if term.name in elements:
+                self._restore_elements(term, *elements[term.name])
+                term.take_pairs(system.x, system.active.frozen[term])
         self.stepper.restore(arrays, memory, self.time, self.step_number)
         self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}
         self.stability = self.stability and memory.get("stability", self.stability)

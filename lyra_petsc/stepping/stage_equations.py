@@ -182,6 +182,8 @@ class StageEquations:
         step = UpcomingStep(time, time, time, self.x, self.reference.at)
         self.active.freeze(step)
         self._follow(self.x)  # energies at the start of a run are those of all stencils
+        for term in self.active.near:
+            term.take_pairs(self.x, self.active.frozen[term])
 
     # -- a step ------------------------------------------------------------------------------------
 

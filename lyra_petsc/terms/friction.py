@@ -16,6 +16,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import contact_pairs, friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -98,7 +99,7 @@ class CoulombFriction(Elastic):
         assert scene.contact is not None
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
-        self._pairs, self._began = _no_pairs(), False
+        self._pairs = _no_pairs()
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 1))}))
 
@@ -163,13 +164,46 @@ class CoulombFriction(Elastic):
         )
         self.stale = True
 
+    def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
+        self._renew(x, frozen.places)
+
+    def element_state(self) -> tuple[Ints, Array]:
+        """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
+        p = self._pairs
+        counted = p.key[:, 0] == 0
+        values = np.column_stack([p.key[:, 5:], p.slip, p.slid]).astype(np.float64)
+        return p.vertices[counted], values[counted]
+
+    def restore_elements(self, vertices: Ints, values: Array, counted: Mask) -> None:
+        vertices, what = vertices.copy(), values[:, :6].astype(np.int64)
+        slip, edges, sheets = values[:, 6:9].copy(), what[:, 0] == EDGE_EDGE, what[:, 1] < 0
+        # edges are named in the order of the present numbers
+        for rows, first in ((edges, 0), (edges & sheets, 2)):
+            turned = rows & (vertices[:, first] > vertices[:, first + 1])
+            vertices[turned, first : first + 2] = vertices[turned, first : first + 2][:, ::-1]
+        vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
+        swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
+        vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
+        key = np.column_stack([~counted, vertices, what])
+        order = np.lexsort(key.T[::-1])
+        nothing = np.zeros((len(key), 3))
+        self._pairs = Pairs(
+            key[order],
+            vertices[order],
+            what[order, 1],
+            np.zeros((len(key), 4)),
+            nothing,
+            nothing,
+            slip[order],
+            nothing,
+            np.zeros(len(key)),
+            values[order, 9] > 0.5,
+        )
+
     # -- a step ------------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
         obstacles = self._contact.obstacles
-        if not self._began:
-            self._began = True
-            self._renew(step.x, obstacles.at(step.start))
         stage, end = obstacles.moved(step.start, step.at), obstacles.moved(step.start, step.end)
         return ObstacleMoves(stage, end, obstacles.at(step.end))
 

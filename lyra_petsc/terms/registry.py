@@ -65,6 +65,8 @@ class Registration:
         It limits how far a Newton iteration may go.
     state, edge_state : tuple of str
         Names of the arrays that a checkpoint must hold for it, of vertices and of edges with an unknown.
+    element_vertices : int
+        Vertices of each of its elements, where these change and a checkpoint must hold something of them.
     coarse : str
         The term that stands for it on coarse levels of multigrid, which have no unknowns of edges. Its module
         offers ``coarse_elements(rest)``, of that term.
@@ -84,6 +86,7 @@ class Registration:
     limits_step: bool = False
     state: tuple[str, ...] = ()
     edge_state: tuple[str, ...] = ()
+    element_vertices: int = 0
     coarse: str = ""
     home: str = ""
 
@@ -135,6 +138,7 @@ REGISTRY: list[Registration] = [
         columns={"friction_work": "sum"},
         neighbours=True,
         state=("friction_work",),
+        element_vertices=4,
     ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),
     Registration(

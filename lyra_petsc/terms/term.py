@@ -315,6 +315,18 @@ class Elastic(Term):
     def restore_edges(self, state: Mapping[str, Array], x: Array) -> None:
         """Go on with a state of edges at positions x (n_local, 3)."""
 
+    def take_pairs(self, x: Array, frozen: Any) -> None:
+        """Let the next step be that from positions x (n_local, 3), where no step has ended."""
+
+    def element_state(self) -> tuple[Ints, Array]:
+        """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,
+        by their global numbers, and (E, m) numbers.
+        """
+        raise NotImplementedError
+
+    def restore_elements(self, vertices: Ints, values: Array, counted: NDArray[np.bool_]) -> None:
+        """Go on with what `element_state` gave, of elements that touch owned vertices; counted (E,)."""
+
     def largest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors of owned edges turn on a way (n_owned, 3)."""
         return 0.0

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import CLOTH, grid, scene_of
+from physics import CLOTH, end_on_one_rank, gathered, grid, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.friction import CoulombFriction
 
 Array = NDArray[np.float64]
 
@@ -65,3 +68,48 @@ def test_it_stands(comm: MPI.Comm) -> None:
     assert abs(speed) < 1e-5
     assert 0.0 < way < 2e-3
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
+
+
+def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Two sheets lie crosswise on a slope and stick; on one rank edges are named in another order."""
+    place = [0.9 * GAP * component for component in NORMAL]
+    above = [1.85 * GAP * component for component in NORMAL]
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
+    lower = grid(0.4, 0.4, 3, 3) | {"transform": {"rotate": turn, "translate": place}}
+    upper = grid(0.37, 0.33, 4, 3) | {"transform": {"rotate": turn, "translate": above}}
+    tight = {"force_tolerance": 1e-11, "step_tolerance": 1e-10}
+    scene = scene_of(
+        {
+            "mesh": [lower, upper],
+            "material": CLOTH | {"bending": 1e-4, "damping": 0.01},
+            "gravity": [0.0, 0.0, -G],
+            "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE)},
+            "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},
+            "time": {"end": 0.16, "step": 0.004},
+            "solver": tight,
+        }
+    )
+    simulation = SteppedScene(comm, scene)
+    start = gathered(simulation.problem.points, simulation.problem.system.x)
+    while not simulation.finished:
+        simulation.step()
+    unbroken = gathered(simulation.problem.points, simulation.problem.system.x)
+    term = simulation.problem.terms["friction"]
+    assert isinstance(term, CoulombFriction)
+    vertices, pairs = term.element_state()
+    between = (pairs[:, 0] == EDGE_EDGE) & (pairs[:, 1] < 0)
+    renamed, turned = vertices.copy(), pairs.copy()
+    renamed[between] = vertices[between][:, [3, 2, 1, 0]]
+    turned[between, 6:9] *= -1.0
+    term.restore_elements(renamed, turned, np.ones(len(pairs), dtype=np.bool_))
+    for again, before in zip(term.element_state(), (vertices, pairs), strict=True):
+        np.testing.assert_array_equal(again, before)
+    slips = comm.allgather(np.linalg.norm(pairs[:, 6:9], axis=1).max(initial=0.0))
+    kinds = set().union(*comm.allgather({(int(kind), obstacle < 0) for kind, obstacle in pairs[:, :2]}))
+    simulation.destroy()
+    assert max(slips) > 1e-6  # without which the sheets would creep on
+    assert {(EDGE_EDGE, True), (VERTEX_TRIANGLE, True)} <= kinds
+    x = end_on_one_rank(comm, scene, shared_tmp / "run", 20)
+    if x is not None:
+        assert np.abs(unbroken - start).max() > 1e-4
+        np.testing.assert_allclose(x, unbroken, rtol=0, atol=1e-9)
