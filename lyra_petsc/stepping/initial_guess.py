@@ -27,8 +27,7 @@ def first_guess(system: StageEquations, out: Array) -> None:
     if system.integrator.order > 1 and not system.discretisation.guards:
         out[:] = going_on
         return
-    staying = system.velocity_of_staying()
-    system.prescribe(staying)
+    staying = system.beginning()
     if system.discretisation.guards:
         going_on = staying + system.largest_step(staying, going_on - staying) * (going_on - staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]

@@ -77,7 +77,7 @@ def worst_pair(system: StageEquations) -> NearPair | None:
         return nearest_pair(system, system.evaluated[0])
 
     def obstruction(term: Elastic) -> Array:
-        return 1.0 - term.free_parts(way.x, way.ahead, system.active.frozen[term], carried=way.carried)
+        return 1.0 - term.free_parts(way.x, way.ahead, system.active.frozen[term], way.part)
 
     return _worst(system, way.x, obstruction)
 

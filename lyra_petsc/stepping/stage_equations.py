@@ -38,12 +38,15 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Elastic, Load, Part, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
 FARTHEST_TURN = 0.5
 """Angle [rad] by which a Newton iteration of a static analysis may turn a director."""
+
+SEARCHES = 16
+"""For what is near, at most, on the way of a Newton iteration or of handles in a step."""
 
 LEAST = 1e-6
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
@@ -56,13 +59,13 @@ class RefusedWay(NamedTuple):
     ----------
     x, ahead : (n_local, 3)
         Where it begins and how far it goes [m].
-    carried : bool
-        Obstacles go theirs in the step, too; else they stand where they do at the stage.
+    part : Part
+        Of the step, in which obstacles go theirs, too.
     """
 
     x: Array
     ahead: Array
-    carried: bool
+    part: Part
 
 
 class StageEquations:
@@ -108,6 +111,7 @@ class StageEquations:
 
     refused_way: RefusedWay | None = None
     touches = False
+    _may_begin: Array | None = None  # where ``may_move`` found a way to
 
     def __init__(
         self,
@@ -190,7 +194,7 @@ class StageEquations:
     def begin_step(self, t0: float, t1: float) -> None:
         """Freeze what stays fixed during the step from t0 to t1 [s]; collective."""
         self.t0, self.t1, self.dt = t0, t1, t1 - t0
-        self.refused_way = None
+        self.refused_way = self._may_begin = None
         self.new_iterate(None)
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
@@ -299,6 +303,15 @@ class StageEquations:
     def velocity_of_staying(self) -> Array:
         """Velocities (n_owned, 3) [m/s] whose stage is where the step starts."""
         return ((self.x - self._xh) / self.stage.reach)[: self.points.n_owned]
+
+    def beginning(self) -> Array:
+        """Velocities (n_owned, 3) [m/s] of staying, or going on where only that leads past what is near; what
+        is prescribed goes where it shall.
+        """
+        if self._may_begin is not None and not self._at_end:
+            return self._may_begin.copy()
+        self.prescribe(v := self.velocity_of_staying())
+        return v
 
     def stay(self) -> None:
         """Let the stage be where the step starts; collective."""
@@ -426,14 +439,32 @@ class StageEquations:
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        x, ahead = self._ahead(v, way)
-        fraction = self.discretisation.largest_step(x, ahead)
-        for term in self.active.limiting:
-            fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
-        for term in () if self.integrator.moves else self.active.edged:
-            turn = term.largest_turn(ahead[: len(way)])
-            fraction = min(fraction, FARTHEST_TURN / turn) if turn > 0.0 else fraction
-        return float(self.points.comm.allreduce(min(1.0, fraction), MPI.MIN))
+        turn = 0.0 if self.integrator.moves else self._farthest_turn(way * self.stage.reach)
+        most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
+        for _ in range(SEARCHES):
+            x, ahead = self._ahead(v + gone * way, (most - gone) * way)
+            seen = fraction = self.discretisation.largest_step(x, ahead)
+            for term in self.active.limiting:
+                fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
+            seen, fraction = self._least_of(seen, fraction)
+            if fraction == 1.0:
+                return most
+            gone += fraction * (most - gone)
+            if fraction < seen:
+                break
+        return gone
+
+    def _farthest_turn(self, way: Array) -> float:
+        """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
+        turn = max((term.largest_turn(way) for term in self.active.edged), default=0.0)
+        return float(self.points.comm.allreduce(turn, MPI.MAX))
+
+    def _least_of(self, *numbers: float) -> list[float]:
+        """The least of each number on all ranks; collective."""
+        least = np.array(numbers)
+        self.points.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
+        found: list[float] = least.tolist()
+        return found
 
     def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
@@ -443,17 +474,33 @@ class StageEquations:
         return x, ahead
 
     def may_move(self) -> bool:
-        """Whether what is prescribed in the step can go where it shall, while all else stays; collective."""
+        """Whether the sheet can go where the step's solve may start, while obstacles go theirs; collective.
+
+        What is prescribed goes where it shall; all else stays, or goes on as it did.
+        """
         here = self.velocity_of_staying()
-        there = here.copy()
-        self.prescribe(there)
-        x, ahead = self._ahead(here, there - here)
-        reach = self.discretisation.largest_step(x, ahead)
-        free = all(term.lets_pass(x, ahead, self.active.frozen[term]) for term in self.active.limiting)
-        free &= reach == 1.0
-        if not self.points.comm.allreduce(int(not free), MPI.MAX):
-            return True
-        self.refused_way = RefusedWay(x.copy(), ahead, carried=True)
+        for v in [here] if self.integrator.lagged_loads else [here, self.v[: len(here)]]:
+            self.prescribe(there := v.copy())
+            if self._may_go(here, there - here):
+                self.refused_way, self._may_begin = None, there
+                return True
+        return False
+
+    def _may_go(self, v: Array, way: Array) -> bool:
+        """Whether the sheet can go from velocities v by ``way`` (n_owned, 3) while obstacles go theirs."""
+        gone = 0.0
+        for _ in range(SEARCHES):
+            x, ahead = self._ahead(v + gone * way, (1.0 - gone) * way)
+            (seen,) = self._least_of(self.discretisation.largest_step(x, ahead))
+            ahead *= seen
+            part = Part(gone, 1.0 if seen == 1.0 else gone + seen * (1.0 - gone))
+            free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
+            if not self._least_of(float(all(free)))[0]:
+                break
+            if seen == 1.0:
+                return True
+            gone = part.end
+        self.refused_way = RefusedWay(x.copy(), ahead, part)
         return False
 
     def may_end(self, v: Array) -> bool:
@@ -466,13 +513,11 @@ class StageEquations:
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
         if self.integrator.lagged_loads:  # one linear solve has found it
             v = self.velocity_of_staying()
-        from_x = self.evaluate_at(v)[0].copy()
-        way = end - from_x[:n]
-        if self.largest_step(v, way / self.stage.reach) == 1.0:
+        way = (end - self.evaluate_at(v)[0][:n]) / self.stage.reach
+        if self.largest_step(v, way) == 1.0:
             return True
-        ahead = fitted(way, n, self.points.n_local)
-        self.points.update_ghosts(ahead)
-        self.refused_way = RefusedWay(from_x, ahead, carried=False)
+        x, ahead = self._ahead(v, way)
+        self.refused_way = RefusedWay(x.copy(), ahead, Part(1.0, 1.0))
         return False
 
     # -- what Newton asks for ----------------------------------------------------------------------

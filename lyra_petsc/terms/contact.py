@@ -28,7 +28,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, Pair, UpcomingStep
+from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -318,10 +318,9 @@ class ContactBarrier(Elastic):
         still = np.zeros_like(frozen.now)
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
-    def lets_pass(self, x: Array, way: Array, frozen: Places) -> bool:
+    def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
         pairs = self.kind, self.points, self.offset
-        moved = frozen.now - frozen.before
-        return bool(contact_pairs.free_way(x, frozen.before, way, moved, *pairs, KEPT, 1.0) == 1.0)
+        return bool(contact_pairs.free_way(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
 
     def distances(self, x: Array, others: Array) -> Array:
         """Distance less thickness and radius [m] of all pairs, (E,)."""
@@ -333,11 +332,9 @@ class ContactBarrier(Elastic):
     def gaps(self, x: Array, frozen: Places) -> Array:
         return self.distances(x, frozen.now)[: self.n_owned]
 
-    def free_parts(self, x: Array, way: Array, frozen: Places, *, carried: bool) -> Array:
-        others = frozen.before if carried else frozen.now
-        theirs = frozen.now - frozen.before if carried else np.zeros_like(frozen.now)
+    def free_parts(self, x: Array, way: Array, frozen: Places, part: Part) -> Array:
         pairs, out = (self.kind, self.points, self.offset), np.empty(self.n_owned)
-        contact_pairs.free_ways(x, others, way, theirs, *pairs, KEPT, out)
+        contact_pairs.free_ways(x, *_during(frozen, part, way), *pairs, KEPT, out)
         return out
 
     def pair(self, element: int) -> Pair:
@@ -368,6 +365,12 @@ class ContactBarrier(Elastic):
         left = self.gaps(x, frozen)
         count = float((left < self.barrier.gap).sum())
         return {"contacts": count, "smallest_gap": float(left.min(initial=np.inf))}
+
+
+def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array]:
+    """Where obstacles' points stand at the start of a part of the step, the sheets' way, and theirs in it."""
+    (begin, end), moved = part, frozen.now - frozen.before
+    return frozen.before + begin * moved, way, (end - begin) * moved
 
 
 def elements(rest: RestShape) -> Elements:

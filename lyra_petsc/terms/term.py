@@ -81,6 +81,13 @@ class UpcomingStep:
     reference: Callable[[float, Ints], Array]
 
 
+class Part(NamedTuple):
+    """A part of the time up to a step's stage, as fractions of it; both 1: obstacles stand there."""
+
+    begin: float
+    end: float
+
+
 class Pair(NamedTuple):
     """Two parts that an element keeps apart.
 
@@ -260,8 +267,10 @@ class Elastic(Term):
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
 
-    def lets_pass(self, x: Array, way: Array, frozen: Any) -> bool:
-        """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in the step."""
+    def lets_pass(self, x: Array, way: Array, frozen: Any, part: Part) -> bool:
+        """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in a part of the
+        step.
+        """
         return True
 
     def gaps(self, x: Array, frozen: Any) -> Array:
@@ -271,10 +280,9 @@ class Elastic(Term):
         """
         return np.empty(0)
 
-    def free_parts(self, x: Array, way: Array, frozen: Any, *, carried: bool) -> Array:
-        """Fraction, up to 1, of the way (n_local, 3) [m] from x that each owned element lets go, (n_owned,).
-
-        ``carried``: obstacles go theirs in the step meanwhile, as for `lets_pass`. Empty as for `gaps`.
+    def free_parts(self, x: Array, way: Array, frozen: Any, part: Part) -> Array:
+        """Fraction, up to 1, of the way (n_local, 3) [m] from x that each owned element lets go, (n_owned,),
+        while obstacles go theirs in a part of the step. Empty as for `gaps`.
         """
         return np.empty(0)
 

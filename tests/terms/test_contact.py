@@ -346,3 +346,19 @@ def test_pulled_through_another_sheet(comm: MPI.Comm, speed: float) -> None:
             run.look()
         else:
             assert run.x[25:, 2].min() == pytest.approx(-0.15, abs=1e-6)
+
+
+@pytest.mark.parametrize("handled", [True, False])
+def test_what_moves_far_in_a_step_is_not_held_up(comm: MPI.Comm, handled: bool) -> None:
+    """A handle, ten times the gap in a step; a plate that comes with the sheet that flies before it."""
+    up = {"rise": [{"time": 0.0}, {"time": 0.1, "translate": [0.0, 0.0, 2.0]}]}
+    moving = {"motions": up, "time": {"end": 0.1, "step": 0.01}}
+    plate = {"box": {"min": [-1.0, -1.0, -0.2], "max": [2.0, 2.0, -0.01]}, "motion": "rise"}
+    more = {"handles": [{"group": "left", "motion": "rise"}]} if handled else {"obstacles": {"it": plate}}
+    with Watched(comm, {"mesh": LOWER} | moving | more) as run:
+        if not handled:
+            run.throw(lambda x: np.broadcast_to([0.0, 0.0, 22.0], x.shape))
+        for _ in range(4):
+            assert run.simulation.step().rejected == 0
+            run.look()
+        assert run.x[:, 2].max() > 0.2
