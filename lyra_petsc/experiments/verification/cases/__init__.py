@@ -52,5 +52,6 @@ CASES: Registry[VerificationCase] = Registry(
         "incline": "contacts",
         "rest": "contacts",
         "capstan": "contacts",
+        "collision": "contacts",
     },
 )

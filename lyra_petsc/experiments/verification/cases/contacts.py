@@ -1,17 +1,20 @@
-"""Sheets in contact: at rest, and with friction on a slope and over a cylinder."""
+"""Sheets in contact: at rest, and with friction on a slope and over a cylinder; thrown sheets."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import (
     STATIC,
+    Converges,
     Exact,
     Measured,
     at_finest,
@@ -22,6 +25,10 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
 )
 from lyra_petsc.output.fields import FIELDS
+from lyra_petsc.stepping.energy_guard import LARGEST_SUM
+from lyra_petsc.terms.contact import ContactBarrier
+
+Array = NDArray[np.float64]
 
 G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
@@ -221,3 +228,103 @@ def capstan(bench: Bench, n: float) -> Iterator[Measured]:
         slack, tight = (float(np.linalg.norm(pull[end].sum(axis=0))) for end in ends)
         words = f"T2/T1, φ = {turns:g} π, μ = {friction:g}"
         yield Measured(words, tight / slack, math.exp(math.pi * turns * friction))
+
+
+# -- sheets thrown at each other -------------------------------------------------------------------------
+
+SPEED, FLIGHT, THROWN = 2.0, 0.1, 8
+"""[m/s], [s], cells a side"""
+
+THROWS = (("beuler", 0.0), ("bdf2", 0.0), ("midpoint", 0.0), ("beuler", 0.3))
+"""Integrators and friction"""
+
+
+@dataclass
+class Balance:
+    """Largest resultant and moment of a step's contact forces over the sums of their sizes; largest change
+    of momentum and angular momentum, and rise of the energy, over what they are at the start.
+    """
+
+    force: float = 0.0
+    moment: float = 0.0
+    momentum: float = 0.0
+    angular: float = 0.0
+    energy: float = 0.0
+
+    def take(self, **found: float) -> None:
+        """Let each be no less than what is given."""
+        for name, value in found.items():
+            setattr(self, name, max(getattr(self, name), value))
+
+
+def _thrown(bench: Bench, integrator: str, friction: float, n: float) -> Balance:
+    """A sheet and a smaller one, tilted above it, that fly towards each other; collective."""
+    side, small = 0.3, 0.24
+    turn = {"axis": [0.3, 1.0, 0.2], "degrees": 50.0}
+    upper = {"transform": {"rotate": turn, "translate": [0.05, 0.05, 0.25]}}
+    content = {
+        "mesh": [
+            grid(side, side, THROWN, THROWN, "alternating"),
+            grid(small, small, THROWN, THROWN) | upper,
+        ],
+        "material": {"cloth": "gray-interlock"},
+        "contact": {"gap": 0.005, "friction": friction},
+        "time": {"end": FLIGHT, "step": 1.0 / n, "integrator": integrator},
+    }
+    found = Balance()
+    with bench.simulation(content) as trial:
+        system, contact = trial.simulation.problem.system, trial.simulation.problem.terms["contact"]
+        assert isinstance(contact, ContactBarrier)
+        below = (np.arange(len(trial.start)) < (THROWN + 1) ** 2)[:, None]
+        trial.set_state(v=np.where(below, [0.2 * SPEED, 0.0, SPEED], [0.0, 0.0, -SPEED]))
+        mass = trial.mass[:, None]
+
+        def momenta() -> Array:
+            momentum = mass * trial.v
+            return np.stack([momentum, np.cross(trial.x, momentum)])
+
+        first, energy = momenta(), trial.simulation.budget.total
+        before, sizes = first.sum(axis=1), np.abs(first).sum(axis=(1, 2))
+        while not trial.simulation.finished:
+            trial.step()
+            x = system.stage_positions
+            pull = np.zeros((system.points.n_local, 3))
+            contact.add_gradient(x, system.active.frozen[contact], pull)
+            forces, places = trial.gather(pull), trial.gather(x)
+            each = np.stack([forces, np.cross(places, forces)])
+            off = np.abs(each.sum(axis=1)).max(axis=1) / np.maximum(np.abs(each).sum(axis=(1, 2)), 1e-300)
+            changed = np.abs(momenta().sum(axis=1) - before).max(axis=1) / sizes
+            found.take(
+                force=float(off[0]),
+                moment=float(off[1]),
+                momentum=float(changed[0]),
+                angular=float(changed[1]),
+                energy=trial.simulation.budget.total / energy - 1.0,
+            )
+    return found
+
+
+@case(
+    "Two sheets thrown at each other: resultant and moment of each step's contact forces; momentum, angular "
+    "momentum, and by how much the energy rises above that at the start",
+    source="balance of momentum; angular momentum of a pair of forces of friction is of the gap's size",
+    resolutions=(250, 500, 1000, 2000),
+    claim=Exact(1e-12),
+    claims={
+        "angular momentum, beuler": Converges(1.0, 1e-2, slack=0.5),
+        "angular momentum, bdf2": Converges(2.0, 1e-3, slack=1.0),
+        "energy, midpoint": Exact(LARGEST_SUM),
+    },
+    counts="steps per second",
+    quick=1,
+)
+def collision(bench: Bench, n: float) -> Iterator[Measured]:
+    for integrator, friction in THROWS:
+        found = _thrown(bench, integrator, friction, n)
+        words = f"{integrator}, with friction" if friction else integrator
+        if not friction:
+            yield Measured(f"resultant, {words}", found.force, 0.0, scale=1.0)
+            yield Measured(f"moment, {words}", found.moment, 0.0, scale=1.0)
+            yield Measured(f"angular momentum, {words}", found.angular, 0.0, scale=1.0)
+        yield Measured(f"momentum, {words}", found.momentum, 0.0, scale=1.0)
+        yield Measured(f"energy, {words}", found.energy, 0.0, scale=1.0)
