@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
-from lyra_petsc.terms.hinge_energy import hinge_hessian
+from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge, mean_directors
-from lyra_petsc.terms.midedge_energy import triangle_hessian
-from lyra_petsc.terms.midedge_shape import Frames, carried, unit
+from lyra_petsc.terms.midedge_shape import Frames, carried, fading_tangent, tangent_of, unit
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
 
@@ -153,14 +152,51 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
 
 def midedge_blocks(term: MidEdge, x: Array, frames: Frames, blend: float, out: Array) -> None:
     """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
-    data, shape, slopes = term.elements.data, term._shape(x, frames), np.empty((3, 9))
-    numbers = term.stencil, term.of_edges.of_triangles, data["sign"], shape
-    for e in range(term.n_elements):
-        upper, gradients = np.zeros((12, 12)), np.zeros((3, 12))
-        constants = *term._constants, data["length"], gradients, slopes
-        triangle_hessian(x, e, blend, *numbers, *constants, upper)
-        upper[:9, :9] = np.triu(upper[:9, :9])
-        out[e] = np.triu(upper) + np.triu(upper, 1).T
+    data, shape = term.elements.data, term._shape(x, frames)
+    stiffness, rest, limit = term._constants
+    for e, points in enumerate(term.stencil):
+        corners, k = x[points], np.empty((3, 3))
+        k[np.triu_indices(3)] = k.T[np.triu_indices(3)] = stiffness[e]
+        sides = corners[[2, 0, 1]] - corners[[1, 2, 0]]
+        area = np.cross(sides[1], sides[2])  # 2A n
+        double = np.linalg.norm(area)
+        n, along = area / double, np.linalg.norm(sides, axis=1)
+        director, spin, about = shape[term.of_edges.of_triangles[e]].reshape(3, 3, 3).transpose(1, 0, 2)
+        angles = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
+        t, t1, t2, s, s1, s2 = np.array(angles).T
+        omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double
+        ends = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]])
+        own, between = np.diag(np.diag(k)), k - np.diag(np.diag(k))
+        further = s - [fading_tangent(tangent) for tangent in rest[e]]
+        pull = own @ (t - rest[e]) * t1 + between @ further * s1
+        gradients, curved = np.zeros((3, 12)), np.zeros((12, 12))
+        for i in range(3):
+            for c in range(3):
+                at = slice(3 * c, 3 * c + 3)
+                gradients[i, at] = omega[i, c] * n + ends[i, c] * spin[i]
+                for d in range(3):
+                    tau = -np.cross(sides[i], n) / (2.0 * along[i] ** 3)
+                    block = -omega[i, d] * np.outer(n, inward[c]) - omega[i, c] * np.outer(inward[d], n)
+                    both = np.outer(n, tau) - 0.5 * data["sign"][e, i] * np.outer(spin[i], about[i])
+                    block += ends[i, c] * ends[i, d] * (both + both.T)
+                    curved[at, 3 * d : 3 * d + 3] += pull[i] * block
+            gradients[i, 9 + i] = data["sign"][e, i] / data["length"][e, i]
+        bend = own @ (t - rest[e]) * t2 + between @ further * s2
+        curved += gradients.T * bend @ gradients
+        stiff = t1[:, None] * own * t1 + s1[:, None] * between * s1
+        found = gradients.T @ stiff @ gradients + (1.0 - blend) * curved
+        if double**2 < limit[e]:
+            weight, first, second = fade(double**2, limit[e])
+            energy = 0.5 * ((t - rest[e]) @ own @ (t - rest[e]) + further @ between @ further)
+            force = pull @ gradients
+            bent, slopes = np.zeros((4, 4, 3, 3)), np.zeros(12)
+            slopes[:9] = 2.0 * np.cross(area, sides).ravel()
+            add_square_hessian(tuple(map(tuple, corners)), tuple(area), (0, 1, 2), first * energy, bent)
+            more = first * (np.outer(force, slopes) + np.outer(slopes, force))
+            more += energy * second * np.outer(slopes, slopes)
+            more[:9, :9] += bent[:3, :3].transpose(0, 2, 1, 3).reshape(9, 9)
+            found = weight * found + (1.0 - blend) * more
+        out[e] = found
 
 
 def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:

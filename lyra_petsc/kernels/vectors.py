@@ -202,6 +202,21 @@ def _add_balanced(code: Code, offsets: list[Any], three: list[Any]) -> None:
     code.add_six(offsets, [b00, b01, b02, (b11, one), stored, (b22, last)])
 
 
+def _add_corners(typing: Any, blocks: Any, offsets: Any, e: Any, three: Any) -> Any:
+    """Add the blocks of the corners of an element e of three vertices and three edges, offsets (E, 21).
+
+    Their rows and columns sum to zero; given are those of (1, 1), (1, 2), (2, 2), nine numbers each.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        code = Code(context, builder, signature, arguments, "blocks offsets e three")
+        made = [(code.filled(nine[:8], code.eight), nine[8]) for nine in code.tuples("three")]
+        _add_balanced(code, code.six_offsets((0, 1, 2, 6, 7, 11), 21), made)
+        return context.get_dummy_value()
+
+    return types.void(blocks, offsets, e, three), generate
+
+
 def _put(transposed: bool, typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
     """out[at] = blocks[k], or this transposed."""
     _check(blocks, out)
@@ -244,6 +259,7 @@ def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
 # their callers leave out ``typing``
 gather: Any = intrinsic(_gather)
 gather_edges: Any = intrinsic(_gather_edges)
+add_corners: Any = intrinsic(_add_corners)
 add_outer: Any = intrinsic(_add_outer)
 add_six: Any = intrinsic(_add_six)
 add_triangle: Any = intrinsic(_add_triangle)

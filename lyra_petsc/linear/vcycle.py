@@ -170,14 +170,14 @@ class Smoother:
             self.b[lagged] = right
 
     def _add_interpolated(self, coarse: Floats) -> None:
-        if self._turns is None:
-            sweeps.add_interpolated(*self._all_parents, self._free, coarse, self.x)
-            return
-        more = np.zeros_like(self.x)
+        more = self.x if self._turns is None else np.zeros_like(self.x)
         sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
-        self._turns.follow(more)
-        self.x += more
-        self.points.update_ghosts(self.x)  # edges of others have followed there
+        if self._turns is not None:
+            self._turns.follow(more)
+            self.x += more
+        if not isinstance(self._sweeps, sweeps.BlockSweeps):
+            self._sweeps.correct(self.x)
+            self.points.update_ghosts(self.x)  # of edges' unknowns only owners know these
 
 
 class Coarsest:

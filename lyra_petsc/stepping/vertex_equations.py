@@ -49,12 +49,23 @@ class VertexEquations:
         self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.pattern = self._rows.pattern
         self.turns = EdgeTurns(self._bent, layout.n_owned)
+        self._hold(np.zeros((layout.n_local, 3), dtype=bool))
+
+    def _hold(self, held: Mask) -> None:
+        """Keep what depends on the prescribed unknowns (n_local, 3): mostly they stay the same."""
+        term = self._bent
+        assert term.edges is not None
+        self._held, self._beside = held.copy(), self._rows.beside(held)[0]
+        self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
+        self.turns.hold(held)
 
     def values(self, held: Mask) -> Array:
         """Block rows (n_blocks, 3, 3) at the stage last evaluated; held (n_local, 3) are decoupled."""
         equations, rows = self._equations, self._rows
         (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.acts
-        self.turns.set(x, held)
+        if not np.array_equal(held, self._held):
+            self._hold(held)
+        self.turns.set(x)
         values = np.empty((self.pattern.n_blocks, 3, 3))
         rows.set_diagonal(stage.sigma * equations.mass, values)
         for term in self._elastic:
@@ -65,18 +76,17 @@ class VertexEquations:
         for wind in self._viscous:
             wind.add_hessian(vs, equations.active.frozen[wind], self.pattern.offsets, values)
         if held.any():
-            self._add_clamps(x, held, values)
-            rows.constrain(values, held, rows.beside(held)[0])
+            self._add_clamps(x, values)
+            rows.constrain(values, held, self._beside)
         return values
 
-    def _add_clamps(self, x: Array, held: Mask, values: Array) -> None:
+    def _add_clamps(self, x: Array, values: Array) -> None:
         """Where a director is held its triangles resist as hinges do: to their third corner, at its height.
 
         No hinge does at the border, and a clamped sheet would swing freely about its clamp.
         """
         term, data = self._bent, self._bent.elements.data
-        assert term.edges is not None
-        triangle, corner = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
+        triangle, corner = self._clamped
         opposite, tail, head = (x[term.stencil[triangle, (corner + k) % 3]] for k in range(3))
         edge = head - tail
         normal = np.cross(edge, opposite - tail)

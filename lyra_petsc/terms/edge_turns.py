@@ -111,13 +111,17 @@ class EdgeTurns:
         # all triangles of an edge that this rank owns are here
         share = 1.0 / np.bincount(edges.ravel())[edges]
         share[term.edges >= 3 * n_owned] = 0.0
-        self._share = -share * term.elements.data["length"] * term.elements.data["sign"]
+        self._all = -share * term.elements.data["length"] * term.elements.data["sign"]
+        self._share = self._all
         self._turns = np.zeros((len(edges), 12), dtype=np.float32)
 
-    def set(self, x: Array, held: Mask) -> None:
-        """Take positions x (n_local, 3); unknowns that are held (n_local, 3) do not follow."""
-        share = np.where(held.ravel()[self._places], 0.0, self._share)
-        _set(x, self._stencil, share, self._turns)
+    def hold(self, held: Mask) -> None:
+        """Let unknowns that are held (n_local, 3) not follow."""
+        self._share = np.where(held.ravel()[self._places], 0.0, self._all)
+
+    def set(self, x: Array) -> None:
+        """Take positions x (n_local, 3)."""
+        _set(x, self._stencil, self._share, self._turns)
 
     def follow(self, x: Floats) -> None:
         """Add to x (n_local, 3), all 0 in the edges' unknowns, what its vertices make of those owned."""

@@ -34,6 +34,7 @@ from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.midedge_shape import (
     Frames,
+    against,
     carried,
     directions,
     directors,
@@ -130,10 +131,14 @@ class MidEdge(Elastic):
         return np.bincount(self.of_edges.of_triangles.ravel(), diagonal.ravel()).astype(np.float64)
 
     def nearer(self, x: Array, frozen: Frames, held: Mask) -> Frames | None:
-        tangent = self._tangents(x)
-        far = (np.sum(tangent * frozen.tangent, axis=1) < 0.0) & ~held.ravel()[self.of_edges.places]
+        places, ends, *_ = self.of_edges
+        far = np.empty(len(ends), dtype=bool)
+        if not against(x, ends, frozen.tangent, far):
+            return None
+        far &= ~held.ravel()[places]
         if not far.any():
             return None
+        tangent = self._tangents(x)
         found = Frames(frozen.tangent.copy(), frozen.across.copy())
         found.across[far] = carried(Frames(frozen.tangent[far], frozen.across[far]), tangent[far])
         found.tangent[far] = tangent[far]

@@ -29,7 +29,7 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.scatter import fetch_ahead
+from lyra_petsc.kernels.vectors import add_corners
 from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
 from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
@@ -129,198 +129,246 @@ def add_gradient(  # type: ignore[no-untyped-def]
         flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
 
 
-@kernel()
-def triangle_hessian(x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h):  # type: ignore[no-untyped-def]
-    """The Hessian of triangle e into h (12, 12), of edges what is above the diagonal; whether it is not 0.
+@kernel(inline="always")
+def _along(f, u, v):  # type: ignore[no-untyped-def]
+    """f u + v."""
+    return f * u[0] + v[0], f * u[1] + v[1], f * u[2] + v[2]
 
-    g (3, 12) becomes the ∇α_i; beyond the vertices' part it must be 0 off the diagonal. w (3, 9) is scratch.
-    """
-    x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-    e0, e1, e2, normal, square = edges_of(x0, x1, x2)
-    if square <= GONE * limit[e]:
-        return False
-    inverse = 1.0 / math.sqrt(square)  # 1 / 2A
-    n = scaled(inverse, normal)
-    t0, a0, c0, s0, b0, d0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-    t1, a1, c1, s1, b1, d1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-    t2, a2, c2, s2, b2, d2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-    own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
-    p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
-    exact = 1.0 - blend
-    # ∇α_i
-    s00, s11, s22, s01, s02, s12 = (
-        dot(e0, e0),
-        dot(e1, e1),
-        dot(e2, e2),
-        dot(e0, e1),
-        dot(e0, e2),
-        dot(e1, e2),
+
+@kernel(inline="always")
+def _weighted(a, u, b, v, c, w):  # type: ignore[no-untyped-def]
+    return (
+        a * u[0] + b * v[0] + c * w[0],
+        a * u[1] + b * v[1] + c * w[1],
+        a * u[2] + b * v[2] + c * w[2],
     )
-    r0, r1, r2 = -inverse / math.sqrt(s00), -inverse / math.sqrt(s11), -inverse / math.sqrt(s22)
-    spin0, spin1, spin2 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
-    for k in range(3):
-        g[0, k], g[0, 3 + k], g[0, 6 + k] = (
-            r0 * s00 * n[k],
-            r0 * s01 * n[k] - spin0[k],
-            r0 * s02 * n[k] + spin0[k],
-        )
-        g[1, k], g[1, 3 + k], g[1, 6 + k] = (
-            r1 * s01 * n[k] + spin1[k],
-            r1 * s11 * n[k],
-            r1 * s12 * n[k] - spin1[k],
-        )
-        g[2, k], g[2, 3 + k], g[2, 6 + k] = (
-            r2 * s02 * n[k] - spin2[k],
-            r2 * s12 * n[k] + spin2[k],
-            r2 * s22 * n[k],
-        )
-    for i in range(3):
-        g[i, 9 + i] = sign[e, i] / length[e, i]
-    # ∇f K ∇fᵀ, and what T and S add as they bend
-    k00 = a0 * a0 * stiffness[e, 0] + exact * (own[0] * c0 + others[0] * d0)
-    k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)
-    k22 = a2 * a2 * stiffness[e, 5] + exact * (own[2] * c2 + others[2] * d2)
-    k01, k02, k12 = b0 * b1 * stiffness[e, 1], b0 * b2 * stiffness[e, 2], b1 * b2 * stiffness[e, 4]
-    for b in range(9):
-        g0, g1, g2 = g[0, b], g[1, b], g[2, b]
-        w[0, b] = k00 * g0 + k01 * g1 + k02 * g2
-        w[1, b] = k01 * g0 + k11 * g1 + k12 * g2
-        w[2, b] = k02 * g0 + k12 * g1 + k22 * g2
-    q0, q1, q2 = g[0, 9], g[1, 10], g[2, 11]
-    for a in range(9):
-        g0, g1, g2 = g[0, a], g[1, a], g[2, a]
-        for b in range(9):
-            h[a, b] = g0 * w[0, b] + g1 * w[1, b] + g2 * w[2, b]
-        h[a, 9], h[a, 10], h[a, 11] = q0 * w[0, a], q1 * w[1, a], q2 * w[2, a]
-    h[9, 9], h[9, 10], h[9, 11] = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02
-    h[10, 10], h[10, 11], h[11, 11] = q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
-    if exact > 0.0:
-        # Σ_i p_i ∂²α_i
-        m0, m1, m2 = exact * p0, exact * p1, exact * p2
-        q0, q1, q2 = m0 * r0, m1 * r1, m2 * r2
-        area = math.sqrt(square)
-        _turn(spin0, row(shape, edges[e, 0], 6), e0, n, 0.5 * area * q0 / s00, m0, sign[e, 0], 0, w)
-        _turn(spin1, row(shape, edges[e, 1], 6), e1, n, 0.5 * area * q1 / s11, m1, sign[e, 1], 1, w)
-        _turn(spin2, row(shape, edges[e, 2], 6), e2, n, 0.5 * area * q2 / s22, m2, sign[e, 2], 2, w)
-        u0, u1, u2 = (
-            scaled(inverse, cross(n, e0)),
-            scaled(inverse, cross(n, e1)),
-            scaled(inverse, cross(n, e2)),
-        )
-        v0, v1, v2 = (
-            q0 * s00 + q1 * s01 + q2 * s02,
-            q0 * s01 + q1 * s11 + q2 * s12,
-            q0 * s02 + q1 * s12 + q2 * s22,
-        )
-        _add_own(h, 0, n, v0, u0, 1, 2, w)
-        _add_own(h, 3, n, v1, u1, 2, 0, w)
-        _add_own(h, 6, n, v2, u2, 0, 1, w)
-        _add_pair(h, 0, 3, n, v0, v1, u0, u1, 2, w)
-        _add_pair(h, 0, 6, n, v0, v2, u0, u2, 1, w)
-        _add_pair(h, 3, 6, n, v1, v2, u1, u2, 0, w)
-    if square < limit[e]:
-        energy = 0.5 * _twice(own, others)
-        _fade_hessian((x0, x1, x2), normal, square, limit[e], energy, exact, (p0, p1, p2), g, h)
-    return True
 
 
 @kernel(inline="always")
-def _turn(spin, about, e, n, scale, pull, sign, i, w):  # type: ignore[no-untyped-def]
-    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge into row i of w (3, 9)."""
-    across, spin = scaled(scale, cross(e, n)), scaled(-0.5 * pull * sign, spin)
-    for k in range(3):
-        for m in range(3):
-            w[i, 3 * k + m] = n[k] * across[m] + across[k] * n[m] + spin[k] * about[m] + about[k] * spin[m]
+def _products(g, w):  # type: ignore[no-untyped-def]
+    """Σ_i g_i w_iᵀ of three vectors each, row by row."""
+    (a, b, c), (d, e, f) = g, w
+    return (
+        a[0] * d[0] + b[0] * e[0] + c[0] * f[0],
+        a[0] * d[1] + b[0] * e[1] + c[0] * f[1],
+        a[0] * d[2] + b[0] * e[2] + c[0] * f[2],
+        a[1] * d[0] + b[1] * e[0] + c[1] * f[0],
+        a[1] * d[1] + b[1] * e[1] + c[1] * f[1],
+        a[1] * d[2] + b[1] * e[2] + c[1] * f[2],
+        a[2] * d[0] + b[2] * e[0] + c[2] * f[0],
+        a[2] * d[1] + b[2] * e[1] + c[2] * f[1],
+        a[2] * d[2] + b[2] * e[2] + c[2] * f[2],
+    )
 
 
 @kernel(inline="always")
-def _add_own(h, first, n, slope, b, one, two, w):  # type: ignore[no-untyped-def]
-    """Add −slope (n bᵀ + b nᵀ) and two rows of w to the block of a corner."""
-    for k in range(3):
-        for m in range(3):
-            more = w[one, 3 * k + m] + w[two, 3 * k + m]
-            h[first + k, first + m] += more - slope * (n[k] * b[m] + b[k] * n[m])
+def _symmetric(a, b, c, d):  # type: ignore[no-untyped-def]
+    """a bᵀ + b aᵀ + c dᵀ + d cᵀ, row by row."""
+    xx, yy, zz = (
+        2.0 * (a[0] * b[0] + c[0] * d[0]),
+        2.0 * (a[1] * b[1] + c[1] * d[1]),
+        2.0 * (a[2] * b[2] + c[2] * d[2]),
+    )
+    xy = a[0] * b[1] + a[1] * b[0] + c[0] * d[1] + c[1] * d[0]
+    xz = a[0] * b[2] + a[2] * b[0] + c[0] * d[2] + c[2] * d[0]
+    yz = a[1] * b[2] + a[2] * b[1] + c[1] * d[2] + c[2] * d[1]
+    return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
 @kernel(inline="always")
-def _add_pair(h, first, second, n, slope_c, slope_d, b_c, b_d, opposite, w):  # type: ignore[no-untyped-def]
-    """Add −slope_d n b_cᵀ − slope_c b_d nᵀ without a row of w to the blocks of two corners."""
-    for k in range(3):
-        for m in range(3):
-            more = -w[opposite, 3 * k + m] - slope_d * n[k] * b_c[m] - slope_c * b_d[k] * n[m]
-            h[first + k, second + m] += more
-            h[second + m, first + k] += more
+def _sum(u, v):  # type: ignore[no-untyped-def]
+    return (
+        u[0] + v[0], u[1] + v[1], u[2] + v[2],
+        u[3] + v[3], u[4] + v[4], u[5] + v[5],
+        u[6] + v[6], u[7] + v[7], u[8] + v[8],
+    )  # fmt: skip
+
+
+@kernel(inline="always")
+def _times(f, u):  # type: ignore[no-untyped-def]
+    return f * u[0], f * u[1], f * u[2], f * u[3], f * u[4], f * u[5], f * u[6], f * u[7], f * u[8]
+
+
+@kernel(inline="always")
+def _bend(spin, about, e, n, scale, pull, sign):  # type: ignore[no-untyped-def]
+    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge."""
+    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * pull * sign, spin), about)
 
 
 @kernel()
-def _fade_hessian(corners, normal, square, limit, energy, exact, pulls, g, h):  # type: ignore[no-untyped-def]
-    """Turn the Hessian of f in h (12, 12) into that of f w; of the rest, the regularised one has nothing."""
+def _faded(x0, x1, x2, normal, square, limit, energy, exact, pulls, g1, g2, q, hessian):  # type: ignore[no-untyped-def]
+    """The Hessian of f w, of that of f; of the rest, the regularised one has nothing.
+
+    As ``add_hessian`` has it: blocks of corners, couplings of the corners 1 and 2 and of edges with edges.
+    """
+    three, one, two, edges = hessian
     weight, first, second = fade(square, limit)
-    h *= weight
-    slopes, force, bent = np.zeros(12), np.zeros(12), np.zeros((4, 4, 3, 3))
-    for c in range(3):
-        b, d = corners[(c + 1) % 3], corners[(c + 2) % 3]
-        turned = cross(normal, (d[0] - b[0], d[1] - b[1], d[2] - b[2]))
-        for i in range(3):
-            slopes[3 * c + i] = 2.0 * turned[i]
-    for i in range(3):
-        for a in range(12):
-            force[a] += pulls[i] * g[i, a]
-    add_square_hessian(corners, normal, (0, 1, 2), first, bent)
-    for a in range(12):
-        for b in range(12):
-            h[a, b] += exact * first * (force[a] * slopes[b] + slopes[a] * force[b])
-            h[a, b] += exact * energy * second * slopes[a] * slopes[b]
-            if max(a, b) < 9:
-                h[a, b] += exact * energy * bent[a // 3, b // 3, a % 3, b % 3]
+    first, second = exact * first, exact * second
+    bent = np.zeros((4, 4, 3, 3))
+    add_square_hessian((x0, x1, x2), normal, (0, 1, 2), first * energy, bent)
+    s1 = scaled(2.0, cross(normal, (x0[0] - x2[0], x0[1] - x2[1], x0[2] - x2[2])))
+    s2 = scaled(2.0, cross(normal, (x1[0] - x0[0], x1[1] - x0[1], x1[2] - x0[2])))
+    f1 = _weighted(pulls[0], g1[0], pulls[1], g1[1], pulls[2], g1[2])
+    f2 = _weighted(pulls[0], g2[0], pulls[1], g2[1], pulls[2], g2[2])
+    # w' (∇f ∇sᵀ + ∇s ∇fᵀ) + f w'' ∇s ∇sᵀ, s = |n|²
+    t1, t2 = scaled(energy * second, s1), scaled(energy * second, s2)
+    p1, p2 = _along(first, f1, t1), _along(first, f2, t2)
+    r1, r2 = scaled(first, s1), scaled(first, s2)
+    more11 = _products((p1, r1, r1), (s1, f1, (0.0, 0.0, 0.0)))
+    more12 = _products((p1, r1, r1), (s2, f2, (0.0, 0.0, 0.0)))
+    more22 = _products((p2, r2, r2), (s2, f2, (0.0, 0.0, 0.0)))
+    three = (
+        _sum(_sum(_times(weight, three[0]), more11), _nine(bent, 1, 1)),
+        _sum(_sum(_times(weight, three[1]), more12), _nine(bent, 1, 2)),
+        _sum(_sum(_times(weight, three[2]), more22), _nine(bent, 2, 2)),
+    )
+    m0, m1, m2 = q[0] * pulls[0], q[1] * pulls[1], q[2] * pulls[2]
+    one = (
+        _along(m0, r1, scaled(weight, one[0])),
+        _along(m1, r1, scaled(weight, one[1])),
+        _along(m2, r1, scaled(weight, one[2])),
+    )
+    two = (
+        _along(m0, r2, scaled(weight, two[0])),
+        _along(m1, r2, scaled(weight, two[1])),
+        _along(m2, r2, scaled(weight, two[2])),
+    )
+    a, b, c, d, e, f = edges
+    return three, one, two, (weight * a, weight * b, weight * c, weight * d, weight * e, weight * f)
+
+
+@kernel(inline="always")
+def _nine(blocks, a, b):  # type: ignore[no-untyped-def]
+    u = blocks[a, b]
+    return u[0, 0], u[0, 1], u[0, 2], u[1, 0], u[1, 1], u[1, 2], u[2, 0], u[2, 1], u[2, 2]
+
+
+@kernel(inline="always")
+def _add_column(blocks, at, place, column, factor):  # type: ignore[no-untyped-def]
+    """Add factor times the coupling of a vertex with the edge at ``place`` to its block."""
+    if at >= 0:
+        k, second = Index(at >> 1), Index(place) % Index(3)
+        if at & 1:  # values of a block stand column by column
+            first = Index(3) * second
+            blocks[k, first] += factor * column[0]
+            blocks[k, first + Index(1)] += factor * column[1]
+            blocks[k, first + Index(2)] += factor * column[2]
+        else:
+            blocks[k, second] += factor * column[0]
+            blocks[k, second + Index(3)] += factor * column[1]
+            blocks[k, second + Index(6)] += factor * column[2]
+
+
+@kernel(inline="always")
+def _add_columns(blocks, offsets, e, edge, place, one, two, factor):  # type: ignore[no-untyped-def]
+    """Add factor times the couplings of the corners 1 and 2 with an edge, and minus their sum of 0."""
+    both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
+    _add_column(blocks, offsets[e, 3 + edge], place, both, -factor)
+    _add_column(blocks, offsets[e, 8 + edge], place, one, factor)
+    _add_column(blocks, offsets[e, 12 + edge], place, two, factor)
+
+
+@kernel(inline="always")
+def _add_number(blocks, at, place, other, value):  # type: ignore[no-untyped-def]
+    """Add the coupling of the edges at two places to their block."""
+    if at >= 0:
+        k, i, j = Index(at >> 1), Index(place) % Index(3), Index(other) % Index(3)
+        if at & 1:
+            i, j = j, i
+        blocks[k, Index(3) * i + j] += value
+        if place != other and Index(place) // Index(3) == Index(other) // Index(3):
+            blocks[k, Index(3) * j + i] += value
 
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
     x, stencil, blend, edges, sign, shape, stiffness, rest, limit, length, places, weight, offsets, values
 ):
-    """Add weight (E,) times the Hessians to block rows, as ``scatter.add_mixed_elements`` does.
+    """Add weight (E,) times the Hessians to block rows, where offsets (E, 21) say.
 
-    Without its loops over any number of vertices and edges, and its array of Hessians.
+    A translation does nothing, so that of the corners only the second and the third are looked at.
     """
-    g, w, h = np.zeros((3, 12)), np.empty((3, 9)), np.zeros((12, 12))
-    blocks = values.reshape(-1, 9)
+    blocks, exact = values.reshape(-1, 9), 1.0 - blend
     for e in range(stencil.shape[0]):
-        fetch_ahead(e, offsets, values, 21)
-        if not triangle_hessian(
-            x, e, blend, stencil, edges, sign, shape, stiffness, rest, limit, length, g, w, h
-        ):
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+        if square <= GONE * limit[e]:
             continue
-        factor, pair = weight[e], 0
-        for a in range(3):
-            for b in range(a, 3):
-                at = offsets[e, pair]
-                pair += 1
-                if at >= 0:
-                    k, swapped = Index(at >> 1), at & 1
-                    first, second = Index(3 * (a + swapped * (b - a))), Index(3 * (b - swapped * (b - a)))
-                    for i in range(3):
-                        for j in range(3):
-                            blocks[k, 3 * i + j] += factor * h[first + Index(i), second + Index(j)]
-            for b in range(3):
-                at = offsets[e, pair]
-                pair += 1
-                if at >= 0:
-                    k, swapped, place = Index(at >> 1), at & 1, Index(places[e, b]) % Index(3)
-                    first, way = place * Index(1 + 2 * swapped), Index(3 - 2 * swapped)
-                    for i in range(3):
-                        blocks[k, first + way * Index(i)] += factor * h[3 * a + i, 9 + b]
-        for a in range(3):
-            row_a, one = Index(places[e, a]) // Index(3), Index(places[e, a]) % Index(3)
-            for b in range(a, 3):
-                at = offsets[e, pair]
-                pair += 1
-                if at >= 0:
-                    k, swapped, other = Index(at >> 1), at & 1, Index(places[e, b]) % Index(3)
-                    value = factor * h[9 + a, 9 + b]
-                    if swapped:
-                        blocks[k, Index(3) * other + one] += value
-                    else:
-                        blocks[k, Index(3) * one + other] += value
-                        if a != b and row_a == Index(places[e, b]) // Index(3):
-                            blocks[k, Index(3) * other + one] += value
+        inverse = 1.0 / math.sqrt(square)  # 1 / 2A
+        n = scaled(inverse, normal)
+        t0, a0, c0, s0, b0, d0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+        t1, a1, c1, s1, b1, d1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+        t2, a2, c2, s2, b2, d2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
+        p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
+        # ∇α_i
+        s00, s11, s22 = dot(e0, e0), dot(e1, e1), dot(e2, e2)
+        s01, s02, s12 = dot(e0, e1), dot(e0, e2), dot(e1, e2)
+        r0, r1, r2 = -inverse / math.sqrt(s00), -inverse / math.sqrt(s11), -inverse / math.sqrt(s22)
+        spin0, spin1 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3)
+        spin2 = row(shape, edges[e, 2], 3)
+        g1 = (
+            _along(r0 * s01, n, scaled(-1.0, spin0)),
+            scaled(r1 * s11, n),
+            _along(r2 * s12, n, spin2),
+        )
+        g2 = (
+            _along(r0 * s02, n, spin0),
+            _along(r1 * s12, n, scaled(-1.0, spin1)),
+            scaled(r2 * s22, n),
+        )
+        q0, q1, q2 = sign[e, 0] / length[e, 0], sign[e, 1] / length[e, 1], sign[e, 2] / length[e, 2]
+        # ∇f K ∇fᵀ, and what T and S add as they bend
+        k00 = a0 * a0 * stiffness[e, 0] + exact * (own[0] * c0 + others[0] * d0)
+        k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)
+        k22 = a2 * a2 * stiffness[e, 5] + exact * (own[2] * c2 + others[2] * d2)
+        k01, k02, k12 = b0 * b1 * stiffness[e, 1], b0 * b2 * stiffness[e, 2], b1 * b2 * stiffness[e, 4]
+        w1 = (
+            _weighted(k00, g1[0], k01, g1[1], k02, g1[2]),
+            _weighted(k01, g1[0], k11, g1[1], k12, g1[2]),
+            _weighted(k02, g1[0], k12, g1[1], k22, g1[2]),
+        )
+        w2 = (
+            _weighted(k00, g2[0], k01, g2[1], k02, g2[2]),
+            _weighted(k01, g2[0], k11, g2[1], k12, g2[2]),
+            _weighted(k02, g2[0], k12, g2[1], k22, g2[2]),
+        )
+        b11, b12, b22 = _products(g1, w1), _products(g1, w2), _products(g2, w2)
+        if exact > 0.0:
+            # Σ_i p_i ∂²α_i
+            m0, m1, m2 = exact * p0, exact * p1, exact * p2
+            f0, f1, f2 = m0 * r0, m1 * r1, m2 * r2
+            half = 0.5 * math.sqrt(square)
+            bend0 = _bend(spin0, row(shape, edges[e, 0], 6), e0, n, half * f0 / s00, m0, sign[e, 0])
+            bend1 = _bend(spin1, row(shape, edges[e, 1], 6), e1, n, half * f1 / s11, m1, sign[e, 1])
+            bend2 = _bend(spin2, row(shape, edges[e, 2], 6), e2, n, half * f2 / s22, m2, sign[e, 2])
+            u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
+            v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
+            nothing = (0.0, 0.0, 0.0)
+            b11 = _sum(b11, _sum(_sum(bend2, bend0), _symmetric(scaled(-v1, n), u1, nothing, nothing)))
+            b22 = _sum(b22, _sum(_sum(bend0, bend1), _symmetric(scaled(-v2, n), u2, nothing, nothing)))
+            turned = _products((scaled(-v2, n), scaled(-v1, u2), nothing), (u1, n, nothing))
+            b12 = _sum(b12, _sum(turned, _times(-1.0, bend0)))
+        one = scaled(q0, w1[0]), scaled(q1, w1[1]), scaled(q2, w1[2])
+        two = scaled(q0, w2[0]), scaled(q1, w2[1]), scaled(q2, w2[2])
+        numbers = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02, q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
+        hessian = (b11, b12, b22), one, two, numbers
+        if square < limit[e]:
+            energy, pulls = 0.5 * _twice(own, others), (p0, p1, p2)
+            hessian = _faded(
+                x0, x1, x2, normal, square, limit[e], energy, exact, pulls, g1, g2, (q0, q1, q2), hessian
+            )
+        (b11, b12, b22), one, two, numbers = hessian
+        factor = weight[e]
+        add_corners(values, offsets, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
+        p, q, r = places[e, 0], places[e, 1], places[e, 2]
+        _add_columns(blocks, offsets, e, 0, p, one[0], two[0], factor)
+        _add_columns(blocks, offsets, e, 1, q, one[1], two[1], factor)
+        _add_columns(blocks, offsets, e, 2, r, one[2], two[2], factor)
+        h00, h01, h02, h11, h12, h22 = numbers
+        _add_number(blocks, offsets[e, 15], p, p, factor * h00)
+        _add_number(blocks, offsets[e, 16], p, q, factor * h01)
+        _add_number(blocks, offsets[e, 17], p, r, factor * h02)
+        _add_number(blocks, offsets[e, 18], q, q, factor * h11)
+        _add_number(blocks, offsets[e, 19], q, r, factor * h12)
+        _add_number(blocks, offsets[e, 20], r, r, factor * h22)

@@ -78,6 +78,17 @@ def directions(x, ends, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def against(x, ends, tangent, out):  # type: ignore[no-untyped-def]
+    """Into out (n,) which edges (n, 2) are over a right angle from ``tangent`` (n, 3); whether any is."""
+    found = False
+    for k in range(ends.shape[0]):
+        e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
+        out[k] = dot(e, (tangent[k, 0], tangent[k, 1], tangent[k, 2])) < 0.0
+        found |= out[k]
+    return found
+
+
+@kernel()
 def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
     for k in range(len(out)):
         t = present[k, 0], present[k, 1], present[k, 2]

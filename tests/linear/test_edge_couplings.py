@@ -103,6 +103,14 @@ def test_a_sweep_before_and_one_after() -> None:
     np.testing.assert_allclose(residual(), right - dense @ x.astype(float).ravel(), rtol=1e-4, atol=1e-4)
 
     x[:] = RNG.normal(size=x.shape)
+    before, left = x.astype(float), sweeps.of_edges[N_VERTICES:N_OWNED]
+    diagonal = np.diag(dense)[3 * N_VERTICES : 3 * N_OWNED].reshape(-1, 3)
+    sweeps.correct(x)
+    before[N_VERTICES:N_OWNED] += np.divide(
+        left, diagonal, out=np.zeros_like(diagonal), where=diagonal != 0.0
+    )
+    np.testing.assert_allclose(x, before, rtol=1e-4, atol=1e-5)
+
     before = x.astype(float).ravel()
     sweeps.forward(b, x)
     step = np.linalg.solve(upper.T, right - dense @ before)

@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 
 from lyra_petsc.kernels.scatter import AHEAD, add_elements, fetch_ahead
-from lyra_petsc.kernels.vectors import add_outer, add_six, add_triangle
+from lyra_petsc.kernels.vectors import add_corners, add_outer, add_six, add_triangle
 
 RNG = np.random.default_rng(7)
 
@@ -27,6 +27,11 @@ def add_all(values: Any, offsets: Any, e: Any, n: Any, six: Any) -> None:
 @njit
 def add_balanced(values: Any, offsets: Any, e: Any, f: Any, three: Any) -> None:
     add_triangle(values, offsets, e, f, three)
+
+
+@njit
+def add_given(values: Any, offsets: Any, e: Any, three: Any) -> None:
+    add_corners(values, offsets, e, three)
 
 
 def vectors(count: int) -> tuple[tuple[float, float, float], ...]:
@@ -99,6 +104,21 @@ def test_three_blocks_of_a_triangle_make_the_others(places: list[int], kind: typ
     b01, b02 = -(b11 + b12.T), -(b12 + b22)
     values = np.zeros((6, 3, 3))
     add_balanced(values, np.array([places], dtype=kind), 0, f, factors)
+    expected = sums_at(places, np.array([-(b01 + b02), b01, b02, b11, b12, b22]))
+    np.testing.assert_allclose(values, expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("places", PLACES)
+@pytest.mark.parametrize("kind", [np.int32, np.int64])
+def test_three_blocks_of_corners_make_the_others(places: list[int], kind: type) -> None:
+    b11, b12, b22 = blocks = RNG.normal(size=(3, 3, 3))
+    b11 += b11.T.copy()
+    b22 += b22.T.copy()
+    b01, b02 = -(b11 + b12.T), -(b12 + b22)
+    offsets = np.full((2, 21), -1, dtype=kind)
+    offsets[1, [0, 1, 2, 6, 7, 11]] = places
+    values = np.zeros((6, 3, 3))
+    add_given(values, offsets, 1, tuple(tuple(map(float, block.ravel())) for block in blocks))
     expected = sums_at(places, np.array([-(b01 + b02), b01, b02, b11, b12, b22]))
     np.testing.assert_allclose(values, expected, atol=1e-13)
 

@@ -34,7 +34,7 @@ def bent(comm: MPI.Comm) -> Iterator[tuple[Simulation, MidEdge, EdgeTurns]]:
         x[rows, 2] += 0.03 * np.cos(9.0 * x[rows, 0]) * np.sin(7.0 * x[rows, 1])
         term.begin(x)
         turns = EdgeTurns(term, layout.n_owned)
-        turns.set(x, np.zeros(x.shape, dtype=bool))
+        turns.set(x)
         yield simulation, term, turns
 
 
@@ -74,7 +74,8 @@ def test_held_edges_do_not_follow(bent: tuple[Simulation, MidEdge, EdgeTurns]) -
     x = simulation.system.x
     held = np.zeros(x.shape, dtype=bool)
     held.ravel()[term.of_edges.places[::2]] = True
-    turns.set(x, held)
+    turns.hold(held)
+    turns.set(x)
     followed = np.ones_like(x, dtype=np.float32)
     followed[:, 2] = x[:, 0]
     before = followed.copy()
