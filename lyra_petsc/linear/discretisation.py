@@ -276,8 +276,10 @@ class Discretisation:
         every = union(needed, extra) if self.rows.pattern.n_local == n_local else needed
         fits = self.place is not None and len(every) == len(extra) and n_local == self.rows.pattern.n_local
         if self.layout.comm.allreduce(int(not fits), MPI.MAX):
-            few = len(every) <= 2 * len(needed) + FEW * self.fixed.pattern.n_blocks
-            self._extra = every if few else needed
+            # those of elements that do not act yet, too: some soon will
+            soon = self.fixed.pattern.missing([term.stencil for term in self._changing], n_local)
+            few = len(every) <= 2 * len(soon) + FEW * self.fixed.pattern.n_blocks
+            self._extra = union(every, soon) if few else soon
             pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
             self.rows = BlockRows(pattern)
             self._located = False
