@@ -53,5 +53,6 @@ CASES: Registry[VerificationCase] = Registry(
         "rest": "contacts",
         "capstan": "contacts",
         "collision": "contacts",
+        "ruck": "drapes",
     },
 )
