@@ -54,5 +54,7 @@ CASES: Registry[VerificationCase] = Registry(
         "capstan": "contacts",
         "collision": "contacts",
         "ruck": "drapes",
+        "pole": "drapes",
+        "table-edge": "drapes",
     },
 )

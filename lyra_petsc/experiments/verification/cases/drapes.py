@@ -1,8 +1,9 @@
-"""Sheets that bend over obstacles: a ruck on a plane."""
+"""Sheets that bend over obstacles: a ruck on a plane, strips that meet a pole and a table's edge."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,16 @@ from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
-from lyra_petsc.experiments.verification.answers import Measured, at_finest, case, data, scene
+from lyra_petsc.experiments.verification.answers import (
+    Converges,
+    Measured,
+    at_finest,
+    case,
+    data,
+    grid,
+    isotropic,
+    scene,
+)
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 
 Array = NDArray[np.float64]
@@ -102,3 +112,88 @@ def ruck(bench: Bench, n: float) -> Iterator[Measured]:
                 ),
             ]
     yield from found
+
+
+# -- against a pole, over an edge ------------------------------------------------------------------------
+
+LENGTH, CELLS, STEP, GAP = 0.3, 12, 0.004, 0.002
+"""Of a strip [m]; cells along, Δt [s] and gap [m], of which one is refined at a time"""
+
+FABRIC = {"density": 0.2, "membrane": isotropic(200.0), "bending": 2e-4}
+
+ALONG_Y = [-1.0, 1.0]
+"""Ends of what strips meet, which are one cell wide and stay in the xz plane"""
+
+
+def _strip(
+    cells: int, step: float, gap: float, end: float, transform: dict[str, Any], **more: Any
+) -> dict[str, Any]:
+    """A strip that falls until ``end`` [s]; ``more`` are further keys."""
+    mesh = grid(LENGTH, LENGTH / cells, cells, 1, "alternating") | {"transform": transform}
+    held = [*more.pop("handles", []), {"group": "sheet", "axes": ["y"]}]
+    contact = {"gap": gap, "self": False, "friction": more.pop("friction", 0.0)}
+    # tighter than needed, and not as tight as without impacts
+    solver = {"force_tolerance": 1e-8, "step_tolerance": 1e-8}
+    time = {"end": end, "step": step}
+    return scene(
+        mesh, FABRIC, time, gravity=[0, 0, -9.81], handles=held, contact=contact, solver=solver, **more
+    )
+
+
+def _refined(bench: Bench, n: float, of: Callable[[int, float, float], dict[str, Any]]) -> Iterator[Measured]:
+    """By how much the ends of a strip move when Δt, cells or gap go from 2/n to 1/n of the coarsest."""
+    for words in ("Δt", "h", "gap"):
+        ends: list[Array] = []
+        for part in (0.5 * n, n):
+            step = STEP / part if words == "Δt" else STEP
+            gap = GAP / part if words == "gap" else GAP
+            cells = round(CELLS * part) if words == "h" else CELLS
+            with bench.simulation(of(cells, step, gap)) as trial:
+                ends.append(trial.run().x[[0, cells]])
+        change = float(np.abs(ends[1] - ends[0])[:, ::2].max())
+        yield Measured(f"change of the ends, {words} halved", change, 0.0, "m", scale=LENGTH)
+
+
+REFINED: dict[str, Any] = {
+    "source": "order of backward Euler, and of the distance at which the barrier holds",
+    "resolutions": (2, 4, 8),
+    "claim": Converges(1.0, 1e-2, slack=0.4),
+    # corners of the polygon that a strip is arrive one by one
+    "claims": {"change of the ends, h halved": Converges(1.0, 5e-3, slack=math.inf)},
+    "counts": "refinements",
+    "quick": 1,
+}
+
+
+@case("Hanging strip that swings against a pole: ends, when Δt, h or the gap is halved", **REFINED)
+def pole(bench: Bench, n: float) -> Iterator[Measured]:
+    def swings(cells: int, step: float, gap: float) -> dict[str, Any]:
+        low, high = ([-0.03, y, -0.15] for y in ALONG_Y)
+        return _strip(
+            cells,
+            step,
+            gap,
+            0.3,
+            {"rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 30.0}},
+            handles=[{"group": "left"}],
+            obstacles={"pole": {"capsule": {"from": low, "to": high, "radius": 0.02}}},
+        )
+
+    yield from _refined(bench, n, swings)
+
+
+@case("Strip that slides off a table's edge with friction: ends, when Δt, h or the gap is halved", **REFINED)
+def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
+    def slides(cells: int, step: float, gap: float) -> dict[str, Any]:
+        low, high = ALONG_Y
+        return _strip(
+            cells,
+            step,
+            gap,
+            0.2,
+            {"translate": [-0.13, 0.0, 0.95 * gap]},
+            friction=0.2,
+            obstacles={"table": {"box": {"min": [-1.0, low, -0.5], "max": [0.0, high, 0.0]}}},
+        )
+
+    yield from _refined(bench, n, slides)
