@@ -18,7 +18,8 @@ SOME = (
 LONG = (
     "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang", "slit-annulus", "sze-end-moment",
-    "pinched-cylinder", "incline", "rest", "capstan", "collision",
+    "pinched-cylinder", "incline", "rest", "capstan", "collision", "ruck",
+    "pole", "table-edge",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""
 
@@ -45,7 +46,7 @@ def test_is_in_the_docs(name: str) -> None:
 
 def marks(name: str) -> list[pytest.MarkDecorator]:
     """Whether a case is slow, and on how many ranks it also runs: contact on two and three, others on two."""
-    contact = CASES.modules[name] == "contacts"
+    contact = CASES.modules[name] in ("contacts", "drapes")
     ranks = pytest.mark.parallel if contact else pytest.mark.parallel(2)
     return [ranks] if name in SOME else [ranks, pytest.mark.slow]
 

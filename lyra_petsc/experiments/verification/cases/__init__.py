@@ -53,5 +53,8 @@ CASES: Registry[VerificationCase] = Registry(
         "rest": "contacts",
         "capstan": "contacts",
         "collision": "contacts",
+        "ruck": "drapes",
+        "pole": "drapes",
+        "table-edge": "drapes",
     },
 )
