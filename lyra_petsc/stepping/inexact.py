@@ -12,7 +12,8 @@ LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
 LOOSEST_IN_CONTACT = 1e-3
-"""With contact; looser solves cost more Newton iterations, each of which evaluates all pairs."""
+"""With contact, but for multigrid, whose iterations are dear: looser solves cost more Newton iterations,
+each of which evaluates all pairs."""
 
 STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
@@ -37,12 +38,14 @@ class Forcing:
         Leave it alone.
     contact : bool
         Whether parts may touch.
+    cycles : bool
+        Whether the preconditioner is a cycle of multigrid.
     """
 
-    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, contact: bool) -> None:
+    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, contact: bool, cycles: bool) -> None:
         self._ksp, self._fixed = ksp, fixed
         self._slow = SLOW_IN_CONTACT if contact else SLOW
-        self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact else LOOSEST
+        self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact and not cycles else LOOSEST
         self._norm = 0.0
 
     def begin(self) -> None:

@@ -43,6 +43,8 @@ class LinearSystem:
     ----------
     operator, preconditioner : Matrix
         May be the same.
+    cycles : bool
+        The latter is a cycle of multigrid.
     """
 
     def __init__(
@@ -56,7 +58,7 @@ class LinearSystem:
         # else the preconditioner is built from the operator's own values
         self._regularised = iterates and hessian != "regularised" and not direct and not self._one_matrix
         self._shifts = not direct
-        self._cycles = multigrid.is_asked_for()
+        self.cycles = multigrid.is_asked_for()
         self._interpolations: list[InterpolationRows] | None = None
         self._multigrid: Multigrid | None = None
         self._ksp: PETSc.KSP | None = None
@@ -76,7 +78,7 @@ class LinearSystem:
         else:
             self.operator = BlockMatrix(layout, pattern)
         self.preconditioner = self.operator
-        if self._cycles:
+        if self.cycles:
             if self._regularised or isinstance(self.operator, AssembledMatrix):
                 self.preconditioner = BlockMatrix(layout, pattern)
             self._multigrid = self._levels()

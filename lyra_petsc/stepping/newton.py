@@ -60,7 +60,9 @@ class Newton:
         self._from: PETSc.Vec | None = None
         self._began_convex = False
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
-        self.forcing = Forcing(self._ksp, fixed=fixed, contact=equations.discretisation.guards)
+        self.forcing = Forcing(
+            self._ksp, fixed=fixed, contact=equations.discretisation.guards, cycles=linear.cycles
+        )
 
     def begin_step(self) -> None:
         """Forget the step before."""
