@@ -56,6 +56,11 @@ ENTRIES = {
     "buckle": Entry(2.0, ("--handles", "--field", "curvature")),
     "twist": Entry(2.0, ("--handles", "--field", "curvature")),
     "ball": Entry(1.0, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
+    "flag-contact": Entry(1.5, ("--handles", "--wind")),
+    "tablecloth": Entry(1.5, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
+    "stack": Entry(0.3, ("--field", "displacement"), speed=0.5),
+    "wring": Entry(1.6, ("--handles", "--colors", "#2f6f9f,#f3e7d3")),
+    "reef-knot": Entry(1.0, ("--colors", "#2f6f9f,#f3e7d3"), speed=0.5),
     "shell": Entry(1.0, ("--handles", "--field", "curvature")),
 }
 

@@ -14,9 +14,9 @@ AHEAD = 8
 
 
 @cached(forceinline=True)
-def fetch_ahead(element, offsets, values, n_pairs):  # type: ignore[no-untyped-def]
+def fetch_ahead(element, offsets, values, n_pairs, ahead=AHEAD):  # type: ignore[no-untyped-def]
     """Let the blocks of a later element with offsets (E, n_pairs) come into the caches."""
-    later = min(element + AHEAD, offsets.shape[0] - 1)
+    later = min(element + ahead, offsets.shape[0] - 1)
     for pair in range(n_pairs):  # which compilers know where it is written down
         fetch(values, offsets[later, pair] >> 1)
 

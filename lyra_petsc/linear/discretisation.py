@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.linear.pattern import BlockPattern, union
+from lyra_petsc.linear.pattern import MISSING, BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
@@ -270,21 +270,27 @@ class Discretisation:
         """
         if not self._changing:
             return False
-        n_local, extra, before = self.layout.n_local, self._extra, self.rows
-        stencils = [term.stencil[acting[term]] for term in self._changing]
-        needed = self.fixed.pattern.missing(stencils, n_local)
-        every = union(needed, extra) if self.rows.pattern.n_local == n_local else needed
-        fits = self.place is not None and len(every) == len(extra) and n_local == self.rows.pattern.n_local
-        if self.layout.comm.allreduce(int(not fits), MPI.MAX):
-            few = len(every) <= 2 * len(needed) + FEW * self.fixed.pattern.n_blocks
-            self._extra = every if few else needed
-            pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
-            self.rows = BlockRows(pattern)
-            self._located = False
-        if not self._located:
-            self.rows.pattern.locate({term.name: term.stencil for term in self._changing})
+        n_local = self.layout.n_local
+        stencils = {term.name: term.stencil for term in self._changing}
+        fits = self.place is not None and self.rows.pattern.n_local == n_local
+        if fits and not self._located:
+            self.rows.pattern.locate(stencils)
             self._located = True
-        return self.rows is not before
+        if fits:
+            offsets = self.rows.pattern.offsets
+            fits = not any((offsets[term.name][acting[term]] == MISSING).any() for term in self._changing)
+        if not self.layout.comm.allreduce(int(not fits), MPI.MAX):
+            return False
+        # with those of elements that do not act yet: some soon will
+        soon = self.fixed.pattern.missing(stencils.values(), n_local)
+        kept = self._extra if self.rows.pattern.n_local == n_local else self._extra[:0]
+        few = len(kept) <= len(soon) + FEW * self.fixed.pattern.n_blocks
+        self._extra = union(kept, soon) if few else soon
+        pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
+        self.rows = BlockRows(pattern)
+        pattern.locate(stencils)
+        self._located = True
+        return True
 
     def destroy(self) -> None:
         """Free the communication objects; collective."""

@@ -20,6 +20,9 @@ STATIC = 1e-4
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
 
+SLOW_IN_CONTACT = 0.7
+"""The same with contact, where residuals also fall slowly as pairs meet and part."""
+
 FAST = 0.03
 """Fraction below which a looser one would have done."""
 
@@ -38,6 +41,7 @@ class Forcing:
 
     def __init__(self, ksp: PETSc.KSP, *, fixed: bool, contact: bool) -> None:
         self._ksp, self._fixed = ksp, fixed
+        self._slow = SLOW_IN_CONTACT if contact else SLOW
         self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact else LOOSEST
         self._norm = 0.0
 
@@ -50,7 +54,7 @@ class Forcing:
         """``norm`` [N] is the residual at the present iterate."""
         if self._fixed:
             return
-        if self._norm > 0.0 and norm > SLOW * self._norm:
+        if self._norm > 0.0 and norm > self._slow * self._norm:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)

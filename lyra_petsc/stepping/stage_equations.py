@@ -38,7 +38,7 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import Elastic, Load, Part, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, UpcomingStep, Viscous
 
 Array = NDArray[np.float64]
 
@@ -359,7 +359,7 @@ class StageEquations:
 
         On the tangent at v the vertices go beside their circles, and directors far beyond.
         """
-        if not self.active.edged:
+        if not self.active.edged or self.stage.reach * self._farthest_turn(way) <= LARGEST_TURN:
             return False
         x, ahead = self._ahead(v, way)
         changed = 0

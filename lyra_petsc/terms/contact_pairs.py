@@ -398,21 +398,23 @@ def pair_hessian(p, kind, offset, gap, stiffness, parallel, blend, beta, gamma, 
         w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
         det = u * w - v * v
         a00, a01, a11 = w / det, -v / det, u / det
-    across = first / (d * d)
+    along = second - first / (d * d)
+    beta_g, c, a_c = np.empty(12), np.zeros((2, 12)), np.zeros((2, 12))
+    for i in range(4):
+        for k in range(3):
+            beta_g[3 * i + k] = beta[i] * g[k]
+            for f in range(free):
+                c[f, 3 * i + k] = beta[i] * e[f, k] + gamma[f, i] * g[k]
+    for i in range(12):
+        a_c[0, i] = first * (a00 * c[0, i] + a01 * c[1, i])
+        a_c[1, i] = first * (a01 * c[0, i] + a11 * c[1, i])
+    for i in range(12):
+        for j in range(12):
+            h[i, j] = along * beta_g[i] * beta_g[j] - c[0, i] * a_c[0, j] - c[1, i] * a_c[1, j]
     for i in range(4):
         for j in range(4):
             for k in range(3):
-                c0 = beta[i] * e[0, k] + gamma[0, i] * g[k]
-                c1 = beta[i] * e[1, k] + gamma[1, i] * g[k]
-                for m in range(3):
-                    r0 = beta[j] * e[0, m] + gamma[0, j] * g[m]
-                    r1 = beta[j] * e[1, m] + gamma[1, j] * g[m]
-                    both = beta[i] * beta[j] * g[k] * g[m]
-                    value = (second - across) * both
-                    if k == m:
-                        value += first * beta[i] * beta[j]
-                    value -= first * (a00 * c0 * r0 + a01 * (c0 * r1 + c1 * r0) + a11 * c1 * r1)
-                    h[3 * i + k, 3 * j + m] = value
+                h[3 * i + k, 3 * j + k] += first * beta[i] * beta[j]
     if kind == EDGE_EDGE:
         slope = np.zeros(12)
         weight, once, twice = _mollifier(p, parallel, slope)

@@ -45,7 +45,7 @@ from lyra_petsc.terms.midedge_shape import (
 )
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
+from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -58,9 +58,6 @@ it is folded."""
 
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
-
-LARGEST_TURN = 1.0
-"""Angle [rad] by which a Newton iteration may turn a director against its triangles."""
 
 
 class Edges(NamedTuple):
@@ -271,7 +268,7 @@ class MidEdge(Elastic):
 
     def largest_turn(self, way: Array) -> float:
         places, length = self.of_edges.places, self.of_edges.length
-        own = places < way.size
+        own = slice(np.searchsorted(places, way.size))
         return float(np.abs(way.ravel()[places[own]] / length[own]).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:

@@ -29,10 +29,14 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_corners
 from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
 from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
+
+AHEAD = 4
+"""Triangles by which blocks are fetched before they are added to: each takes longer than other elements."""
 
 
 @kernel(inline="always")
@@ -290,6 +294,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
     """
     blocks, exact = values.reshape(-1, 9), 1.0 - blend
     for e in range(stencil.shape[0]):
+        fetch_ahead(e, offsets, values, 21, AHEAD)
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:

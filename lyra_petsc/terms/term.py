@@ -32,6 +32,9 @@ Offsets = NDArray[np.int32] | NDArray[np.int64]
 CHUNK_VALUES = 32_768
 """Scalars of element Hessians computed before they are added to the matrix: they stay in cache."""
 
+LARGEST_TURN = 1.0
+"""Angle [rad] by which a Newton iteration may turn a director against its triangles."""
+
 
 class Across(NamedTuple):
     """Pairs of rows (E, 2) of which only the coupling of one with the other is stored."""

@@ -60,6 +60,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--weak", type=int, metavar="N", help="vertices per rank of the weak scaling (25000); 0: none")
     add("--growth", type=numbers, nargs="*", metavar="N", help=f"further sizes to fit growth ({GROWTH})")
     add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
+    add("--contact", action="store_true", help="also sheets in contact, for a second and more")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
     add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
@@ -156,6 +157,8 @@ class Bench:
         self._growth()
         if asked.presets is not None:
             self._presets()
+        if asked.contact:
+            self._contact()
         if not asked.only_rows:
             self._meshes()
             self._weak()
@@ -207,6 +210,20 @@ class Bench:
                     ),
                 ),
             )
+
+    def _contact(self) -> None:
+        asked = self._asked
+        for vertices in asked.vertices:
+            for ranks in asked.ranks:
+                self._add(
+                    "contact",
+                    self._attempt(
+                        f"{vertices} vertices in contact, {ranks} rank(s)",
+                        lambda vertices=vertices, ranks=ranks: measures.contact(
+                            vertices, ranks, self._petsc, asked.limits
+                        ),
+                    ),
+                )
 
     def _growth(self) -> None:
         known = measures.first_method(self.results["rows"])

@@ -106,3 +106,38 @@ def small_sheet() -> dict[str, Any]:
     scene["mesh"] = {"grid": {"width": 0.5, "height": 1.0, "nx": 5, "ny": 10}}
     scene["handles"] = [{"nodes": [60, 65]}]
     return scene
+
+
+SHEETS = 5
+"""Of the stack."""
+
+
+def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
+    """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then one that
+    falls over a ball, and a stack that lies on a plane and, before it, as many sheets that swing.
+    """
+
+    def sheets(number: int, apart: float) -> list[dict[str, Any]]:
+        grid = {"width": 1.0, "height": 1.0, "nx": cells_of(vertices // number), "pattern": "alternating"}
+        grid["ny"] = grid["nx"]
+        return [
+            {"grid": grid, "transform": {"translate": [-0.5, -0.5, apart * (layer + 0.95)]}}
+            for layer in range(number)
+        ]
+
+    common = hanging_square(vertices, "beuler")
+    held = {"handles": [{"group": "left"}]}
+    free = {"handles": []}
+    ball = {"obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.31], "radius": 0.3}}}}
+    floor = {"obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}}
+    gap = 0.2 / cells_of(vertices // SHEETS)
+    one, several = sheets(1, 0.0), sheets(SHEETS, gap)
+    return {
+        "swings": common | held | {"mesh": one},
+        "over a ball": common | free | ball | {"mesh": one, "contact": {"friction": 0.4}},
+        f"{SHEETS} swing": common | held | {"mesh": several},
+        f"{SHEETS} in a stack": common
+        | free
+        | floor
+        | {"mesh": several, "contact": {"gap": gap, "friction": 0.4}},
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import shutil
@@ -12,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cases import MESHES, METHODS, STEP, hanging_square, on_mesh, small_sheet, square_number
+from cases import MESHES, METHODS, STEP, hanging_square, in_contact, on_mesh, small_sheet, square_number
 from peers import measure_peer
 from processes import Limits, measure, run
 from tables import growth
@@ -87,6 +88,13 @@ def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits
     with _scratch(folder) as scratch:
         scenes = {kind: on_mesh(kind, vertices, scratch) for kind in MESHES}
         return measure("meshes", ranks, petsc, len(MESHES) * limits.process, scenes=scenes, **few)
+
+
+def contact(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
+    """Steps of sheets in contact by turns with sheets that swing, after those of a second."""
+    few = {"warm_up": round(1.0 / STEP), "steps": limits.steps, "seconds": math.inf}
+    found = measure("meshes", ranks, petsc, 100 * limits.process, scenes=in_contact(vertices), **few)
+    return found | {"ranks": ranks}
 
 
 def first_method(rows: Sequence[Result]) -> list[Result]:

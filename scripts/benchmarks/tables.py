@@ -119,6 +119,41 @@ def of_vertex(found: Result) -> float:
     return median_of(found, "cpu") / found["vertices"]
 
 
+def contact_table(results: Sequence[Result]) -> list[str]:
+    """Steps in contact beside those of the sheets that swing, named before them."""
+    rows = []
+    for result in results:
+        base: Result = {}
+        for name, found in result["meshes"].items():
+            base = found if "swing" in name else base
+            cpu = [step["cpu"] for step in found["steps"]]
+            rows.append(
+                [
+                    str(found["vertices"]),
+                    str(result["ranks"]),
+                    name,
+                    spread(cpu, 1e3),
+                    number(median_of(found, "cpu") / median_of(base, "cpu")),
+                    number(found["all_cpu"] / base["all_cpu"]),
+                    number(median_of(found, "newton")),
+                    number(median_of(found, "cg")),
+                    found["preset"],
+                ]
+            )
+    head = (
+        "vertices",
+        "ranks",
+        "sheets",
+        "CPU ms a step",
+        "times those that swing",
+        "the whole run",
+        "Newton iterations",
+        "CG iterations",
+        "preset",
+    )
+    return table(head, rows)
+
+
 def meshes_table(results: Sequence[Result]) -> list[str]:
     """Kinds of meshes beside the first, by time a vertex, and the slowest of all."""
     rows, slowest, first = [], (0.0, ""), next(iter(results[0]["meshes"]))
@@ -282,6 +317,8 @@ def document(results: Result) -> str:
         lines += [*main_table(results["rows"]), ""]
     if results.get("meshes"):
         lines += ["## Other meshes, and directors on edges", "", *meshes_table(results["meshes"]), ""]
+    if results.get("contact"):
+        lines += ["## Contact", "", *contact_table(results["contact"]), ""]
     if "growth" in results:
         lines += [*growth_words(results["growth"]), ""]
     if results.get("weak"):

@@ -196,8 +196,10 @@ def meshes(comm: Comm, job: Result) -> Result:
             began = time.process_time()
             report = simulation.step()
             cpu = comm.allreduce(time.process_time() - began)
+            found[name]["all_cpu"] = found[name].get("all_cpu", 0.0) + cpu
             if number >= job["warm_up"]:
-                found[name]["steps"].append({"cpu": cpu, "cg": report.linear_iterations})
+                iterations = {"cg": report.linear_iterations, "newton": report.newton_iterations}
+                found[name]["steps"].append({"cpu": cpu, **iterations})
         enough = number >= job["warm_up"] - 1 + FEWEST
         if comm.bcast(time.perf_counter() - first > job["seconds"] and enough):
             break

@@ -29,7 +29,7 @@ def test_every_scene_is_shown_and_all_is_small(gallery):
     names = {path.stem for path in (ROOT / "configs").glob("*.yaml")}
     assert set(gallery.ENTRIES) == names
     page = (gallery.GALLERY.parent / "gallery.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"gallery/(\w+)\.png", page)) == names
+    assert set(re.findall(r"gallery/([\w-]+)\.png", page)) == names
     files = {path.name for path in gallery.GALLERY.iterdir()}
     assert files == {f"{name}.{ending}" for name in names for ending in ("png", "mp4")} | {"flag.gif"}
     assert sum(path.stat().st_size for path in gallery.GALLERY.iterdir()) < gallery.LIMIT

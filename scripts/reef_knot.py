@@ -1,0 +1,100 @@
+"""Writes meshes/reef-knot.obj: two strips in the shape of a loose reef knot, flat at rest.
+
+    .venv/bin/python scripts/reef_knot.py
+
+The first strip is a bight; the second comes up through it, goes over one of its legs, under both, over the
+other, and down through it again. Each follows a smooth curve, across which it lies so that it is bent rather
+than stretched and twisted as little as possible.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FILE = Path(__file__).resolve().parent.parent / "meshes" / "reef-knot.obj"
+UNIT = 0.05  # m, of the points below
+EDGE, CELLS = 0.01, 3  # m, and cells across a strip
+
+BIGHT = [[-5, 1, 0], [-3, 1, 0], [-1, 1, 0], [1, 1, 0], [2.2, 0.7, 0], [2.6, 0, 0]]
+AROUND = [[5, 0.6, 0], [3.5, 0.6, -0.4], [2.4, 0.5, -0.9], [1.2, 0.5, 0], [0.2, 0.9, 0.9], [-0.7, 1.6, 0.7]]
+AROUND += [[-1.2, 1.6, -0.5], [-1.4, 0.8, -0.9], [-1.4, 0, -0.9]]
+
+
+def mirrored(half: list[list[float]]) -> Array:
+    """The whole way of a strip: its first half, and this turned over to the other side of the xz plane."""
+    points = np.array(half, dtype=np.float64)
+    return np.concatenate([points, points[-2::-1] * [1, -1, 1]])
+
+
+def evenly(points: Array, n: int) -> Array:
+    """n points at equal distances along a polygon."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    return np.column_stack([np.interp(np.linspace(0.0, way[-1], n), way, points[:, k]) for k in range(3)])
+
+
+def smooth(points: Array) -> tuple[Array, float]:
+    """A curve near a polygon's corners, at about the distance of an edge, and that distance [m]."""
+    fine = evenly(points * UNIT, 400)
+    for _ in range(250):
+        fine[1:-1] += 0.25 * (fine[2:] - 2.0 * fine[1:-1] + fine[:-2])
+    length = float(np.linalg.norm(np.diff(fine, axis=0), axis=1).sum())
+    n = round(length / EDGE)
+    return evenly(fine, n + 1), length / n
+
+
+def across(curve: Array) -> Array:
+    """Unit vectors (n, 3) across a strip along a curve: at right angles to it and to its curvature, where it
+    has any, and turning little.
+    """
+    along = np.gradient(curve, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    bend = np.gradient(along, axis=0)
+    binormal = np.cross(along, bend)
+    # the direction whose square is most like the binormals' nearby: these may change their sign
+    wanted = binormal[:, :, None] * binormal[:, None, :] / (np.sum(bend**2, axis=1) + 1e-9)[:, None, None]
+    wanted += 0.02 * np.eye(3)
+    for _ in range(60):
+        wanted[1:-1] += 0.25 * (wanted[2:] - 2.0 * wanted[1:-1] + wanted[:-2])
+        wanted[0], wanted[-1] = wanted[1], wanted[-2]
+    plane = np.eye(3) - along[:, :, None] * along[:, None, :]
+    found = np.linalg.eigh(plane @ wanted @ plane)[1][:, :, 2]
+    for i in range(1, len(found)):
+        found[i] *= np.sign(found[i] @ found[i - 1])
+    return found
+
+
+def strip(points: Array, name: str, first: int, beside: float) -> list[str]:
+    """Lines of an .obj file: vertices from number ``first`` on, material coordinates from y = ``beside`` [m],
+    and quads; those at both ends are groups.
+    """
+    curve, edge = smooth(points)
+    sideways, n = across(curve), len(curve)
+    lines, rows = [], np.arange(CELLS + 1) - 0.5 * CELLS
+    for i in range(n):
+        lines += ["v {:.6f} {:.6f} {:.6f}".format(*(curve[i] + EDGE * row * sideways[i])) for row in rows]
+        lines += [f"vt {edge * i:.6f} {beside + EDGE * row:.6f}" for row in rows]
+    for group, begin, end in ((name, 1, n - 2), (f"{name}-start", 0, 1), (f"{name}-end", n - 2, n - 1)):
+        lines.append(f"g {group}")
+        for i in range(begin, end):
+            for row in range(CELLS):
+                a = first + i * (CELLS + 1) + row
+                quad = a, a + CELLS + 1, a + CELLS + 2, a + 1
+                lines.append("f " + " ".join(f"{corner}/{corner}" for corner in quad))
+    return lines
+
+
+def main() -> None:
+    """Write the file."""
+    lines = ["# Two strips in a loose reef knot (scripts/reef_knot.py); vt: flat, in metres"]
+    lines += strip(mirrored(BIGHT), "left", 1, 0.0)
+    lines += strip(mirrored(AROUND), "right", 1 + sum(line.startswith("v ") for line in lines), 1.0)
+    FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
