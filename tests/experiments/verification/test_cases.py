@@ -19,7 +19,7 @@ LONG = (
     "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang", "slit-annulus", "sze-end-moment",
     "pinched-cylinder", "incline", "rest", "capstan", "collision", "ruck",
-    "pole", "table-edge",
+    "pole", "table-edge", "cusick",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""
 

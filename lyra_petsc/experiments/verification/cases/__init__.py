@@ -56,5 +56,6 @@ CASES: Registry[VerificationCase] = Registry(
         "ruck": "drapes",
         "pole": "drapes",
         "table-edge": "drapes",
+        "cusick": "drapes",
     },
 )

@@ -1,18 +1,19 @@
-"""Sheets that bend over obstacles: a ruck on a plane, strips that meet a pole and a table's edge."""
+"""Sheets that bend over obstacles: rucks, strips at a pole and a table's edge, drapes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 from lyra_petsc.experiments.verification.answers import (
     Converges,
+    Exact,
     Measured,
     at_finest,
     case,
@@ -24,6 +25,7 @@ from lyra_petsc.experiments.verification.answers import (
 from lyra_petsc.experiments.verification.flat_plates import plate_material
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 # -- ruck ------------------------------------------------------------------------------------------------
 
@@ -197,3 +199,80 @@ def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
         )
 
     yield from _refined(bench, n, slides)
+
+
+# -- Cusick's drape test ---------------------------------------------------------------------------------
+
+CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
+"""Radii and gap [m]"""
+
+STARTS, NOISE = 5, 2e-4
+"""How many, and the standard deviation [m] of their heights"""
+
+MESHES = ("diagonal", "alternating", "irregular")
+PIXELS = 300
+"""Along a quarter's side, of the shadow's picture"""
+
+
+def _quarter(kind: str, n: int) -> tuple[Array, Ints]:
+    """The quarter x, y ≥ 0 of a disc of radius 1, a square of n × n cells mapped smoothly."""
+    if kind == "irregular":
+        flat, faces = irregular_rectangle(n, n, 1.0, 1.0)
+    else:
+        flat, faces = rectangle(n, n, 1.0, 1.0, alternating=kind == "alternating")
+    i, j = flat[:, 0], flat[:, 1]
+    return np.column_stack([i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2), 0.0 * i]), faces
+
+
+def _drape_coefficient(x: Array, faces: Ints) -> float:
+    """Share of the ring beside the disc that lies in the shadow of a quarter with vertices x (V, 3) [m]."""
+    middles = (np.arange(PIXELS) + 0.5) / PIXELS * (1.05 * CLOTH)
+    at = np.stack(np.meshgrid(middles, middles), axis=-1)
+    dark = np.hypot(at[..., 0], at[..., 1]) < DISC
+    for corners in x[faces][:, :, :2]:
+        sides, beside = np.roll(corners, -1, axis=0) - corners, at[..., None, :] - corners
+        turn = sides[:, 0] * beside[..., 1] - sides[:, 1] * beside[..., 0]
+        dark |= (turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1)
+    quarter, ring = 0.25 * math.pi * DISC**2, 0.25 * math.pi * (CLOTH**2 - DISC**2)
+    return (float(dark.mean()) * (1.05 * CLOTH) ** 2 - quarter) / ring
+
+
+@case(
+    "Denim (11oz-black-denim) of 30 cm over a disc of 18 cm, a quarter of it, bending_model: midedge: drape "
+    "coefficients, mean of five starts, on three kinds of meshes, against the mean of all",
+    source="G. E. Cusick, Journal of the Textile Institute 59 (1968) 253-260; agreement of meshes",
+    resolutions=(4, 6),
+    claim=Exact(0.1),
+    counts="cells along the radius",
+    quick=1,
+)
+def cusick(bench: Bench, n: float) -> Sequence[Measured]:
+    angle = np.radians(np.linspace(-35.0, 125.0, 17))
+    rim = DISC * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    fan = np.array([[k, k + 1, len(rim)] for k in range(len(rim) - 1)])
+    disc = {"mesh": bench.mesh(np.vstack([rim, np.zeros((1, 3))]), fan)}
+    means: dict[str, float] = {}
+    for kind in MESHES:
+        flat, faces = _quarter(kind, round(n))
+        mesh = bench.mesh(CLOTH * flat + [0.0, 0.0, 0.95 * DRAPE_GAP], faces, rest=CLOTH * flat[:, :2])
+        found = []
+        for start in range(STARTS):
+            content = scene(
+                mesh,
+                {"cloth": "11oz-black-denim", "bending_model": "midedge"},
+                {"end": 1.2, "step": 0.04},
+                gravity=[0.0, 0.0, -9.81],
+                initial={"noise": NOISE, "seed": start},
+                handles=[
+                    {"nodes": np.flatnonzero(flat[:, axis] < 1e-9).tolist(), "symmetry": "xy"[axis]}
+                    for axis in (0, 1)
+                ],
+                contact={"gap": DRAPE_GAP, "friction": 0.3, "self": False},
+                obstacles={"disc": disc},
+                solver={"force_tolerance": 1e-6, "step_tolerance": 1e-6},
+            )
+            with bench.simulation(content) as trial:
+                found.append(_drape_coefficient(trial.run().x, faces))
+        means[kind] = float(np.mean(found))
+    common = float(np.mean(list(means.values())))
+    return [Measured(f"drape coefficient, {kind}", mean, common, scale=1.0) for kind, mean in means.items()]
