@@ -56,7 +56,7 @@ class RunCrossings:
         self._run = run
         boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
         self._overlaps = {
-            one.name: _overlap(one, run.triangles, is_box=one.name in boxes) for one in run_obstacles(run)
+            one.name: inside(one, run.triangles, is_box=one.name in boxes) for one in run_obstacles(run)
         }
 
     def of(self, state: int) -> StateCrossings:
@@ -68,7 +68,7 @@ class RunCrossings:
         return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 
 
-def _overlap(obstacle: Solid | Container, triangles: Ints, *, is_box: bool) -> Overlap:
+def inside(obstacle: Solid | Container, triangles: Ints, *, is_box: bool) -> Overlap:
     """The function that finds what of a sheet with some triangles is in an obstacle."""
 
     def overlap(x: Array, time: float) -> Overlaps:

@@ -48,6 +48,11 @@ HALFWAY = 6.386
 """b″ / k in the middle of the gap: 2 ln 2 + 5."""
 
 
+STRAIN = 0.01
+"""Of an edge that is pressed with the force k times the gap, at least: with less a small gap is used up by a
+small force, and Newton's method goes there in many iterations."""
+
+
 class Barrier(NamedTuple):
     """Numbers of the barrier, the same on all ranks.
 
@@ -398,7 +403,8 @@ def barrier(rest: RestShape) -> Barrier:
             file=scene.source,
             key="contact",
         )
-    stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells) / HALFWAY
+    stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
+    stiffness *= max(1.0 / HALFWAY, STRAIN * float(length.mean()) / gap)
     return Barrier(gap, thickness, stiffness, PARALLEL)
 
 

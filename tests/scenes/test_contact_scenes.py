@@ -102,6 +102,7 @@ def test_a_wrung_cloth_has_eight_turns(comm: MPI.Comm, shared_tmp: Path) -> None
     assert linking_number(*closed) == pytest.approx(8.0, abs=1e-9)
 
 
+@pytest.mark.parallel(2)
 def test_a_reef_knot_holds(comm: MPI.Comm, shared_tmp: Path) -> None:
     if (run := run_of(comm, shared_tmp, "reef-knot", "time.step=0.02", "output.reactions=true")) is None:
         return

@@ -38,6 +38,7 @@ from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
+from lyra_petsc.stepping.state import fitted
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge
@@ -106,8 +107,10 @@ def force_along(
         return exact, False
     widest = math.inf if turned else _widest_turn(bent, x0, dx)
     if comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN:
-        panels, before = 1, integral(bent, 1, 5)
-        while panels < MOST_PANELS:
+        # the nearest points of contact go from edge to triangle, where second derivatives leap
+        panels = 4 if any(term.registration.neighbours for term in bent) else 1
+        most, before = MOST_PANELS * panels, integral(bent, panels, 5)
+        while panels < most:
             panels *= 2
             now = integral(bent, panels, 5)
             if abs(now - before) <= max(enough, EPSILON * abs(now)):
@@ -198,6 +201,11 @@ def largest(comm: MPI.Comm, values: Array) -> float:
     return float(comm.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX))
 
 
+def _in_space(term: Elastic) -> bool:
+    """Whether a term of the sheet's energy also pushes from outside: clamps and contact with obstacles."""
+    return term.registration.moving or term.registration.neighbours
+
+
 class Accountant:
     """Takes the balance of each step of a simulation by backward Euler; collective.
 
@@ -231,6 +239,12 @@ class Accountant:
         self._energy = energy(self._shell, system.x)
         self._frames: Terms = {term: term.frames for term in self._elastic if isinstance(term, MidEdge)}
 
+    def _fit(self) -> None:
+        """Give the positions in which the step began the ghosts that contact needs now; collective."""
+        layout = self._system.points
+        self._x = fitted(self._x, layout.n_owned, layout.n_local)
+        layout.update_ghosts(self._x)
+
     @property
     def _turned(self) -> Terms:
         """Terms whose frames have turned since the step began, in those of its beginning."""
@@ -241,6 +255,7 @@ class Accountant:
         """The balance of the step just accepted, which started from the state looked at last."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
+        self._fit()
         x0, v0, x1, v1 = self._x, self._v, system.x, system.v
         dx, dv = x1 - x0, v1[:n] - v0[:n]
         free = ~system.prescribed.mask[:n]
@@ -251,8 +266,8 @@ class Accountant:
         outside = -parts["loads"] + reaction
         for name in ("springs", "wind"):
             outside = outside - parts[name]
-        # the planes of clamps stand in space: their energy is stored, but they push from outside
-        planes = {term: frozen for term, frozen in self._shell.items() if term.registration.moving}
+        # planes of clamps and obstacles stand in space: their energy is stored, but they push from outside
+        planes = {term: frozen for term, frozen in self._shell.items() if _in_space(term)}
         pushed = gradient(planes, x1)[:n]
         slowed = self._damping(planes, v1)[:n]
         energy_now, energy_then = energy(self._shell, x1), energy({**self._shell, **self._turned}, x0)
@@ -313,7 +328,8 @@ class Accountant:
         squares = system.points.summed(*(float(np.sum(part**2, where=free)) for part in everything))
         *each, residual = np.sqrt(squares).tolist()
         floor = residual_roundoff(system, max(reach, simulation.problem.outline.reach))
-        way = (system.x - self._x - dt * self._v)[: len(free)]
+        n = len(free)
+        way = system.x[:n] - self._x[:n] - dt * self._v[:n]
         return {
             "residual": residual,
             "promised": max(simulation.scene.solver.force_tolerance * max(each), floor),
@@ -422,6 +438,7 @@ class StageAccountant(Accountant):
         integral of the elastic forces, and nothing is known of ``numerical``, ``viscous`` and ``work``."""
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
+        self._fit()
         x0, x1 = self._x, system.x
         # targets that move stand where the step ends by now
         self._prepare(system.t0 + system.stage.after)
@@ -429,8 +446,8 @@ class StageAccountant(Accountant):
         self._prepare(system.t1)
         total = np.asarray(sum(parts.values()))
         gap = total - self._simulation.ledger.reaction
-        if not any(term.registration.moving for term in self._shell):
-            # clamps push from outside, and cannot be told from the sheet's own forces here
+        if not any(_in_space(term) for term in self._shell):
+            # they push from outside, and cannot be told from the sheet's own forces here
             gap = gap - parts["internal"] - parts.get("damping", 0.0)
         change, noise, forces, way, *gaps = system.points.summed(
             energy(self._shell, x1) - energy({**self._shell, **self._turned}, x0),

@@ -25,6 +25,7 @@ FAMILIES: Registry[CaseFamily] = Registry(
         "elements": "shapes_and_handles",
         "free": "shapes_and_handles",
         "compression": "shapes_and_handles",
+        "contact": "contact",
         "directors": "directors",
         "rigid-plate": "rigid_plate",
         "chain": "chain",

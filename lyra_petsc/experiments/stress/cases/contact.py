@@ -1,0 +1,185 @@
+"""Sheets that meet obstacles and each other: thin and thick, fast, stiff, squeezed, pulled through a ring.
+
+Nothing may cross in any state, and a step takes at most `MOST` Newton iterations in the median.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.stress_scenes import (
+    FULL,
+    QUICK,
+    STEP,
+    USUAL,
+    Content,
+    Setting,
+    StressCase,
+    family,
+    scale,
+)
+from lyra_petsc.experiments.verification.answers import grid
+from lyra_petsc.mesh.crossings import self_crossings
+from lyra_petsc.output.run_crossings import inside
+from lyra_petsc.parallel import on_root
+
+MOST = 12
+"""Newton iterations of a step, in the median."""
+
+CELLS, RADIUS = 12, 0.3
+"""Cells along a side of the sheet, and radius of the ball [m]."""
+
+STEPS = 40
+PRESSURE, LAYERS, RAMP = 1e5, 10, 20
+"""Pa, and steps in which the pressure grows"""
+
+
+def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **more: Any) -> Content:
+    """A scene of the base scene's material, with nothing held."""
+    content = setting.content()
+    return content | {"mesh": mesh, "handles": [], "contact": contact, "obstacles": obstacles} | more
+
+
+def _over_ball(
+    setting: Setting, bench: Bench, contact: Content, stiffer: float = 1.0, speed: float = 0.0
+) -> Content:
+    """A square metre over a ball, on which it falls."""
+    apart = contact.get("thickness", 0.0) + 0.02
+    mesh = grid(1.0, 1.0, CELLS, CELLS, "alternating")
+    mesh["transform"] = {"translate": [-0.5, -0.48, RADIUS + apart]}
+    ball = {"ball": {"sphere": {"center": [0.0, 0.0, 0.0], "radius": RADIUS}}}
+    content = _scene(setting, mesh, contact, ball, initial={"velocity": [0.0, 0.0, -speed]})
+    return scale(content, stretching=stiffer)
+
+
+def _on_needles(setting: Setting, bench: Bench) -> Content:
+    """On a roof of long thin triangles, a thousand times as long as they are wide."""
+    n = 200
+    x = np.linspace(-1.0, 1.0, n + 1)
+    below = np.column_stack([x, np.full(n + 1, -1.0), np.full(n + 1, -1.0)])
+    ridge = np.column_stack([x + 0.5 / n, np.zeros(n + 1), np.zeros(n + 1)])
+    beyond = below * [1.0, -1.0, 1.0]
+    i = np.arange(n)
+    sides = []
+    for first in (0, 2 * (n + 1)):
+        sides += [[first + i, first + i + 1, n + 1 + i], [first + i + 1, n + 2 + i, n + 1 + i]]
+    triangles = np.concatenate([np.stack(side, axis=1) for side in sides])
+    # needles along the ridge: its triangles are squeezed to a tenth of their width
+    roof = bench.mesh(np.concatenate([below, ridge, beyond]) * [0.5, 1.0, 1.0], triangles)
+    mesh = grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": {"translate": [-0.5, -0.48, 0.02]}}
+    return _scene(setting, mesh, {"gap": 0.01}, {"roof": {"mesh": roof}})
+
+
+def _through_ring(setting: Setting, bench: Bench) -> Content:
+    """Pulled by its middle through a ring of a fifth of its width."""
+    n, radius, thick = 16, 0.1, 0.02
+    angle = 2.0 * math.pi * np.arange(n + 1) / n
+    corners = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(n + 1)]).tolist()
+    ring = {
+        f"part{k}": {"capsule": {"from": corners[k], "to": corners[k + 1], "radius": thick}} for k in range(n)
+    }
+    mesh = grid(0.5, 0.5, CELLS, CELLS, "alternating")
+    mesh["transform"] = {"translate": [-0.25, -0.25, thick + 0.02]}
+    middle = {"nodes": [(CELLS + 1) * (CELLS // 2) + CELLS // 2], "motion": "pull"}
+    pull = [{"time": 0.0}, {"time": 80 * STEP, "translate": [0.0, 0.0, -0.6]}]
+    scene = _scene(setting, mesh, {"gap": 0.005}, ring)
+    return scene | {"handles": [middle], "motions": {"pull": pull}}
+
+
+def _pressed(setting: Setting, bench: Bench) -> Content:
+    """Ten layers on a plane, on the uppermost of which a pressure acts."""
+    meshes = []
+    for layer in range(LAYERS):
+        place = [-0.05 + 0.002 * (layer % 3), 0.003 * (layer % 2), 0.005 + 0.006 * layer]
+        meshes.append(grid(0.1, 0.1, 3, 3) | {"name": f"layer{layer}", "transform": {"translate": place}})
+    floor = {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}
+    group = f"layer{LAYERS - 1}"
+    # in each step that much more
+    loads = [
+        {"group": group, "traction": [0.0, 0.0, -more], "from": STEP * k}
+        for k, more in enumerate(np.diff(np.geomspace(1e-4, 1.0, RAMP + 1)) * PRESSURE)
+    ]
+    return _scene(setting, meshes, {"gap": 0.004}, floor, loads=loads)
+
+
+def _crossings(trial: Trial) -> int:
+    """How many pairs of triangles cross now, and parts are inside of obstacles."""
+    simulation, x = trial.simulation, trial.x
+    mesh = simulation.problem.mesh  # on rank 0
+    term: Any = simulation.problem.terms["contact"]
+
+    def count() -> int:
+        assert mesh is not None
+        triangles = mesh.triangles.astype(np.int64)
+        found = len(self_crossings(x, triangles))
+        for one in term.obstacles.each:
+            box = (simulation.scene.obstacles or {})[one.name].box is not None
+            found += sum(len(part) for part in inside(one, triangles, is_box=box)(x, simulation.time))
+        return found
+
+    return on_root(simulation.comm, count)
+
+
+def _judged(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
+    crossed, usual = sum(record.observed), statistics.median(record.newton)
+    states = f"{crossed} crossings in {len(record.observed)} states"
+    return {
+        "crossings": Verdict(crossed == 0, states),
+        "iterations": Verdict(usual <= MOST, f"{usual:g} Newton iterations in the median, at most {MOST}"),
+    }
+
+
+_case = partial(StressCase, own=True, steps=STEPS, step=STEP, observe=_crossings, judge=_judged)
+
+GAP = 0.01
+
+contact = family(
+    "contact",
+    "contact: thickness, gap, Δt, stiffness, speed, needles, a ring, ten layers",
+    _case("contact-plain", "over a ball", partial(_over_ball, contact={"gap": GAP}), level=QUICK),
+    *(
+        _case(
+            f"contact-thick-{part}", f"thickness {part} edges",
+            partial(_over_ball, contact={"gap": GAP, "thickness": part / CELLS}),
+        )
+        for part in (0.1, 0.5)
+    ),
+    *(
+        _case(
+            f"contact-gap-{gap}", f"gap {gap} m",
+            partial(_over_ball, contact={"gap": float(gap)}), level=level,
+        )
+        for gap, level in (("1e-3", FULL), ("1e-4", USUAL), ("1e-5", FULL))
+    ),
+    *(
+        _case(
+            f"contact-{ms}ms", f"Δt {ms} ms", partial(_over_ball, contact={"gap": GAP}),
+            step=1e-3 * ms, steps=STEPS if ms < STEP * 1e3 else 20, level=level,
+        )
+        for ms, level in ((1, FULL), (20, USUAL), (40, USUAL))
+    ),
+    *(
+        _case(f"contact-{factor}", f"membrane × {factor}",
+              partial(_over_ball, contact={"gap": GAP}, stiffer=float(factor)), level=level)
+        for factor, level in (("1e3", USUAL), ("1e6", USUAL))
+    ),
+    *(
+        _case(
+            f"contact-thrown-{speed}", f"thrown at the ball with {speed} m/s",
+            partial(_over_ball, contact={"gap": GAP}, speed=float(speed)), steps=20, level=level,
+        )
+        for speed, level in ((1, FULL), (10, USUAL), (100, USUAL))
+    ),
+    _case("contact-needles", "on a roof of triangles of aspect 1000", _on_needles),
+    _case("contact-ring", "pulled through a narrow ring", _through_ring, steps=80),
+    _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
+)  # fmt: skip
