@@ -63,7 +63,7 @@ def _over_ball(
 
 def _on_needles(setting: Setting, bench: Bench) -> Content:
     """On a roof of long thin triangles, a thousand times as long as they are wide."""
-    n = 200
+    n = 1400
     x = np.linspace(-1.0, 1.0, n + 1)
     below = np.column_stack([x, np.full(n + 1, -1.0), np.full(n + 1, -1.0)])
     ridge = np.column_stack([x + 0.5 / n, np.zeros(n + 1), np.zeros(n + 1)])
@@ -73,8 +73,7 @@ def _on_needles(setting: Setting, bench: Bench) -> Content:
     for first in (0, 2 * (n + 1)):
         sides += [[first + i, first + i + 1, n + 1 + i], [first + i + 1, n + 2 + i, n + 1 + i]]
     triangles = np.concatenate([np.stack(side, axis=1) for side in sides])
-    # needles along the ridge: its triangles are squeezed to a tenth of their width
-    roof = bench.mesh(np.concatenate([below, ridge, beyond]) * [0.5, 1.0, 1.0], triangles)
+    roof = bench.mesh(np.concatenate([below, ridge, beyond]), triangles)
     mesh = grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": {"translate": [-0.5, -0.48, 0.02]}}
     return _scene(setting, mesh, {"gap": 0.01}, {"roof": {"mesh": roof}})
 
