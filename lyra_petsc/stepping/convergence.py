@@ -86,7 +86,12 @@ class Convergence:
 
         Where its line search fails, PETSc takes a short direction for convergence, whatever the residual.
         """
-        return self._ended or self.norm <= max(self._floor, self._force_tolerance())
+        return self._ended or self.balanced
+
+    @property
+    def balanced(self) -> bool:
+        """Whether the last residual is as small as the scene asks, or round-off."""
+        return self.norm <= max(self._floor, self._force_tolerance())
 
     def test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
         """SNES's reason to stop after so many linear iterations ``spent``, or None."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.watchdog import Watchdog
 
@@ -22,10 +23,11 @@ class Globalisation:
     ----------
     snes : PETSc.SNES
     equations : StageEquations
+    convergence : Convergence
     """
 
-    def __init__(self, snes: PETSc.SNES, equations: StageEquations) -> None:
-        self._snes, self._equations = snes, equations
+    def __init__(self, snes: PETSc.SNES, equations: StageEquations, convergence: Convergence) -> None:
+        self._snes, self._equations, self._convergence = snes, equations, convergence
         self._shape = (equations.points.n_owned, 3)
         self._watchdog = Watchdog()
         self.begin()
@@ -40,7 +42,8 @@ class Globalisation:
         """Note energy and residual of the present iterate, against which trial points are judged."""
         self._at = self._equations.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
-        self._near = self._equations.touches
+        # where forces are in balance differences of energies are round-off, and kinks far away
+        self._near = self._equations.touches and not self._convergence.balanced
         energy, size = self._at
         self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
 

@@ -55,7 +55,7 @@ class Newton:
     ) -> None:
         self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
         self._linear, self._blend, self._iterates = linear, blend, iterates
-        self.convergence, self.globalisation = convergence, Globalisation(snes, equations)
+        self.convergence, self.globalisation = convergence, Globalisation(snes, equations, convergence)
         self._shape = (equations.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
         self._began_convex = False
