@@ -114,7 +114,7 @@ class CoulombFriction(Elastic):
     def take(self, elements: Elements) -> None:
         super().take(elements)
         self._number = number = elements.data["what"][:, 0].astype(np.int64)
-        p = self._pairs
+        self._taken = p = self._pairs  # the next ones are known before their elements are
         if not len(number):
             number = np.empty(0, dtype=np.int64)
             self._limit = self._spring = np.empty(0)
@@ -210,7 +210,7 @@ class CoulombFriction(Elastic):
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
         if self._moved is not moved:
-            p, number = self._pairs, self._number
+            p, number = self._taken, self._number
             start, side = p.start[number], self._beta.sum(axis=1)
             for obstacle, (rotation, translation) in enumerate(moved):
                 mine = p.obstacle[number] == obstacle
@@ -240,12 +240,12 @@ class CoulombFriction(Elastic):
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
-        self._pairs.slip[self._number], self._pairs.slid[self._number] = self._slip, slides
+        self._taken.slip[self._number], self._taken.slid[self._number] = self._slip, slides
         self._renew(x, frozen.places)
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
-        number = self._pairs.obstacle[self._number][: self.n_owned]
+        number = self._taken.obstacle[self._number][: self.n_owned]
         out = np.zeros((len(self._contact.obstacles.each), 6))
         for obstacle in np.unique(number[number >= 0]):
             of, pull = np.flatnonzero(number == obstacle), np.zeros_like(x)
