@@ -108,7 +108,7 @@ def force_along(
     widest = math.inf if turned else _widest_turn(bent, x0, dx)
     if comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN:
         # the nearest points of contact go from edge to triangle, where second derivatives leap
-        panels = 4 if any(term.registration.neighbours for term in bent) else 1
+        panels = 16 if any(term.registration.neighbours for term in bent) else 1
         most, before = MOST_PANELS * panels, integral(bent, panels, 5)
         while panels < most:
             panels *= 2
