@@ -85,36 +85,32 @@ class BlockPattern:
         self._set(keys, n_owned, n_local)
         self.edges = tuple(part for part in couplings.values() if isinstance(part, WithEdges))
         self.offsets: dict[str, Offsets] = {}
-        self._locate(couplings, keys, n_local)
-
-    def _locate(self, couplings: Couplings, keys: Ints, n_local: int) -> None:
-        """Find the offsets of elements in the pattern of these keys."""
         for name, coupling in couplings.items():
             # terms on the same triangles are wont to have them in the same order
             alike = [other for other in self.offsets if _same(couplings.get(other), coupling)]
-            self.offsets[name] = (
-                self.offsets[alike[0]] if alike else _offsets(coupling, keys, self.n_owned, n_local)
-            )
+            self.offsets[name] = self.offsets[alike[0]] if alike else self.offsets_of(coupling)
 
     def missing(self, stencils: Iterable[NDArray[np.int32]], n_local: int) -> Ints:
         """Keys row · n_local + column, ascending, of blocks that further elements couple and this has not."""
         found = [np.empty(0, dtype=np.int64)]
         for stencil in stencils:
             one, other = (stencil[:, side] for side in np.array(_pairs(stencil)).T.reshape(2, -1))
-            at = np.flatnonzero(self._find(stencil).ravel() == MISSING)
+            at = np.flatnonzero(self.offsets_of(stencil).ravel() == MISSING)
             found.append(_keys(one.ravel()[at], other.ravel()[at], n_local))
         return union(*found)
 
     def locate(self, stencils: Mapping[str, NDArray[np.int32]]) -> None:
         """Take the offsets of further elements; `MISSING` where a coupling has no block."""
         for name, stencil in stencils.items():
-            self.offsets[name] = self._find(stencil)
+            self.offsets[name] = self.offsets_of(stencil)
 
-    def _find(self, stencil: NDArray[np.int32]) -> Offsets:
+    def offsets_of(self, coupling: Coupling) -> Offsets:
+        """Offsets of elements; `MISSING` where a coupling has no block."""
+        stencil = _stencil(coupling)
         n = stencil.shape[1]
-        out = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
+        out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
         _look_up(self.indptr, self.columns, stencil, out)
-        return out
+        return out[:, 1].copy() if isinstance(coupling, Across) else out
 
     def extended(self, more: Ints, n_local: int) -> tuple[BlockPattern, Ints]:
         """The pattern with further blocks ``more``, keys as `missing` gives them, among more ghosts.
@@ -137,11 +133,6 @@ class BlockPattern:
             moved = 2 * place[offsets >> 1] + (offsets & 1)
             made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
         return made, place
-
-    def offsets_of(self, stencil: NDArray[np.int32], n_local: int) -> Offsets:
-        """Offsets of further elements, all of whose couplings have a block already."""
-        rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
-        return _offsets(stencil, rows * n_local + self.columns, self.n_owned, n_local)
 
     @classmethod
     def of_keys(cls, keys: Ints, n_owned: int, n_local: int) -> BlockPattern:
@@ -237,13 +228,3 @@ def union(*parts: Ints) -> Ints:
     numbers = np.concatenate(parts)
     numbers.sort()
     return numbers[np.concatenate([[True], numbers[1:] != numbers[:-1]])] if len(numbers) else numbers
-
-
-def _offsets(coupling: Coupling, keys: Ints, n_owned: int, n_local: int) -> Offsets:
-    stencil, pairs = _stencil(coupling), _pairs(coupling)
-    out: Offsets = np.empty((len(stencil), len(pairs)), dtype=index_type(2 * len(keys)))
-    for pair, (a, b) in enumerate(pairs):
-        one, other = stencil[:, a], stencil[:, b]
-        found = 2 * np.searchsorted(keys, _keys(one, other, n_local)) + (one < other)
-        out[:, pair] = np.where(np.minimum(one, other) < n_owned, found, -1)
-    return out[:, 0] if isinstance(coupling, Across) else out

@@ -198,6 +198,16 @@ class Layout(Points):
         rows.ravel()[self.edge_places] = edges
         return rows
 
+    def in_mesh(self) -> Ints:
+        """Position among the mesh's vertices of each local one, (n_local,), ghosts too; 0 of edges;
+        collective.
+        """
+        known = np.zeros((self.n_local, 3))
+        known[: self.n_vertices, 0] = self.original
+        self.update_ghosts(known)
+        found: Ints = known[:, 0].astype(np.int64)
+        return found
+
     def are_vertices(self, rows: Ints) -> NDArray[np.bool_]:
         """Which of these rows, given by global numbers, are vertices."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1

@@ -95,10 +95,7 @@ def _worst(system: StageEquations, x: Array, sizes: Callable[[Elastic], Array]) 
     sized = np.concatenate(found)
     if not points.comm.allreduce(float(sized.max(initial=0.0)), MPI.MAX) > 0.0:
         return None
-    known = np.zeros((points.n_local, 3))
-    known[: points.n_vertices, 0] = points.original
-    points.update_ghosts(known)
-    numbers = known[:, 0].astype(np.int64)
+    numbers = points.in_mesh()
     ends = np.cumsum([len(size) for size in found])
     first = [numbers[term.stencil[: len(size)]].min(axis=1) for term, size in zip(terms, found, strict=True)]
 

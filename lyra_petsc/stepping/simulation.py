@@ -500,11 +500,8 @@ class SteppedScene:
         layout, found = self.problem.points, {}
         for term in self.problem.system.active.near:
             if term.registration.element_vertices:
-                known = np.zeros((layout.n_local, 3))
-                known[: layout.n_vertices, 0] = layout.original
-                layout.update_ghosts(known)
                 vertices, values = term.element_state()
-                numbers = known[layout.local(vertices.ravel()), 0].reshape(vertices.shape)
+                numbers = layout.in_mesh()[layout.local(vertices.ravel())].reshape(vertices.shape)
                 found[term.name] = np.concatenate([numbers, values], axis=1)
         return found
 

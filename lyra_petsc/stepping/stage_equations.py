@@ -446,7 +446,7 @@ class StageEquations:
             seen = fraction = self.discretisation.largest_step(x, ahead)
             for term in self.active.limiting:
                 fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
-            seen, fraction = self._least_of(seen, fraction)
+            fraction = self._least_of(fraction)
             if fraction == 1.0:
                 return most
             gone += fraction * (most - gone)
@@ -459,12 +459,9 @@ class StageEquations:
         turn = max((term.largest_turn(way) for term in self.active.edged), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
 
-    def _least_of(self, *numbers: float) -> list[float]:
-        """The least of each number on all ranks; collective."""
-        least = np.array(numbers)
-        self.points.comm.Allreduce(MPI.IN_PLACE, least, MPI.MIN)
-        found: list[float] = least.tolist()
-        return found
+    def _least_of(self, number: float) -> float:
+        """The least of all ranks; collective."""
+        return float(self.points.comm.allreduce(number, MPI.MIN))
 
     def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
@@ -491,11 +488,11 @@ class StageEquations:
         gone = 0.0
         for _ in range(SEARCHES):
             x, ahead = self._ahead(v + gone * way, (1.0 - gone) * way)
-            (seen,) = self._least_of(self.discretisation.largest_step(x, ahead))
+            seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
             part = Part(gone, 1.0 if seen == 1.0 else gone + seen * (1.0 - gone))
             free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
-            if not self._least_of(float(all(free)))[0]:
+            if not self._least_of(float(all(free))):
                 break
             if seen == 1.0:
                 return True
@@ -651,7 +648,7 @@ class StageEquations:
         following: list[Load | Viscous] = [load for load in self.active.loads if load.follows]
         for load in [*following, *self.active.viscous]:
             blocks = self.applied.factor * following_stiffness(load, self.x, self._force_of)
-            offsets = rows.pattern.offsets_of(load.stencil, self.points.n_local)
+            offsets = rows.pattern.offsets_of(load.stencil)
             add_elements(np.ones(load.n_elements), blocks, offsets, values)
         if len(self.prescribed.rows):
             rows.constrain(values, self.prescribed.mask, self.prescribed.rows)

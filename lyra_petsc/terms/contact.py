@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near, swept_boxes
@@ -41,16 +40,12 @@ KEPT = 0.2
 PARALLEL = 1e-3
 """Squared sine of the angle of two edges below which they count as nearly parallel."""
 
-AT_ONCE = 256
-"""Pairs whose Hessians are in memory at a time."""
-
 HALFWAY = 6.386
 """b″ / k in the middle of the gap: 2 ln 2 + 5."""
 
-
 STRAIN = 0.01
-"""Of an edge that is pressed with the force k times the gap, at least: with less a small gap is used up by a
-small force, and Newton's method goes there in many iterations."""
+"""Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
+which takes Newton's method many iterations."""
 
 
 class Barrier(NamedTuple):
@@ -308,12 +303,12 @@ class ContactBarrier(Elastic):
     ) -> None:
         at = np.flatnonzero(self.acting(x, frozen))
         offset, *constants = self._constants
-        pairs, places = (self.kind[at], self.points[at], offset[at]), offsets[self.name][at]
-        for lo in range(0, len(at), AT_ONCE):
-            part = slice(lo, lo + AT_ONCE)
-            blocks = np.empty((len(at[part]), 4, 4, 3, 3))
-            contact_pairs.hessians(x, frozen.now, *pairs, *constants, lo, blend, blocks)
-            add_elements(weight[at[part]], blocks, places[part], values)
+        pairs = self.kind[at], self.points[at], offset[at], *constants
+
+        def fill(lo: int, hi: int, out: Array) -> None:
+            contact_pairs.hessians(x, frozen.now, *pairs, lo, blend, out)
+
+        self._scatter(fill, weight, offsets, values, at)
 
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)

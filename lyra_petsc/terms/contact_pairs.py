@@ -314,14 +314,12 @@ def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  #
             continue
         d = distance(kind[e], p)
         delta = d - offset[e]
-        if delta >= gap:
-            pass
-        elif delta > 0.0:
+        if not delta > 0.0:  # or no number
+            out[e] = np.inf
+        elif delta < gap:
             out[e] = stiffness * barrier(delta, gap)[0]
             if kind[e] == EDGE_EDGE:
                 out[e] *= _mollifier(p, parallel, slope)[0]
-        else:
-            out[e] = np.inf
 
 
 @kernel()
@@ -332,8 +330,7 @@ def acting(x, others, kind, points, offset, gap, out):  # type: ignore[no-untype
         _load(x, others, points, e, p)
         out[e] = _at_least(p, kind[e]) - offset[e] < gap
         if out[e]:
-            d = distance(kind[e], p)
-            out[e] = d - offset[e] < gap
+            out[e] = distance(kind[e], p) - offset[e] < gap
 
 
 @kernel()
@@ -546,6 +543,13 @@ def _farthest(ways):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def _approach(way, others_way):  # type: ignore[no-untyped-def]
+    """By how much [m] two points, one of them of a sheet, come nearer at most."""
+    farthest = _farthest(way)
+    return farthest + max(farthest, _farthest(others_way))
+
+
+@kernel()
 def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
     """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
 
@@ -553,18 +557,18 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
     detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
     170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
-    both = _farthest(way) + max(_farthest(way), _farthest(others_way))
-    return _free_way(x, others, way, others_way, both, kind, points, offset, keep, most)
+    approach = _approach(way, others_way)
+    return _free_way(x, others, way, others_way, approach, kind, points, offset, keep, most)
 
 
 @kernel()
-def _free_way(x, others, way, others_way, both, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
-    """The same; no two points go farther together than ``both`` [m]."""
+def _free_way(x, others, way, others_way, approach, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+    """The same; no two points come nearer by more than ``approach`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         plane = kind[e] == VERTEX_PLANE
-        if not plane and most * both <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
+        if not plane and most * approach <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
             continue
         _load(way, others_way, points, e, w)
         speed = _plane_speed(p, w, most) if plane else _speed(kind[e], w)
@@ -618,11 +622,11 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, no
 @kernel()
 def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
     """What `free_way` gives for each of the first len(out) pairs alone."""
-    both = _farthest(way) + max(_farthest(way), _farthest(others_way))
+    approach = _approach(way, others_way)
     for e in range(len(out)):
         one = slice(e, e + 1)
         pair = kind[one], points[one], offset[one]
-        out[e] = _free_way(x, others, way, others_way, both, *pair, keep, 1.0)
+        out[e] = _free_way(x, others, way, others_way, approach, *pair, keep, 1.0)
 
 
 @kernel()

@@ -36,10 +36,6 @@ class Pairs(NamedTuple):
     key : (E, 11)
         Whether others count it, numbers of the vertices, kind, obstacle, its points: what tells a pair from
         others; ascending.
-    vertices : (E, 4)
-        Their global numbers.
-    obstacle : (E,)
-        −1 of sheets.
     beta : (E, 4)
         0 for obstacles' points.
     normal, start, slip, foot : (E, 3)
@@ -51,8 +47,6 @@ class Pairs(NamedTuple):
     """
 
     key: Ints
-    vertices: Ints
-    obstacle: Ints
     beta: Array
     normal: Array
     start: Array
@@ -60,6 +54,16 @@ class Pairs(NamedTuple):
     foot: Array
     force: Array
     slid: Mask
+
+    @property
+    def vertices(self) -> Ints:
+        """Global numbers (E, 4)."""
+        return self.key[:, 1:5]
+
+    @property
+    def obstacle(self) -> Ints:
+        """(E,), −1 of sheets."""
+        return self.key[:, 6]
 
 
 class ObstacleMoves(NamedTuple):
@@ -79,9 +83,8 @@ class ObstacleMoves(NamedTuple):
 
 
 def _no_pairs() -> Pairs:
-    ints, three = np.empty(0, dtype=np.int64), np.empty((0, 3))
-    four = np.empty((0, 4), dtype=np.int64)
-    nothing = np.empty((0, 11), dtype=np.int64), four, ints, np.empty((0, 4)), three, three, three, three
+    three = np.empty((0, 3))
+    nothing = np.empty((0, 11), dtype=np.int64), np.empty((0, 4)), three, three, three, three
     return Pairs(*nothing, np.empty(0), np.empty(0, dtype=np.bool_))
 
 
@@ -158,10 +161,7 @@ class CoulombFriction(Elastic):
             went = same >= 0
             slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
             slip -= np.sum(slip * normal[met], axis=1, keepdims=True) * normal[met]
-        obstacle = contact.obstacle[met]
-        self._pairs = Pairs(
-            key, contact.number[met], obstacle, beta, normal[met], start, slip, foot, force[met], slid
-        )
+        self._pairs = Pairs(key, beta, normal[met], start, slip, foot, force[met], slid)
         self.stale = True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
@@ -186,19 +186,8 @@ class CoulombFriction(Elastic):
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
         key = np.column_stack([~counted, vertices, what])
         order = np.lexsort(key.T[::-1])
-        nothing = np.zeros((len(key), 3))
-        self._pairs = Pairs(
-            key[order],
-            vertices[order],
-            what[order, 1],
-            np.zeros((len(key), 4)),
-            nothing,
-            nothing,
-            slip[order],
-            nothing,
-            np.zeros(len(key)),
-            values[order, 9] > 0.5,
-        )
+        # `take_pairs` finds the rest
+        self._pairs = _no_pairs()._replace(key=key[order], slip=slip[order], slid=values[order, 9] > 0.5)
 
     # -- a step ------------------------------------------------------------------------------------
 

@@ -162,21 +162,23 @@ class Term(ABC):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
+        rows: Ints | slice = slice(None),
     ) -> None:
-        """Add weight (E,) × element Hessians to block rows; ``fill`` computes those of elements lo..hi."""
-        at, n = offsets[self.name], self.stencil.shape[1]
+        """Add weight × Hessians of elements ``rows`` to block rows; ``fill`` computes the lo-th to hi-th."""
+        at, stencil, weight = offsets[self.name][rows], self.stencil[rows], weight[rows]
+        n = stencil.shape[1]
         m = 0 if self.edges is None else self.edges.shape[1]
         shape = (n, n, 3, 3) if self.edges is None else (3 * n + m, 3 * n + m)
         chunk = max(1, CHUNK_VALUES // int(np.prod(shape)))
-        buffer = np.empty((min(chunk, self.n_elements), *shape))
-        for lo in range(0, self.n_elements, chunk):
-            hi = min(lo + chunk, self.n_elements)
+        buffer = np.empty((min(chunk, len(stencil)), *shape))
+        for lo in range(0, len(stencil), chunk):
+            hi = min(lo + chunk, len(stencil))
             blocks = buffer[: hi - lo]
             fill(lo, hi, blocks)
             if self.edges is None:
                 add_elements(weight[lo:hi], blocks, at[lo:hi], values)
             else:
-                places = self.stencil[lo:hi], self.edges[lo:hi]
+                places = stencil[lo:hi], self.edges[rows][lo:hi]
                 add_mixed_elements(weight[lo:hi], blocks, *places, at[lo:hi], values)
 
 
@@ -327,7 +329,7 @@ class Elastic(Term):
         """Go on with a state of edges at positions x (n_local, 3)."""
 
     def take_pairs(self, x: Array, frozen: Any) -> None:
-        """Let the next step be that from positions x (n_local, 3), where no step has ended."""
+        """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
 
     def element_state(self) -> tuple[Ints, Array]:
         """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,
