@@ -79,6 +79,7 @@ class Discretisation:
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
         self.place: Ints | None = None
+        self._rows_of: Layout | None = None  # that ``rows`` were made for, with changing stencils
         self._located = False  # whether the pattern has the offsets of the present stencils
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
@@ -272,7 +273,7 @@ class Discretisation:
             return False
         n_local = self.layout.n_local
         stencils = {term.name: term.stencil for term in self._changing}
-        fits = self.place is not None and self.rows.pattern.n_local == n_local
+        fits = fits_layout = self._rows_of is self.layout  # another may have as many rows
         if fits and not self._located:
             self.rows.pattern.locate(stencils)
             self._located = True
@@ -283,13 +284,13 @@ class Discretisation:
             return False
         # with those of elements that do not act yet: some soon will
         soon = self.fixed.pattern.missing(stencils.values(), n_local)
-        kept = self._extra if self.rows.pattern.n_local == n_local else self._extra[:0]
+        kept = self._extra if fits_layout else self._extra[:0]
         few = len(kept) <= len(soon) + FEW * self.fixed.pattern.n_blocks
         self._extra = union(kept, soon) if few else soon
         pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
         self.rows = BlockRows(pattern)
         pattern.locate(stencils)
-        self._located = True
+        self._rows_of, self._located = self.layout, True
         return True
 
     def destroy(self) -> None:
