@@ -110,9 +110,9 @@ class Discretisation:
         for term in asked:
             searches = term.search_distance > 0.0
             self._found[term] = self._search(term, x, way) if searches else term.known()
-        every = np.unique(np.concatenate([stencil.ravel() for stencil, _ in self._found.values()]))
         end = layout.start + layout.n_owned
-        more = np.setdiff1d(every[(every < layout.start) | (every >= end)], self._fixed_layout.ghosts)
+        beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil, _ in self._found.values()]
+        more = np.setdiff1d(np.concatenate(beyond), self._fixed_layout.ghosts)
         present = layout.ghosts[len(self._fixed_layout.ghosts) :]
         others = bool(comm.allreduce(int(not np.isin(more, present).all()), MPI.MAX))
         if others:

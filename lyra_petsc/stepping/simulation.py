@@ -512,8 +512,7 @@ class SteppedScene:
         sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
         came = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
         vertices, values = (np.concatenate(part) for part in zip(*came, strict=True))
-        first = vertices[:, 0] - layout.start
-        term.restore_elements(vertices, values, (first >= 0) & (first < layout.n_owned))
+        term.restore_elements(vertices, values, range(layout.start, layout.start + layout.n_owned))
 
     def _restore_edges(self, term: Elastic, edges: Mapping[str, Array]) -> None:
         """Let a term go on with what a checkpoint holds of edges, those of ghosts too; collective."""

@@ -12,7 +12,7 @@ moves points so far that pairs might meet which the last search did not see.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
 
@@ -77,6 +78,25 @@ class Places(NamedTuple):
 
     before: Array
     now: Array
+
+
+class Meeting(NamedTuple):
+    """Pairs nearer than the gap, of those whose nearest points are on the same vertices one.
+
+    Attributes
+    ----------
+    least : (E,)
+        What the distance of each pair less its offset [m] is not below.
+    at, weight, counted, beta, energy : (m,), (m, 4) of β
+        Of those found, as `contact_pairs.meeting` gives them.
+    """
+
+    least: Array
+    at: Ints
+    weight: Array
+    counted: Array
+    beta: Array
+    energy: Array
 
 
 class Obstacles:
@@ -158,6 +178,7 @@ class ContactBarrier(Elastic):
         self._places = np.empty((2, 0, 3))
         none = np.empty((0, 1), dtype=np.int64)
         self._simplices = none, none, none  # vertices, edges and triangles of the last search
+        self._meeting = Remembered(self._meet)
 
     def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
         """Take what all ranks know alike; before anything else is asked.
@@ -177,6 +198,7 @@ class ContactBarrier(Elastic):
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
         self.points = np.where(what[:, 2:] < 0, what[:, 2:], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+        self._meeting = Remembered(self._meet)
 
     # -- obstacles ---------------------------------------------------------------------------------
 
@@ -271,24 +293,37 @@ class ContactBarrier(Elastic):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    @property
-    def _constants(self) -> tuple[Array, float, float, float]:
-        return self.offset, self.barrier.gap, self.barrier.stiffness, self.barrier.parallel
+    def meeting(self, x: Array, places: Array) -> Meeting:
+        """What is nearer than the gap at positions x (n_local, 3) [m] and obstacles' points (m, 3) [m]."""
+        return Meeting(*self._meeting(np.concatenate([x, places])))
+
+    def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
+        x, places = np.split(points, [len(points) - self.obstacles.n_points])
+        n, (gap, _, *others) = self.n_elements, self.barrier
+        least, weight, counted, energy = np.empty((4, n))
+        found = np.empty(n, dtype=np.int64), weight, counted, np.empty((n, 4)), energy
+        of = self.kind, self.points, self.offset, gap, *others, self.n_owned
+        met = contact_pairs.meeting(x, places, *of, least, found)
+        return least, *(part[:met].copy() for part in found)
+
+    def pairs(self, met: Meeting, of: Ints | slice = slice(None)) -> tuple[Any, ...]:
+        """Kinds, points, offsets, β and constants of the barrier of some of those that meet."""
+        at, (gap, _, *others) = met.at[of], self.barrier
+        return self.kind[at], self.points[at], self.offset[at], met.beta[of], gap, *others
 
     def energies(self, x: Array, frozen: Places) -> Array:
-        out = np.empty(self.n_owned)
-        contact_pairs.energies(x, frozen.now, self.kind, self.points, *self._constants, out)
+        met, out = self.meeting(x, frozen.now), np.zeros(self.n_owned)
+        counts = met.counted > 0.0  # these are among the owned pairs, as they come first
+        out[met.at[counts]] = (met.counted * met.energy)[counts]
         return out
 
     def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
-        pull = np.zeros_like(frozen.now)
-        contact_pairs.add_gradient(x, frozen.now, self.kind, self.points, *self._constants, out, pull)
+        met, pull = self.meeting(x, frozen.now), np.zeros_like(frozen.now)
+        contact_pairs.add_gradient(x, frozen.now, *self.pairs(met), met.weight, out, pull)
 
     def acting(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
-        out = np.empty(self.n_elements, dtype=np.bool_)
-        if self.n_elements:
-            pairs = self.kind, self.points, self.offset, self.barrier.gap
-            contact_pairs.acting(x, frozen.now, *pairs, out)
+        out = np.zeros(self.n_elements, dtype=np.bool_)
+        out[self.meeting(x, frozen.now).at] = True
         return out
 
     def add_hessian(
@@ -301,21 +336,24 @@ class ContactBarrier(Elastic):
         values: Array,
         before: Array | None = None,
     ) -> None:
-        at = np.flatnonzero(self.acting(x, frozen))
-        offset, *constants = self._constants
-        pairs = self.kind[at], self.points[at], offset[at], *constants
+        met = self.meeting(x, frozen.now)
+        pairs = self.pairs(met)
 
         def fill(lo: int, hi: int, out: Array) -> None:
             contact_pairs.hessians(x, frozen.now, *pairs, lo, blend, out)
 
-        self._scatter(fill, weight, offsets, values, at)
+        weight = weight.copy()
+        weight[met.at] *= met.weight
+        self._scatter(fill, weight, offsets, values, met.at)
 
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
 
     def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
-        pairs = self.kind, self.points, self.offset
         still = np.zeros_like(frozen.now)
+        left, nearer = self.meeting(x, frozen.now).least, contact_pairs.approach(way, still)
+        at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
+        pairs = self.kind[at], self.points[at], self.offset[at]
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
     def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
@@ -345,26 +383,37 @@ class ContactBarrier(Elastic):
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
 
     def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
-        out, number = np.zeros((count, 6)), self.obstacle[: self.n_owned]
+        out, met = np.zeros((count, 6)), self.meeting(x, frozen.now)
+        number = self.obstacle[met.at]
         for obstacle in np.unique(number[number >= 0]):
-            of = np.flatnonzero(number == obstacle)
+            of = np.flatnonzero((number == obstacle) & (met.counted > 0.0))
             gradient, pull = np.zeros_like(x), np.zeros_like(frozen.now)
-            offset, *rest = self._constants
-            pairs = self.kind[of], self.points[of], offset[of]
-            contact_pairs.add_gradient(x, frozen.now, *pairs, *rest, gradient, pull)
+            pairs = self.pairs(met, of)
+            contact_pairs.add_gradient(x, frozen.now, *pairs, met.counted[of], gradient, pull)
             out[obstacle] = *gradient.sum(axis=0), *np.cross(x, gradient).sum(axis=0)
         return out
+
+    def touching(self, x: Array, places: Array) -> tuple[NDArray[Any], ...]:
+        """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of all pairs that touch."""
+        n, (gap, _, *others) = self.n_elements, self.barrier
+        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
+        of, least = (self.kind, self.points, self.offset, gap), self.meeting(x, places).least
+        met = contact_pairs.touching(x, places, *of, *others, least, *found)
+        return tuple(part[:met] for part in found)
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
         out = np.zeros(len(x))
-        contact_pairs.add_normal_forces(x, frozen.now, self.kind, self.points, *self._constants, out)
+        beta, _, force, at = self.touching(x, frozen.now)
+        contact_pairs.add_normal_forces(self.points[at], beta, force, out)
         return out
 
     def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
-        left = self.gaps(x, frozen)
-        count = float((left < self.barrier.gap).sum())
-        return {"contacts": count, "smallest_gap": float(left.min(initial=np.inf))}
+        met = self.meeting(x, frozen.now)
+        smallest = met.least[: self.n_owned].min(initial=np.inf)
+        if smallest >= self.barrier.gap:  # it may be more
+            smallest = self.gaps(x, frozen).min(initial=np.inf)
+        return {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
 
 
 def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array]:

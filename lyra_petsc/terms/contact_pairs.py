@@ -18,6 +18,9 @@ factor m = c (2 − c), c = sin² θ / parallel up to 1, with which forces stay 
 side pairs of vertices and triangles are as near (same source, section 5.2, with |u × v|² over rest lengths).
 
 Points of obstacles have numbers below 0: ~number among the obstacles' points.
+
+Pairs whose nearest points are the same vertices, or a vertex and the same point of an edge, have the same
+energy: each is evaluated once, and `meeting` tells how many there are of it.
 """
 
 from __future__ import annotations
@@ -178,37 +181,26 @@ def distance(kind, p):  # type: ignore[no-untyped-def]
     return -length if behind else length
 
 
-@kernel()
-def nearest(kind, p, beta, gamma):  # type: ignore[no-untyped-def]
-    """Distance of points p (4, 3), their β (4,) and γ (2, 4); how many coordinates are free.
-
-    p may change as in `distance`.
-    """
-    behind = kind == VERTEX_INSIDE
-    if kind == VERTEX_PLANE:
-        behind = _around_foot(p)
-    b0, b1, b2, b3 = _weights(kind, p)
-    beta[0], beta[1], beta[2], beta[3] = b0, b1, b2, b3
+@kernel(inline="always")
+def _free(kind, beta, gamma):  # type: ignore[no-untyped-def]
+    """γ (2, 4) of the nearest points with β (4,); how many coordinates are free."""
     gamma[:] = 0.0
     free = 0
     if kind == EDGE_EDGE:
-        if b0 != 0.0 and b1 != 0.0:
-            gamma[0, 0], gamma[0, 1] = -1.0, 1.0
-            free = 1
-        if b2 != 0.0 and b3 != 0.0:
-            gamma[free, 2], gamma[free, 3] = 1.0, -1.0
-            free += 1
-    else:
-        last = -1
-        for i in range(1, 4):
-            if beta[i] != 0.0:
-                if last > 0:
-                    gamma[free, last], gamma[free, i] = 1.0, -1.0
-                    free += 1
-                else:
-                    last = i
-    length = _length(p, b0, b1, b2, b3)
-    return (-length if behind else length), free
+        for first in (0, 2):
+            if beta[first] != 0.0 and beta[first + 1] != 0.0:
+                gamma[free, first], gamma[free, first + 1] = first - 1.0, 1.0 - first
+                free += 1
+        return free
+    last = -1
+    for i in range(1, 4):
+        if beta[i] != 0.0:
+            if last > 0:
+                gamma[free, last], gamma[free, i] = 1.0, -1.0
+                free += 1
+            else:
+                last = i
+    return free
 
 
 @kernel()
@@ -303,61 +295,122 @@ def distances(x, others, kind, points, out):  # type: ignore[no-untyped-def]
         out[e] = distance(kind[e], p)
 
 
-@kernel()
-def energies(x, others, kind, points, offset, gap, stiffness, parallel, out):  # type: ignore[no-untyped-def]
-    """Energy [J] of the first len(out) pairs."""
-    p, slope = np.empty((4, 3)), np.zeros(12)
-    for e in range(len(out)):
-        _load(x, others, points, e, p)
-        out[e] = 0.0
-        if _at_least(p, kind[e]) - offset[e] >= gap:
-            continue
-        d = distance(kind[e], p)
-        delta = d - offset[e]
-        if not delta > 0.0:  # or no number
-            out[e] = np.inf
-        elif delta < gap:
-            out[e] = stiffness * barrier(delta, gap)[0]
-            if kind[e] == EDGE_EDGE:
-                out[e] *= _mollifier(p, parallel, slope)[0]
+@kernel(inline="always")
+def _ends(kind, points, e, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
+    """The nearest parts of a pair with β (4,): a vertex, and the ends of an edge or twice another vertex.
+
+    Only of pairs of which a part is a vertex and the other no interior of a triangle.
+    """
+    if kind == EDGE_EDGE:
+        if b0 != 0.0 and b1 != 0.0:  # the vertex is of the second edge
+            return points[e, 2] if b2 != 0.0 else points[e, 3], points[e, 0], points[e, 1]
+        v = points[e, 0] if b0 != 0.0 else points[e, 1]
+        lo, hi = points[e, 2] if b2 != 0.0 else points[e, 3], points[e, 3] if b3 != 0.0 else points[e, 2]
+        return v, lo, hi
+    lo = points[e, 1] if b1 != 0.0 else (points[e, 2] if b2 != 0.0 else points[e, 3])
+    hi = points[e, 3] if b3 != 0.0 else (points[e, 2] if b2 != 0.0 else points[e, 1])
+    return points[e, 0], lo, hi
 
 
 @kernel()
-def acting(x, others, kind, points, offset, gap, out):  # type: ignore[no-untyped-def]
-    """Whether each pair is nearer than the gap, (E,)."""
-    p = np.empty((4, 3))
-    for e in range(len(out)):
-        _load(x, others, points, e, p)
-        out[e] = _at_least(p, kind[e]) - offset[e] < gap
-        if out[e]:
-            out[e] = distance(kind[e], p) - offset[e] < gap
+def meeting(x, others, kind, points, offset, gap, stiffness, parallel, n_counted, least, found):  # type: ignore[no-untyped-def]
+    """Find the pairs nearer than the gap, one of all those whose nearest points are on the same vertices.
 
+    Parameters
+    ----------
+    n_counted : int
+        The first pairs, which this rank counts.
+    least : (E,)
+        What the distance less the offset [m] is not below; exactly that where it is below the gap.
+    found : tuple of (E,), (E,), (E,), (E, 4), (E,)
+        Numbers of the pairs, ascending; of how many each is one, and how many of these are counted;
+        β and the energy [J] of one pair.
 
-@kernel()
-def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, out, pull):  # type: ignore[no-untyped-def]
-    """Add the gradient [N] to rows of out (n_local, 3), that of obstacles' points to pull (m, 3)."""
-    p, beta, gamma, more = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
+    Returns
+    -------
+    n : int
+        How many there are: the first rows of ``found``.
+    """
+    at, weight, counted, beta, energy = found
+    p, slope, n = np.empty((4, 3)), np.zeros(12), 0
+    first, following = np.full(len(x), -1), np.empty(len(kind), dtype=np.int64)  # lists, by a vertex
+    alike = np.empty((len(kind), 3), dtype=np.int64)  # nearest vertex and edge, or a second vertex twice
     for e in range(len(kind)):
         _load(x, others, points, e, p)
-        if _at_least(p, kind[e]) - offset[e] >= gap:
+        least[e] = _at_least(p, kind[e]) - offset[e]
+        if least[e] >= gap:
             continue
-        d, _ = nearest(kind[e], p, beta, gamma)
-        delta = d - offset[e]
+        behind = kind[e] == VERTEX_INSIDE
+        if kind[e] == VERTEX_PLANE:
+            behind = _around_foot(p)
+        b0, b1, b2, b3 = _weights(kind[e], p)
+        d = _length(p, b0, b1, b2, b3)
+        delta = least[e] = (-d if behind else d) - offset[e]
         if delta >= gap:
             continue
+        ours, part = 1.0 if e < n_counted else 0.0, 1.0
+        if kind[e] == EDGE_EDGE:
+            part = _mollifier(p, parallel, slope)[0]
+        # edges whose energy fades are not like others
+        if part == 1.0 and kind[e] <= EDGE_EDGE and (b0 == 0.0 or b1 == 0.0 or b2 == 0.0 or b3 == 0.0):
+            v, lo, hi = _ends(kind[e], points, e, b0, b1, b2, b3)
+            if lo == hi:
+                v, lo, hi = max(v, lo), min(v, lo), min(v, lo)
+            elif lo > hi:
+                lo, hi = hi, lo
+            row = Index(max(v, hi) if v < 0 else v)
+            other = first[row]
+            while other >= 0 and (alike[other, 0] != v or alike[other, 1] != lo or alike[other, 2] != hi):
+                other = following[other]
+            if other >= 0:
+                weight[other] += 1.0
+                counted[other] += ours
+                continue
+            alike[n, 0], alike[n, 1], alike[n, 2] = v, lo, hi
+            following[n], first[row] = first[row], n
+        at[n], weight[n], counted[n] = e, 1.0, ours
+        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = b0, b1, b2, b3
+        energy[n] = part * stiffness * barrier(delta, gap)[0] if delta > 0.0 else np.inf  # or no number
+        n += 1
+    return n
+
+
+@kernel(inline="always")
+def _between(x, others, kind, points, beta, e, n, p, g):  # type: ignore[no-untyped-def]
+    """Points of pair e into p (4, 3) and Σ β_ni p_i into g (3,); the distance, as `distance` gives it."""
+    _load(x, others, points, e, p)
+    behind = kind[e] == VERTEX_INSIDE
+    if kind[e] == VERTEX_PLANE:
+        behind = _around_foot(p)
+    square = 0.0
+    for k in range(3):
+        g[k] = beta[n, 0] * p[0, k] + beta[n, 1] * p[1, k] + beta[n, 2] * p[2, k] + beta[n, 3] * p[3, k]
+        square += g[k] * g[k]
+    return -math.sqrt(square) if behind else math.sqrt(square)
+
+
+@kernel()
+def add_gradient(x, others, kind, points, offset, beta, gap, stiffness, parallel, weight, out, pull):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add weight (E,) times the gradient [N] of pairs nearer than the gap to rows of out (n_local, 3).
+
+    That of obstacles' points to pull (m, 3).
+    """
+    p, g, more = np.empty((4, 3)), np.empty(3), np.zeros(12)
+    for e in range(len(kind)):
+        d = _between(x, others, kind, points, beta, e, e, p, g)
+        delta = d - offset[e]
         slope = turn = 0.0
         if delta > 0.0:
             energy, slope, _ = barrier(delta, gap)
-            slope *= stiffness / d
+            slope *= weight[e] * stiffness / d
             if kind[e] == EDGE_EDGE:
-                weight, first, _ = _mollifier(p, parallel, more)
-                slope, turn = weight * slope, stiffness * energy * first
+                part, first, _ = _mollifier(p, parallel, more)
+                slope, turn = part * slope, weight[e] * stiffness * energy * first
         else:
             slope = np.nan
-        for k in range(3):
-            g = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
-            for i in range(4):
-                force = slope * beta[i] * g
+        for i in range(4):
+            for k in range(3):
+                force = slope * beta[e, i] * g[k]
                 if turn != 0.0:
                     force += turn * more[3 * i + k]
                 if points[e, i] >= 0:
@@ -367,68 +420,26 @@ def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, out,
 
 
 @kernel()
-def pair_hessian(p, kind, offset, gap, stiffness, parallel, blend, beta, gamma, h):  # type: ignore[no-untyped-def]
-    """The Hessian of a pair at p (4, 3) into h (12, 12); whether it is not 0.
-
-    ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only, which is positive semidefinite.
-    """
-    d, free = nearest(kind, p, beta, gamma)
-    delta = d - offset
-    if delta >= gap or delta <= 0.0:
-        return False
-    energy, force, second = barrier(delta, gap)
-    energy, force = (1.0 - blend) * stiffness * energy, stiffness * force / d
-    first, second = (1.0 - blend) * force, stiffness * second / (d * d)
-    g, e = np.empty(3), np.zeros((2, 3))
-    for k in range(3):
-        g[k] = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
-        for f in range(free):
-            for i in range(4):
-                e[f, k] += gamma[f, i] * p[i, k]
-    # A⁻¹
-    a00 = a01 = a11 = 0.0
-    if free == 1:
-        a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
-    elif free == 2:
-        u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
-        v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
-        w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
-        det = u * w - v * v
-        a00, a01, a11 = w / det, -v / det, u / det
-    along = second - first / (d * d)
-    beta_g, c, a_c = np.empty(12), np.zeros((2, 12)), np.zeros((2, 12))
-    for i in range(4):
-        for k in range(3):
-            beta_g[3 * i + k] = beta[i] * g[k]
-            for f in range(free):
-                c[f, 3 * i + k] = beta[i] * e[f, k] + gamma[f, i] * g[k]
-    for i in range(12):
-        a_c[0, i] = first * (a00 * c[0, i] + a01 * c[1, i])
-        a_c[1, i] = first * (a01 * c[0, i] + a11 * c[1, i])
-    for i in range(12):
-        for j in range(12):
-            h[i, j] = along * beta_g[i] * beta_g[j] - c[0, i] * a_c[0, j] - c[1, i] * a_c[1, j]
+def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, h):  # type: ignore[no-untyped-def]
+    """Let the Hessian h (4, 4, 3, 3) of two edges whose energy does not fade be that where it does."""
+    slope = np.zeros(12)
+    part, once, twice = _mollifier(p, parallel, slope)
+    if part == 1.0:
+        return
+    energy, exact = (1.0 - blend) * stiffness * barrier(delta, gap)[0], (1.0 - blend) * once * force
     for i in range(4):
         for j in range(4):
             for k in range(3):
-                h[3 * i + k, 3 * j + k] += first * beta[i] * beta[j]
-    if kind == EDGE_EDGE:
-        slope = np.zeros(12)
-        weight, once, twice = _mollifier(p, parallel, slope)
-        if weight < 1.0:
-            h *= weight
-            for i in range(12):
-                pull = (1.0 - blend) * once * force * beta[i // 3] * g[i % 3]
-                for j in range(12):
-                    push = (1.0 - blend) * once * force * beta[j // 3] * g[j % 3]
-                    h[i, j] += pull * slope[j] + slope[i] * push + energy * twice * slope[i] * slope[j]
-            _add_turn(p, energy * once, h)
-    return True
+                pull, to = exact * beta[i] * g[k], slope[3 * i + k]
+                for m in range(3):
+                    push, by = exact * beta[j] * g[m], slope[3 * j + m]
+                    h[i, j, k, m] = part * h[i, j, k, m] + pull * by + to * push + energy * twice * to * by
+    _add_turn(p, energy * once, h)
 
 
 @kernel()
 def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
-    """Add factor times the Hessian of sin² θ to h (12, 12)."""
+    """Add factor times the Hessian of sin² θ to h (4, 4, 3, 3)."""
     uu, uv, vv = _of_edges(p)
     square = uu * vv
     if not square > 0.0:
@@ -447,26 +458,73 @@ def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
             for i in range(2):
                 for j in range(2):
                     sign = 1.0 if i == j else -1.0
-                    h[3 * i + k, 3 * j + m] += sign * one
-                    h[6 + 3 * i + k, 6 + 3 * j + m] += sign * other
-                    h[3 * i + k, 6 + 3 * j + m] += sign * mixed
-                    h[6 + 3 * j + m, 3 * i + k] += sign * mixed
+                    h[i, j, k, m] += sign * one
+                    h[2 + i, 2 + j, k, m] += sign * other
+                    h[i, 2 + j, k, m] += sign * mixed
+                    h[2 + j, i, m, k] += sign * mixed
 
 
 @kernel()
-def hessians(x, others, kind, points, offset, gap, stiffness, parallel, lo, blend, out):  # type: ignore[no-untyped-def]
-    """Hessians [N/m] of pairs lo, lo + 1, … into out (n, 4, 4, 3, 3); 0 for points of obstacles."""
-    p, beta, gamma, h = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.empty((12, 12))
+def hessians(x, others, kind, points, offset, beta, gap, stiffness, parallel, lo, blend, out):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Hessians [N/m] of pairs lo, lo + 1, … nearer than the gap into out (n, 4, 4, 3, 3).
+
+    0 for points of obstacles. ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
+    """
+    p, g, gamma = np.empty((4, 3)), np.empty(3), np.empty((2, 4))
+    e, c, a_c = np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3))
     for n in range(len(out)):
-        e = lo + n
-        _load(x, others, points, e, p)
-        some = pair_hessian(p, kind[e], offset[e], gap, stiffness, parallel, blend, beta, gamma, h)
+        pair = lo + n
+        out[n] = 0.0
+        d = _between(x, others, kind, points, beta, pair, pair, p, g)
+        delta, b = d - offset[pair], beta[pair]
+        if not delta > 0.0:
+            continue
+        _, force, second = barrier(delta, gap)
+        force, second = stiffness * force / d, stiffness * second / (d * d)
+        first = (1.0 - blend) * force
+        along = second - first / (d * d)
+        free = _free(kind[pair], b, gamma) if first != 0.0 else 0
+        for f in range(free):
+            for k in range(3):
+                e[f, k] = 0.0
+                for i in range(4):
+                    e[f, k] += gamma[f, i] * p[i, k]
+        # A⁻¹
+        a00 = a01 = a11 = 0.0
+        if free == 1:
+            a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
+        elif free == 2:
+            u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
+            v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+            w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
+            det = u * w - v * v
+            a00, a01, a11 = w / det, -v / det, u / det
+        if free > 0:
+            c[1], a_c[1] = 0.0, 0.0
+            for i in range(4):
+                for k in range(3):
+                    for f in range(free):
+                        c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
+                    a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
+                    a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
         for i in range(4):
-            for j in range(4):
-                here = some and points[e, i] >= 0 and points[e, j] >= 0
+            for j in range(i, 4):
+                if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
+                    continue
+                both = b[i] * b[j]
                 for k in range(3):
                     for m in range(3):
-                        out[n, i, j, k, m] = h[3 * i + k, 3 * j + m] if here else 0.0
+                        value = along * both * g[k] * g[m]
+                        if k == m:
+                            value += first * both
+                        if free > 0:
+                            value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
+                        out[n, i, j, k, m] = out[n, j, i, m, k] = value
+        if kind[pair] == EDGE_EDGE:
+            _add_fading(p, b, g, gap, delta, stiffness, force, blend, parallel, out[n])
+        for i in range(4):
+            if points[pair, i] < 0:
+                out[n, i], out[n, :, i] = 0.0, 0.0
 
 
 @kernel()
@@ -543,7 +601,7 @@ def _farthest(ways):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _approach(way, others_way):  # type: ignore[no-untyped-def]
+def approach(way, others_way):  # type: ignore[no-untyped-def]
     """By how much [m] two points, one of them of a sheet, come nearer at most."""
     farthest = _farthest(way)
     return farthest + max(farthest, _farthest(others_way))
@@ -557,18 +615,18 @@ def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # t
     detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
     170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
-    approach = _approach(way, others_way)
-    return _free_way(x, others, way, others_way, approach, kind, points, offset, keep, most)
+    nearer = approach(way, others_way)
+    return _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, most)
 
 
 @kernel()
-def _free_way(x, others, way, others_way, approach, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
-    """The same; no two points come nearer by more than ``approach`` [m]."""
+def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+    """The same; no two points come nearer by more than ``nearer`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         plane = kind[e] == VERTEX_PLANE
-        if not plane and most * approach <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
+        if not plane and most * nearer <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
             continue
         _load(way, others_way, points, e, w)
         speed = _plane_speed(p, w, most) if plane else _speed(kind[e], w)
@@ -604,39 +662,45 @@ def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-
 
 
 @kernel()
-def touching(x, others, kind, points, offset, gap, stiffness, parallel, beta, normal, force):  # type: ignore[no-untyped-def]  # fmt: skip
-    """β (E, 4), unit normals (E, 3) towards the first simplex and normal forces (E,) [N] of pairs."""
-    p, gamma, slope = np.empty((4, 3)), np.empty((2, 4)), np.zeros(12)
+def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, beta, normal, force, at):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Find what touches: pairs whose distance less the offset is not below ``least`` (E,) [m].
+
+    β, unit normals towards the first simplex, normal forces [N] and numbers of pairs go to the first rows of
+    beta (E, 4), normal (E, 3), force and at (E,), as many as are returned.
+    """
+    p, g, slope, n = np.empty((4, 3)), np.empty(3), np.zeros(12), 0
     for e in range(len(kind)):
+        if least[e] >= gap:
+            continue
         _load(x, others, points, e, p)
-        d, _ = nearest(kind[e], p, beta[e], gamma)
-        delta = d - offset[e]
-        force[e] = _force(p, kind[e], delta, gap, stiffness, parallel, slope)
+        if kind[e] == VERTEX_PLANE:
+            _around_foot(p)
+        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = _weights(kind[e], p)
+        d = _between(x, others, kind, points, beta, e, n, p, g)
+        force[n] = _force(p, kind[e], d - offset[e], gap, stiffness, parallel, slope)
+        if not force[n] > 0.0:
+            continue
         for k in range(3):
-            g = 0.0
-            for i in range(4):
-                g += beta[e, i] * p[i, k]
-            normal[e, k] = g / d
+            normal[n, k] = g[k] / d
+        at[n] = e
+        n += 1
+    return n
 
 
 @kernel()
 def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
     """What `free_way` gives for each of the first len(out) pairs alone."""
-    approach = _approach(way, others_way)
+    nearer = approach(way, others_way)
     for e in range(len(out)):
         one = slice(e, e + 1)
         pair = kind[one], points[one], offset[one]
-        out[e] = _free_way(x, others, way, others_way, approach, *pair, keep, 1.0)
+        out[e] = _free_way(x, others, way, others_way, nearer, *pair, keep, 1.0)
 
 
 @kernel()
-def add_normal_forces(x, others, kind, points, offset, gap, stiffness, parallel, out):  # type: ignore[no-untyped-def]
-    """Add the size [N] of each pair's force to its vertices in out (n_local,), by their shares |β_i|."""
-    p, beta, gamma, slope = np.empty((4, 3)), np.empty(4), np.empty((2, 4)), np.zeros(12)
-    for e in range(len(kind)):
-        _load(x, others, points, e, p)
-        d, _ = nearest(kind[e], p, beta, gamma)
-        force = _force(p, kind[e], d - offset[e], gap, stiffness, parallel, slope)
+def add_normal_forces(points, beta, force, out):  # type: ignore[no-untyped-def]
+    """Add the normal force (E,) [N] of each pair to its vertices in out (n_local,), by their shares |β_i|."""
+    for e in range(len(force)):
         for i in range(4):
             if points[e, i] >= 0:
-                out[Index(points[e, i])] += force * abs(beta[i])
+                out[Index(points[e, i])] += force[e] * abs(beta[e, i])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
-from lyra_petsc.terms import contact_pairs, friction_pairs
+from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.rest import RestShape
@@ -140,17 +140,13 @@ class CoulombFriction(Elastic):
     def _renew(self, x: Array, places: Array) -> None:
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points."""
         contact, old = self._contact, self._pairs
-        n = contact.n_elements
-        beta, normal, force = np.empty((n, 4)), np.empty((n, 3)), np.empty(n)
-        pairs = contact.kind, contact.points, contact.offset, *contact.barrier[:1], *contact.barrier[2:]
-        contact_pairs.touching(x, places, *pairs, beta, normal, force)
-        met = np.flatnonzero(force > 0.0)
+        beta, normal, force, met = contact.touching(x, places)
         points, stencil = contact.points[met], contact.stencil[met]
         sheet = points >= 0
         # in this order contact's pairs are sorted
         order = [met >= contact.n_owned, contact.number[met], contact.kind[met], contact.obstacle[met]]
         key = np.column_stack([*order, np.where(sheet, 0, points)])
-        beta = np.where(sheet, beta[met], 0.0)
+        beta = np.where(sheet, beta, 0.0)
         start = np.einsum("ei,eik->ek", beta, x[stencil])
         side = beta.sum(axis=1)[:, None]  # 1 or −1 where the other side is an obstacle
         foot = np.where(np.abs(side) > 0.5, start * side, 0.0)
@@ -160,8 +156,8 @@ class CoulombFriction(Elastic):
             friction_pairs.find(key, old.key, same)
             went = same >= 0
             slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
-            slip -= np.sum(slip * normal[met], axis=1, keepdims=True) * normal[met]
-        self._pairs = Pairs(key, beta, normal[met], start, slip, foot, force[met], slid)
+            slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
+        self._pairs = Pairs(key, beta, normal, start, slip, foot, force, slid)
         self.stale = True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
@@ -174,7 +170,7 @@ class CoulombFriction(Elastic):
         values = np.column_stack([p.key[:, 5:], p.slip, p.slid]).astype(np.float64)
         return p.vertices[counted], values[counted]
 
-    def restore_elements(self, vertices: Ints, values: Array, counted: Mask) -> None:
+    def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
         vertices, what = vertices.copy(), values[:, :6].astype(np.int64)
         slip, edges, sheets = values[:, 6:9].copy(), what[:, 0] == EDGE_EDGE, what[:, 1] < 0
         # edges are named in the order of the present numbers
@@ -184,7 +180,8 @@ class CoulombFriction(Elastic):
         vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
         swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
-        key = np.column_stack([~counted, vertices, what])
+        elsewhere = (vertices[:, 0] < own.start) | (vertices[:, 0] >= own.stop)
+        key = np.column_stack([elsewhere, vertices, what])
         order = np.lexsort(key.T[::-1])
         # `take_pairs` finds the rest
         self._pairs = _no_pairs()._replace(key=key[order], slip=slip[order], slid=values[order, 9] > 0.5)

@@ -77,12 +77,17 @@ def hessians(x, stencil, beta, normal, start, slip, stiffness, limit, lo, blend,
         sticks = stiffness[e] * m <= limit[e]
         factor = stiffness[e] if sticks else limit[e] / m
         less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
-        for k in range(3):
-            for j in range(3):
-                block = factor * ((1.0 if k == j else 0.0) - normal[e, k] * normal[e, j]) - less * u[k] * u[j]
-                for a in range(4):
-                    for b in range(4):
-                        out[n, a, b, k, j] = beta[e, a] * beta[e, b] * block
+        out[n] = 0.0
+        for a in range(4):
+            for b in range(a, 4):
+                both = beta[e, a] * beta[e, b]
+                if both == 0.0:
+                    continue
+                for k in range(3):
+                    for j in range(3):
+                        same = 1.0 if k == j else 0.0
+                        block = factor * (same - normal[e, k] * normal[e, j]) - less * u[k] * u[j]
+                        out[n, a, b, k, j] = out[n, b, a, k, j] = both * block
 
 
 @kernel()

@@ -337,8 +337,8 @@ class Elastic(Term):
         """
         raise NotImplementedError
 
-    def restore_elements(self, vertices: Ints, values: Array, counted: NDArray[np.bool_]) -> None:
-        """Go on with what `element_state` gave, of elements that touch owned vertices; counted (E,)."""
+    def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
+        """Go on with what `element_state` gave, of elements that touch owned vertices ``own``."""
 
     def largest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors of owned edges turn on a way (n_owned, 3)."""

@@ -101,7 +101,8 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> No
     renamed, turned = vertices.copy(), pairs.copy()
     renamed[between] = vertices[between][:, [3, 2, 1, 0]]
     turned[between, 6:9] *= -1.0
-    term.restore_elements(renamed, turned, np.ones(len(pairs), dtype=np.bool_))
+    layout = simulation.problem.points
+    term.restore_elements(renamed, turned, range(layout.start, layout.start + layout.n_owned))
     for again, before in zip(term.element_state(), (vertices, pairs), strict=True):
         np.testing.assert_array_equal(again, before)
     slips = comm.allgather(np.linalg.norm(pairs[:, 6:9], axis=1).max(initial=0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,29 +52,50 @@ class Pairs:
         contact_pairs.distances(x, others, self.kind, self.points, out)
         return out
 
-    def energies(self, x: Array, parallel: float = NOWHERE) -> Array:
-        out = np.empty(len(self))
+    def meeting(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which of them are nearer than the gap; β and the energy of all, 0 of others."""
+        n = len(self)
         numbers = self.offset, GAP, STIFFNESS, parallel
-        contact_pairs.energies(x, self.others, self.kind, self.points, *numbers, out)
-        return out
+        found = met_of(x, self.others, self.kind, self.points, *numbers, counted=n)
+        assert (found["weight"] == 1.0).all()
+        near, beta, energy = np.zeros(n, dtype=np.bool_), np.zeros((n, 4)), np.zeros(n)
+        at = found["at"]
+        near[at], beta[at], energy[at] = True, found["beta"], found["energy"]
+        return near, beta, energy
+
+    def energies(self, x: Array, parallel: float = NOWHERE) -> Array:
+        return self.meeting(x, parallel)[2]
 
     def gradient(self, x: Array, parallel: float = NOWHERE) -> tuple[Array, Array]:
         out, pull = np.zeros_like(x), np.zeros_like(self.others)
-        numbers = self.offset, GAP, STIFFNESS, parallel
-        contact_pairs.add_gradient(x, self.others, self.kind, self.points, *numbers, out, pull)
+        near, beta, _ = self.meeting(x, parallel)
+        of = self.part(near)
+        numbers = of.offset, beta[near], GAP, STIFFNESS, parallel, np.ones(len(of))
+        contact_pairs.add_gradient(x, self.others, of.kind, of.points, *numbers, out, pull)
         return out, pull
 
     def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
         """(n, 12, 12)"""
-        out = np.empty((len(self), 4, 4, 3, 3))
-        numbers = self.offset, GAP, STIFFNESS, parallel
-        contact_pairs.hessians(self.x, self.others, self.kind, self.points, *numbers, 0, blend, out)
+        near, beta, _ = self.meeting(self.x, parallel)
+        of, out = self.part(near), np.zeros((len(self), 4, 4, 3, 3))
+        numbers, each = (of.offset, beta[near], GAP, STIFFNESS, parallel), np.empty((len(of), 4, 4, 3, 3))
+        contact_pairs.hessians(self.x, self.others, of.kind, of.points, *numbers, 0, blend, each)
+        out[near] = each
         return out.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
     def free_way(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
         pairs = self.kind[at], self.points[at], self.offset[at]
         return float(contact_pairs.free_way(self.x, self.others, way, others_way, *pairs, KEPT, most))
+
+
+def met_of(*given: Any, counted: int) -> dict[str, NDArray[Any]]:
+    """What `contact_pairs.meeting` finds, by name."""
+    n = len(given[2])
+    least, found = np.empty(n), {"at": np.empty(n, dtype=np.int64), "weight": np.empty(n)}
+    found |= {"counted": np.empty(n), "beta": np.empty((n, 4)), "energy": np.empty(n)}
+    met = contact_pairs.meeting(*given, counted, least, tuple(found.values()))
+    return {name: part[:met] for name, part in found.items()}
 
 
 def units(rng: np.random.Generator, n: int) -> Array:
@@ -324,3 +346,58 @@ def test_planes_that_turn() -> None:
             height = (pairs.x[e] + t * way[e] - point) @ normal / np.linalg.norm(normal)
             assert height > pairs.offset[e]
     assert limited > 20
+
+
+def two_layers(noise: float) -> Pairs:
+    """All pairs of two squares of 3 × 3 vertices, the vertices of one above those of the other."""
+    rng = np.random.default_rng(5)
+    flat = np.array([(i, j, 0.0) for j in range(3) for i in range(3)])
+    x = np.concatenate([flat, flat + [0.0, 0.0, 0.5]]) + noise * rng.normal(size=(18, 3))
+    corners = [(i, i + 1, i + 4) for i in (0, 1, 3, 4)] + [(i, i + 4, i + 3) for i in (0, 1, 3, 4)]
+    triangles = np.array(corners)
+    edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    upper = [[v, *t] for v in range(9, 18) for t in triangles]
+    lower = [[v, *t] for v in range(9) for t in triangles + 9]
+    across = [[*a, *b] for a in edges for b in edges + 9]
+    points = np.array(upper + lower + across)
+    kind = np.repeat([VERTEX_TRIANGLE, EDGE_EDGE], [len(upper) + len(lower), len(across)])
+    return Pairs(kind, points, x, np.zeros((0, 3)), np.zeros(len(kind)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 0.05])
+@pytest.mark.parametrize("parallel", [NOWHERE, 1e-3, 0.3])
+def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel: float) -> None:
+    pairs, gap = two_layers(noise), 0.8
+    n = len(pairs)
+    numbers = pairs.offset, gap, STIFFNESS, parallel
+
+    def summed(found: dict[str, NDArray[Any]], of: Pairs) -> tuple[float, Array, Array]:
+        constants = of.offset, found["beta"], *numbers[1:]
+        out, hessian = np.zeros_like(of.x), np.zeros((len(of.x), len(of.x), 3, 3))
+        each = np.empty((len(of), 4, 4, 3, 3))
+        contact_pairs.add_gradient(of.x, of.others, of.kind, of.points, *constants, found["weight"], out, out)
+        contact_pairs.hessians(of.x, of.others, of.kind, of.points, *constants, 0, 0.0, each)
+        at = of.points[:, :, None], of.points[:, None, :]
+        np.add.at(hessian, at, found["weight"][:, None, None, None, None] * each)
+        return float(found["weight"] @ found["energy"]), out, hessian
+
+    def meeting(of: Pairs, counted: int) -> tuple[dict[str, NDArray[Any]], Pairs]:
+        constants = of.offset, *numbers[1:]
+        found = met_of(of.x, of.others, of.kind, of.points, *constants, counted=counted)
+        at = found["at"]
+        return found, replace(of, kind=of.kind[at], points=of.points[at], offset=of.offset[at])
+
+    merged, few = meeting(pairs, n // 2)
+    energy, gradient, hessian = summed(merged, few)
+    singles = [meeting(pairs.part(slice(e, e + 1)), 1) for e in range(n)]
+    singles = [(found, of) for found, of in singles if len(of)]
+    parts = [summed(found, of) for found, of in singles]
+    assert energy == pytest.approx(sum(part[0] for part in parts), rel=1e-12)
+    for mine, theirs in ((gradient, 1), (hessian, 2)):
+        expected = np.sum([part[theirs] for part in parts], axis=0)
+        np.testing.assert_allclose(mine, expected, atol=1e-11 * np.abs(expected).max())
+    assert merged["weight"].sum() == len(singles)
+    first_half = sum(len(meeting(pairs.part(slice(e, e + 1)), 1)[1]) for e in range(n // 2))
+    assert merged["counted"].sum() == first_half
+    if noise < 0.01:
+        assert len(few) < (0.5 if parallel == NOWHERE else 0.9) * len(singles)
