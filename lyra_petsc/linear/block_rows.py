@@ -41,6 +41,15 @@ def _set_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
 
 
 @cached()
+def _add_at(source, place, values):  # type: ignore[no-untyped-def]
+    for k in range(len(place)):
+        at = place[k]
+        for i in range(3):
+            for j in range(3):
+                values[at, i, j] += source[k, i, j]
+
+
+@cached()
 def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyped-def]
     """Zero the rows and columns of prescribed coordinates; their diagonal gets its block's largest size."""
     for t in range(len(touched)):
@@ -93,6 +102,10 @@ class BlockRows:
     def scale(self, source: Array, factor: float, diagonal: Array, values: Array) -> None:
         """Let ``values`` be factor × source + ``diagonal`` (n_owned,) times the identity."""
         _scale(self.pattern.indptr, source, factor, diagonal, values)
+
+    def add_at(self, source: Array, place: NDArray[np.int64], values: Array) -> None:
+        """Add blocks (n, 3, 3) to those of ``values`` at ``place`` (n,), none of them twice."""
+        _add_at(source, place, values)
 
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""

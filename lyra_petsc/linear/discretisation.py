@@ -10,6 +10,7 @@ or of n_blocks blocks compares them with ``layout`` and ``rows``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
@@ -32,9 +33,11 @@ FEW = 0.1
 
 
 @cached()
-def _farthest(x, to, start, end, out):  # type: ignore[no-untyped-def]
-    """Squares of the farthest from start to x, from end to ``to``, from start to ``to``, from end to x."""
-    out[:] = 0.0
+def _leaves(x, to, start, end, reach):  # type: ignore[no-untyped-def]
+    """Bits: 1 where some x are farther than ``reach`` from start, 2: ``to`` from end, 4: ``to`` from start,
+    8: x from end.
+    """
+    square, found = reach * reach, 0
     for i in range(len(x)):
         s = e = m = n = 0.0
         for k in range(3):
@@ -42,9 +45,30 @@ def _farthest(x, to, start, end, out):  # type: ignore[no-untyped-def]
             e += (to[i, k] - end[i, k]) ** 2
             m += (to[i, k] - start[i, k]) ** 2
             n += (x[i, k] - end[i, k]) ** 2
-        for k, square in enumerate((s, e, m, n)):
-            if not square <= out[k]:  # or no number
-                out[k] = square
+        # or no number
+        found |= (0 if s <= square else 1) | (0 if e <= square else 2)
+        found |= (0 if m <= square else 4) | (0 if n <= square else 8)
+        if found == 15:
+            break
+    return found
+
+
+@cached()
+def _free_part(x, way, origin, reach):  # type: ignore[no-untyped-def]
+    """Fraction, up to 1, of ways (n, 3) that points x (n, 3) go until one is ``reach`` from its origin."""
+    least = 1.0
+    for i in range(len(x)):
+        square = mixed = gone = 0.0
+        for k in range(3):
+            off = x[i, k] - origin[i, k]
+            square, mixed, gone = square + way[i, k] ** 2, mixed + off * way[i, k], gone + off * off
+        # |gone + f way| = reach
+        left = max(reach * reach - gone, 0.0)
+        if square > left or 2.0 * mixed + square > left:
+            root = math.sqrt(mixed * mixed + square * left)
+            fraction = left / (mixed + root) if mixed > 0.0 else (root - mixed) / square
+            least = min(least, fraction)
+    return least
 
 
 class Discretisation:
@@ -79,7 +103,7 @@ class Discretisation:
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
         self.place: Ints | None = None
-        self._rows_of: Layout | None = None  # that ``rows`` were made for, with changing stencils
+        self._rows_of = layout  # that ``rows`` were made for
         self._located = False  # whether the pattern has the offsets of the present stencils
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
@@ -136,7 +160,7 @@ class Discretisation:
         if self._way is not None:
             reach = 0.5 * min([term.skin for term in self._searching], default=np.inf)
             # all are at one and the same part of the way that was searched
-            from_start, from_end, along, back = self._from_way(here, to) > reach**2
+            from_start, from_end, along, back = self._from_way(here, to, reach)
             flags = [from_start or along, from_end or back, from_start or from_end]
         stale = [term.stale for term in self._changing]
         found = np.array([*flags, *stale], dtype=np.int64)
@@ -148,12 +172,13 @@ class Discretisation:
             return [*self._searching, *(term for term in self._changing if term not in self._searching)]
         return [*(self._searching if searches else []), *(t for t in told if t not in self._searching)]
 
-    def _from_way(self, x: Array, to: Array) -> Array:
-        """What `_farthest` finds on this rank of a way from x to ``to``; infinite where it is no number."""
+    def _from_way(self, x: Array, to: Array, reach: float) -> list[bool]:
+        """Whether points of this rank on a way from x to ``to`` are farther than ``reach`` [m] from the
+        way that was searched: x from its start, ``to`` from its end, ``to`` from its start, x from its end.
+        """
         assert self._way is not None
-        out = np.empty(4)
-        _farthest(x, to, *self._way, out)
-        return np.where(np.isnan(out), np.inf, out)
+        bits = _leaves(x, to, *self._way, reach)
+        return [bool(bits & bit) for bit in (1, 2, 4, 8)]
 
     @property
     def guards(self) -> bool:
@@ -170,20 +195,13 @@ class Discretisation:
         reach = 0.5 * min(term.unseen for term in self._searching)
         x, way = x[:n], way[:n]
         start, end = self._way
-        from_start, from_end, _, back = self._from_way(x, x + way) > reach**2
+        from_start, from_end, _, back = self._from_way(x, x + way, reach)
         flags = np.array([back, from_start or from_end], dtype=np.int64)
         self.layout.comm.Allreduce(MPI.IN_PLACE, flags, MPI.MAX)
         at_start, apart = flags
         if at_start and not apart:
             return 1.0
-        gone = x - (start if at_start else end)
-        # |gone + f way| = reach
-        square, mixed = np.einsum("ij,ij->i", way, way), np.einsum("ij,ij->i", gone, way)
-        left = np.maximum(reach**2 - np.einsum("ij,ij->i", gone, gone), 0.0)
-        root = np.sqrt(mixed**2 + square * left)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            fraction = np.where(mixed > 0.0, left / (mixed + root), (root - mixed) / square)
-        least = float(np.nanmin(np.where(square > 0.0, fraction, 1.0), initial=1.0))
+        least = float(_free_part(x, way, start if at_start else end, reach))
         return float(self.layout.comm.allreduce(least, MPI.MIN))
 
     def _search(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints]:

@@ -133,7 +133,7 @@ class Damping:
         else:
             rows.set_diagonal(diagonal, values)
             if self.acts and place is not None:
-                values[place] += self._own()
+                rows.add_at(self._own(), place, values)
 
     def with_stiffness_into(
         self, x: Array, weight: float, diagonal: Array, values: Array, changing: NDArray[np.int64]

@@ -22,10 +22,10 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact_search import SheetSearch, Simplices
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
@@ -167,17 +167,18 @@ class ContactBarrier(Elastic):
     ----------
     surface : (F, 3)
         Triangles of this rank, in local rows.
+    uv : (F, 3, 2)
+        Material coordinates [m] of their corners.
     """
 
-    def __init__(self, surface: NDArray[np.int32]) -> None:
+    def __init__(self, surface: NDArray[np.int32], uv: Array) -> None:
         empty = {"what": np.empty((0, 6)), "number": np.empty((0, 4))}
         self.obstacles, self.itself = Obstacles([]), True
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
         self._places = np.empty((2, 0, 3))
-        none = np.empty((0, 1), dtype=np.int64)
-        self._simplices = none, none, none  # vertices, edges and triangles of the last search
+        self._sheets = SheetSearch(surface.astype(np.int64), uv)
         self._meeting = Remembered(self._meet)
 
     def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
@@ -220,33 +221,16 @@ class ContactBarrier(Elastic):
 
     def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         self._places = self._swept
-        if not np.array_equal(triangles, self._simplices[2]):
-            self._simplices = np.unique(triangles)[:, None], unique_edges(triangles), triangles
-        vertices, edges, triangles = self._simplices
-        edges = np.where((numbers[edges[:, 0]] < numbers[edges[:, 1]])[:, None], edges, edges[:, ::-1])
-        sheets = [(of, swept_boxes(x, way, of)) for of in (vertices, edges, triangles)]
-        found = [np.empty((0, 6), dtype=np.int64)]
+        self._sheets.take(x, numbers, triangles)
+        found = [np.empty((0, 6), dtype=np.int64), *self._at_obstacles(x, way)]
         if self.itself:
-            found += self._among_sheets(x, way, numbers, sheets)
-        found += self._at_obstacles(x, way, sheets)
+            found.append(self._sheets.pairs(x, way, numbers, self.search_distance))
         every = np.concatenate(found)
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:]
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
         what = np.column_stack([kind, obstacle, np.where(sheet, 0, points)])
         return np.where(sheet, points, first[:, None]), what
-
-    def _among_sheets(self, x: Array, way: Array, numbers: Ints, sheets: Sequence[Swept]) -> list[Ints]:
-        (vertices, at), (edges, along), (triangles, over) = sheets
-        reach = self.search_distance
-        met = near(at, over, reach=reach, corners=vertices, other_corners=triangles)
-        to_triangles = np.concatenate([vertices[met[:, 0]], triangles[met[:, 1]]], axis=1)
-        met = near(along, reach=reach, corners=edges)
-        to_edges = edges[met].reshape(len(met), 4)
-        nearer = self._nearer(x, way, EDGE_EDGE, np.full(len(to_edges), -1), to_edges)
-        swapped = numbers[nearer[:, 2]] > numbers[nearer[:, 4]]
-        nearer[swapped, 2:] = nearer[swapped][:, [4, 5, 2, 3]]
-        return [self._nearer(x, way, VERTEX_TRIANGLE, np.full(len(to_triangles), -1), to_triangles), nearer]
 
     def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints) -> Ints:
         """Rows of those pairs that may come within the search distance on their ways."""
@@ -257,26 +241,27 @@ class ContactBarrier(Elastic):
         contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
         return np.column_stack([kinds, obstacle, points])[found < reach]
 
-    def _at_obstacles(self, x: Array, way: Array, sheets: Sequence[Swept]) -> list[Ints]:
+    def _at_obstacles(self, x: Array, way: Array) -> list[Ints]:
         """Pairs with obstacles, wherever on their way in the step these are near."""
-        of, found = self.obstacles, []
-        vertices, edges, triangles = sheets
+        of, sheets, found = self.obstacles, self._sheets, []
+        patches = sheets.boxes(x, way)
 
-        def meet(kind: int, sheet: Swept, others: Ints, size: int, *, sheet_first: bool) -> None:
+        def meet(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
             if not len(others):
                 return
             places = self._places[:, others[:, :size]]
             reach = (self.search_distance + of.radius[others[:, 3]])[:, None]
             boxes = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
-            pairs = near(sheet[1], boxes)
-            mine, theirs = sheet[0][pairs[:, 0]], ~others[pairs[:, 1], :size]
+            corners = sheet.of(np.unique(near(patches, boxes)[:, 0]))
+            pairs = near(swept_boxes(x, way, corners), boxes)
+            mine, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
             found.append(self._nearer(x, way, kind, others[pairs[:, 1], 3], points))
 
-        meet(VERTEX_TRIANGLE, vertices, of.triangles, 3, sheet_first=True)
-        meet(VERTEX_TRIANGLE, triangles, of.points, 1, sheet_first=False)
-        meet(EDGE_EDGE, edges, of.edges, 2, sheet_first=True)
-        single = vertices[0][:, 0]
+        meet(VERTEX_TRIANGLE, sheets.vertices, of.triangles, 3, sheet_first=True)
+        meet(VERTEX_TRIANGLE, sheets.triangles, of.points, 1, sheet_first=False)
+        meet(EDGE_EDGE, sheets.edges, of.edges, 2, sheet_first=True)
+        single = sheets.vertices.corners[:, 0]
         for kind, others in ((VERTEX_PLANE, of.planes), (VERTEX_INSIDE, of.segments)):
             for one in others:
                 points = np.column_stack([single, np.tile(~one[:3], (len(single), 1))])
@@ -424,7 +409,7 @@ def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array
 
 def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets."""
-    return Elements(rest.mesh.triangles)
+    return Elements(rest.mesh.triangles, {"uv": rest.mesh.triangle_uv.reshape(-1, 6)})
 
 
 def barrier(rest: RestShape) -> Barrier:
@@ -454,4 +439,4 @@ def barrier(rest: RestShape) -> Barrier:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must follow."""
-    return ContactBarrier(elements.stencil.astype(np.int32))
+    return ContactBarrier(elements.stencil.astype(np.int32), elements.data["uv"].reshape(-1, 3, 2))

@@ -204,7 +204,7 @@ def _free(kind, beta, gamma):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _at_least(p, kind):  # type: ignore[no-untyped-def]
+def at_least(p, kind):  # type: ignore[no-untyped-def]
     """What the distance of a pair at p (4, 3) is not below: that of the boxes around both; −∞ of others
     than simplices.
     """
@@ -337,7 +337,7 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, n_counted
     alike = np.empty((len(kind), 3), dtype=np.int64)  # nearest vertex and edge, or a second vertex twice
     for e in range(len(kind)):
         _load(x, others, points, e, p)
-        least[e] = _at_least(p, kind[e]) - offset[e]
+        least[e] = at_least(p, kind[e]) - offset[e]
         if least[e] >= gap:
             continue
         behind = kind[e] == VERTEX_INSIDE
@@ -528,7 +528,7 @@ def hessians(x, others, kind, points, offset, beta, gap, stiffness, parallel, lo
 
 
 @kernel()
-def _speed(kind, w):  # type: ignore[no-untyped-def]
+def speed(kind, w):  # type: ignore[no-untyped-def]
     """How much the distance of a pair changes at most on the ways w (4, 3) [m], without what is common."""
     longest = np.zeros(4)
     for k in range(3):
@@ -578,15 +578,15 @@ def approaches(x, others, way, others_way, kind, points, reach, out):  # type: i
         _load(x, others, points, e, p)
         _load(way, others_way, points, e, w)
         if points[e].min() >= 0:
-            speed = _speed(kind[e], w)
+            nearer = speed(kind[e], w)
         else:
             begins = 2 if kind[e] == EDGE_EDGE else 1
-            speed = _longest(w, 0, begins) + _longest(w, begins, 4)
-        out[e] = _at_least(p, kind[e]) - speed
+            nearer = _longest(w, 0, begins) + _longest(w, begins, 4)
+        out[e] = at_least(p, kind[e]) - nearer
         if out[e] >= reach[e]:
             continue
         d = distance(kind[e], p)
-        out[e] = d - speed
+        out[e] = d - nearer
 
 
 @kernel()
@@ -626,20 +626,20 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, mo
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         plane = kind[e] == VERTEX_PLANE
-        if not plane and most * nearer <= (1.0 - keep) * (_at_least(p, kind[e]) - offset[e]):
+        if not plane and most * nearer <= (1.0 - keep) * (at_least(p, kind[e]) - offset[e]):
             continue
         _load(way, others_way, points, e, w)
-        speed = _plane_speed(p, w, most) if plane else _speed(kind[e], w)
+        pace = _plane_speed(p, w, most) if plane else speed(kind[e], w)
         d = distance(kind[e], p)
         left = d - offset[e]
-        if left - most * speed >= keep * left or speed == 0.0:
+        if left - most * pace >= keep * left or pace == 0.0:
             continue
-        if not speed < math.inf:
+        if not pace < math.inf:
             return 0.0
         least, enough, t = keep * left, (1.0 - keep) * CLOSE * left, 0.0
         # each advance is shorter than what is left of the way to the least distance
         while left - least > enough:
-            t += (left - least) / speed
+            t += (left - least) / pace
             if t >= most:
                 break
             _load(x, others, points, e, p)

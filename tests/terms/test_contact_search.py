@@ -1,0 +1,151 @@
+"""The search for near simplices of sheets against a comparison of all with all."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
+from lyra_petsc.terms.contact_search import SheetSearch
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+REACH = 0.4
+"""Of an edge of the grid."""
+
+
+def grid(n: int, m: int) -> tuple[Array, Ints]:
+    """Points (V, 2) and triangles of n × m unit cells."""
+    uv = np.array([(i, j) for j in range(m + 1) for i in range(n + 1)], dtype=np.float64)
+    first = [i + j * (n + 1) for j in range(m) for i in range(n)]
+    triangles = [(v, v + 1, v + n + 2) for v in first] + [(v, v + n + 2, v + n + 1) for v in first]
+    return uv, np.array(triangles)
+
+
+def sheet(name: str) -> tuple[Ints, Array]:
+    """Triangles (F, 3) and the material coordinates (F, 3, 2) of their corners."""
+    uv, triangles = grid(9, 6)
+    if name == "jittered":
+        within = ((uv > 0.0) & (uv < uv.max(axis=0))).all(axis=1)
+        uv = uv + 0.15 * within[:, None] * np.random.default_rng(2).uniform(-1.0, 1.0, uv.shape)
+    elif name == "slit":
+        # the cells right of x = 5 have vertices of their own there, but for the lowest rows
+        at = np.flatnonzero((uv[:, 0] == 5.0) & (uv[:, 1] > 2.0))
+        right = uv[triangles].mean(axis=1)[:, 0] > 5.0
+        new = np.arange(len(uv))
+        new[at] = len(uv) + np.arange(len(at))
+        triangles = np.where(right[:, None], new[triangles], triangles)
+        uv = np.concatenate([uv, uv[at]])
+    elif name == "two layers":
+        triangles = np.concatenate([triangles, triangles + len(uv)])
+        uv = np.concatenate([uv, uv])
+    elif name == "spiral":
+        # a ring gone round one and a half times: its ends lie over each other in the plane
+        angle, radius = uv[:, 0] * np.pi / 3.0, 4.0 + 0.5 * uv[:, 1]
+        uv = np.column_stack([radius * np.sin(angle), radius * np.cos(angle)])
+    corners = uv[triangles]
+    if name == "seams":
+        corners = corners + np.arange(len(triangles))[:, None, None] % 2
+    return triangles, corners
+
+
+SHEETS = ["plain", "jittered", "slit", "two layers", "spiral", "seams"]
+
+
+def moved(name: str, corners: Array, triangles: Ints, rng: np.random.Generator) -> Array:
+    """Positions (V, 3) of the vertices."""
+    uv = np.zeros((triangles.max() + 1, 2))
+    uv[triangles.ravel()] = corners.reshape(-1, 2)
+    x, y = uv.T
+    if name == "flat":
+        out = np.column_stack([x, y, 0.0 * x])
+    elif name == "rolled":
+        out = np.column_stack([np.sin(x / 1.2) * (1.2 + 0.02 * x), y, np.cos(x / 1.2) * (1.2 + 0.02 * x)])
+    elif name == "folded":
+        out = np.column_stack([np.abs(x - 4.3), y, 0.15 * np.sign(x - 4.3)])
+    elif name == "sheared":
+        out = np.column_stack([1.1 * x + 0.4 * y, 0.8 * y, 0.3 * np.sin(0.5 * x)])
+    else:
+        out = np.column_stack([x, y, 0.0 * x]) + rng.normal(size=(len(x), 3))
+    # vertices apart, as those of a slit or of layers
+    return out + np.array([0.0, 0.0, 1e-3]) * np.arange(len(out))[:, None] / len(out)
+
+
+def brute(x: Array, way: Array, triangles: Ints) -> tuple[set[tuple[int, ...]], set[tuple[int, ...]]]:
+    """All pairs without common vertices, and those that are within `REACH` somewhere on their ways."""
+    edges = np.unique(np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    v, t = (each.ravel() for each in np.indices((len(x), len(triangles))))
+    rows = np.column_stack([v, triangles[t]])
+    rows = rows[(rows[:, :1] != rows[:, 1:]).all(axis=1)]
+    a, b = np.array(list(itertools.combinations(range(len(edges)), 2))).T
+    across = np.concatenate([edges[a], edges[b]], axis=1)
+    across = across[(across[:, :2, None] != across[:, None, 2:]).all(axis=(1, 2))]
+    points = np.concatenate([rows, across])
+    kind = np.repeat([VERTEX_TRIANGLE, EDGE_EDGE], [len(rows), len(across)])
+    out, least = np.empty(len(points)), np.full(len(points), np.inf)
+    for part in np.linspace(0.0, 1.0, 5):
+        distances(x + part * way, np.empty((0, 3)), kind, points, out)
+        least = np.minimum(least, out)
+    named = [name(k, p) for k, p in zip(kind.tolist(), points.tolist(), strict=True)]
+    near = least < REACH
+    return set(named), {row for row, found in zip(named, near, strict=True) if found}
+
+
+def name(kind: int, points: list[int]) -> tuple[int, ...]:
+    if kind == EDGE_EDGE:
+        one, other = sorted([tuple(sorted(points[:2])), tuple(sorted(points[2:]))])
+        return kind, *one, *other
+    return kind, points[0], *sorted(points[1:])
+
+
+@pytest.mark.parametrize("how", ["flat", "rolled", "folded", "sheared", "crumpled"])
+@pytest.mark.parametrize("which", SHEETS)
+def test_no_pair_that_comes_near_is_missed(which: str, how: str) -> None:
+    rng = np.random.default_rng(3)
+    triangles, corners = sheet(which)
+    x = moved(how, corners, triangles, rng)
+    search, numbers = SheetSearch(triangles, corners), np.arange(len(x))
+    for way in (np.zeros_like(x), np.array([3.0, 1.0, 2.0]) + 0.1 * rng.normal(size=x.shape)):
+        every, near = brute(x, way, triangles)
+        search.take(x, numbers, triangles)
+        rows = search.pairs(x, way, numbers, REACH)
+        found = [name(row[0], row[2:]) for row in rows.tolist()]
+        assert len(found) == len(set(found)), "pairs are named once"
+        assert near <= set(found) <= every
+        assert (rows[:, 1] == -1).all()
+
+
+def test_triangles_of_other_ranks_are_compared_one_by_one() -> None:
+    triangles, corners = sheet("two layers")
+    x = moved("folded", corners, triangles, np.random.default_rng(0))
+    own = len(triangles) // 2
+    search, numbers = SheetSearch(triangles[:own], corners[:own]), np.arange(len(x))
+    search.take(x, numbers, triangles)
+    rows = search.pairs(x, np.zeros_like(x), numbers, REACH)
+    _, near = brute(x, np.zeros_like(x), triangles)
+    assert near <= {name(row[0], row[2:]) for row in rows.tolist()}
+
+
+def test_a_rank_without_triangles_finds_nothing() -> None:
+    none = np.empty((0, 3), dtype=np.int64)
+    search = SheetSearch(none, np.empty((0, 3, 2)))
+    search.take(np.zeros((4, 3)), np.arange(4), none)
+    assert len(search.pairs(np.zeros((4, 3)), np.ones((4, 3)), np.arange(4), REACH)) == 0
+
+
+@pytest.mark.parametrize("which", ["plain", "jittered"])
+def test_parts_of_a_sheet_that_hardly_bends_are_not_compared(which: str) -> None:
+    triangles, corners = sheet(which)
+    x = moved("flat", corners, triangles, np.random.default_rng(0))
+    turned = x @ np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    search = SheetSearch(triangles, corners)
+    search.take(x, np.arange(len(x)), triangles)
+    n = len(search.triangles.first) - 1
+    alone = np.repeat(np.arange(n)[:, None], 2, axis=1)
+    apart = search.apart(turned, 0.02 * x, alone, 0.1)
+    assert apart.all()
+    assert not search.apart(np.random.default_rng(1).normal(size=x.shape), 0.0 * x, alone, 0.1).any()
