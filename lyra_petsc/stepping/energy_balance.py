@@ -210,9 +210,9 @@ class Ledger:
     def handle_forces(self, count: int) -> list[Array]:
         """Total force [N] of each of a scene's ``count`` handles in the last step; collective."""
         system = self._system
-        local, reaction = np.zeros((count, 3)), self.reaction
-        for number in system.held.active(system.t0, system.t1):
-            local[number] = reaction[system.held.vertices(number)].sum(axis=0)
+        local = np.zeros((count, 3))
+        for number, forces, _ in system.held.shares(system.t0, system.t1, self.reaction):
+            local[number] = forces.sum(axis=0)
         for term in system.active.elastic:
             if isinstance(term, Pulling):
                 local += term.handle_forces(system.x, system.active.frozen[term], count)
@@ -234,19 +234,21 @@ class Ledger:
 
     def handle_moments(self) -> dict[int, Array]:
         """Moment [N·m] in the last step of each handle that holds slopes, about its mean; collective."""
-        system, reaction, x = self._system, self.reaction, self._system.stage_positions
+        system, x = self._system, self._system.stage_positions
         edges, numbers = system.held.edges, system.held.with_slopes
         if edges is None:
             return {}
-        frames, active = system.active.frozen[edges.term], system.held.active(system.t0, system.t1)
+        frames = system.active.frozen[edges.term]
         local = np.zeros((len(numbers), 10))  # moment about the origin, force, positions, count
         for row, number in zip(local, numbers, strict=True):
             mine = system.held.vertices(number)
             row[6:9], row[9] = x[mine].sum(axis=0), len(mine)
-            if number in active:
-                row[:3] = np.cross(x[mine], reaction[mine]).sum(axis=0)
-                row[:3] += edges.moment(number, reaction.ravel(), x, frames)
-                row[3:6] = reaction[mine].sum(axis=0)
+        for number, forces, turning in system.held.shares(system.t0, system.t1, self.reaction):
+            if number in numbers:
+                row = local[numbers.index(number)]
+                row[:3] = np.cross(x[system.held.vertices(number)], forces).sum(axis=0)
+                row[:3] += edges.moment(number, turning, x, frames)
+                row[3:6] = forces.sum(axis=0)
         total = np.empty_like(local)
         system.points.comm.Allreduce(local, total)
         moments = total[:, :3] - np.cross(total[:, 6:9] / total[:, 9:], total[:, 3:6])

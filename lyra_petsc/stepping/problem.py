@@ -332,6 +332,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     system.x[rows] = data.get("start", data["position"])
     system.v[rows] = data.get("velocity", 0.0)
     system.state.update_ghosts()
+    system.stage_positions[:] = system.x
     for term in system.active.elastic:
         term.begin(system.x)
     system.rest_at(0.0)

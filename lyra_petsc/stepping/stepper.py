@@ -101,7 +101,7 @@ class Stepper:
         static = scene.time.scheme == "static"
         expected = 0.0 if static else expected_iterations(equations, step)
         self.presets = presets.candidates(
-            points.n_global,
+            points.n_vertices_global if static else points.n_global,  # edges hardly add to the factors
             points.comm.size,
             static=static,
             newton=self._iterates,

@@ -148,12 +148,12 @@ class ClampedEdges:
     def moment(self, number: int, reaction: Array, x: Array, frames: Frames) -> Array:
         """Moment (3,) [N·m] of a handle on its edges of this rank beside that of the forces at their ends.
 
-        ``reaction`` (n,) [N] is the force on all owned unknowns at positions x (n_local, 3) [m].
+        ``reaction`` (n,) [N] is the force on their unknowns at positions x (n_local, 3) [m].
         """
         each = self._handles.get(number)
         if each is None:
             return np.zeros(3)
-        return self.term.moment(reaction[each.places], each.edges, x, frames)
+        return self.term.moment(reaction, each.edges, x, frames)
 
     def _plane(self, each: _Handle, at: float, reference: Callable[[float, Ints], Array]) -> _Plane:
         rows, start = each.stencil, each.window.start

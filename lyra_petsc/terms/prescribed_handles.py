@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
@@ -130,6 +130,22 @@ class Held:
             if self.edges is not None:
                 mask.ravel()[self.edges.places(number)] = True
         return mask
+
+    def shares(self, t0: float, t1: float, reaction: Array) -> Iterator[tuple[int, Array, Array]]:
+        """What each handle of the step bears of the forces (n_owned, 3) [N] on prescribed unknowns.
+
+        Those on its vertices (n, 3) and on the edges that it clamps (m,); what two hold the later one bears.
+        """
+        left = reaction.copy()
+        for number in reversed(self.active(t0, t1)):
+            forces = np.zeros((len(self.vertices(number)), 3))
+            if number in self._places:
+                forces[:, self._axes[number]] = left[self._places[number]]
+                left[self._places[number]] = 0.0
+            edges = self.edges.places(number) if self.edges is not None else np.empty(0, dtype=np.int64)
+            turning = left.ravel()[edges]
+            left.ravel()[edges] = 0.0
+            yield number, forces, turning
 
     def targets(self, t0: float, t1: float, at: float, reference: Reference, out: Array) -> None:
         """Write the positions [m] prescribed at time ``at`` of the step t0..t1 over ``out`` (n_owned, 3).

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
+from lyra_petsc.linear import presets
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
@@ -181,3 +182,15 @@ def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> N
         assert re.search(words, tried[-1].words)
         assert sum(each.newton_iterations for each in tried) < 2500  # it took 36,780
         assert np.array_equal(shape(simulation), start)
+
+
+def test_directors_do_not_make_a_sheet_too_large_to_be_factored(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The limit is a number of vertices; multigrid finds equilibria of stiff shells slowly or not at all."""
+    monkeypatch.setattr(presets, "DIRECT_UNTIL", 60)
+    material = SHEET["material"] | {"bending_model": "midedge"}
+    with motion(comm, material=material, time={"analysis": "static"}) as simulation:
+        points = simulation.problem.points
+        assert points.n_vertices_global < 60 < points.n_global
+        assert simulation.stepper.presets[0] == "direct"

@@ -631,8 +631,8 @@ CANTILEVER = {
 }
 
 
-def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path) -> dict[str, float]:
-    """The last row of reactions.csv."""
+def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path, row: int = -1) -> dict[str, float]:
+    """A row of reactions.csv, by default the last."""
     simulation = Run(comm, scene_of(scene))
     recorder = Recorder(simulation)
     if comm.rank == 0:
@@ -645,7 +645,26 @@ def reactions(comm: MPI.Comm, scene: dict[str, Any], folder: Path) -> dict[str, 
     recorder.close()
     simulation.destroy()
     lines = (folder / "reactions.csv").read_text().splitlines()
-    return dict(zip(lines[0].split(","), map(float, lines[-1].split(",")), strict=True))
+    return dict(zip(lines[0].split(","), map(float, lines[row].split(",")), strict=True))
+
+
+@pytest.mark.parallel
+def test_before_the_first_step_a_clamp_has_no_moment(comm: MPI.Comm, shared_tmp: Path) -> None:
+    scene = CANTILEVER | {"handles": [{"group": "left", "clamp": True}]}
+    found = reactions(comm, scene, shared_tmp / "run", row=1)
+    np.testing.assert_allclose([found[f"handle0_m{axis}"] for axis in "xyz"], 0.0, atol=1e-9)
+
+
+@pytest.mark.parallel
+def test_what_two_handles_hold_one_of_them_bears(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """A clamp in a plane of symmetry, whose corner both hold: the clamp bears the weight, the plane nothing
+    within itself.
+    """
+    handles = [{"group": "bottom", "symmetry": "y"}, {"group": "left", "clamp": True}]
+    scene = CANTILEVER | {"handles": handles, "gravity": [0, 0, -0.1]}
+    found = reactions(comm, scene, shared_tmp / "run")
+    assert found["handle0_x"] == found["handle0_z"] == 0.0
+    assert found["handle1_z"] == pytest.approx(0.1 * 0.6 * 0.2, rel=1e-6)
 
 
 @pytest.mark.parallel

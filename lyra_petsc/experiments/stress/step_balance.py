@@ -440,10 +440,12 @@ class StageAccountant(Accountant):
         n, dt = system.points.n_owned, report.dt
         self._fit()
         x0, x1 = self._x, system.x
-        # targets that move stand where the step ends by now
-        self._prepare(system.t0 + system.stage.after)
+        # targets that move stand where the step ends by now; damping is right in the frames of the step
+        system.active.turn_targets(self._at(system.t0 + system.stage.after))
         parts = system.forces_at_stage()
-        self._prepare(system.t1)
+        ended = self._at(system.t1)
+        frozen = {term: term.freeze(ended) for term in system.active.elastic}
+        system.active.frozen = system.active.frozen | frozen
         total = np.asarray(sum(parts.values()))
         gap = total - self._simulation.ledger.reaction
         if not any(_in_space(term) for term in self._shell):
@@ -454,7 +456,7 @@ class StageAccountant(Accountant):
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
             float(np.sum((x1 - x0)[:n] ** 2)),
-            *gap.sum(axis=0),
+            *gap[: system.points.n_vertices].sum(axis=0),
         ).tolist()
         reach = largest(comm, x1)
         left = self._left(parts, reach, dt)
@@ -473,11 +475,10 @@ class StageAccountant(Accountant):
             **left,
         )
 
-    def _prepare(self, at: float) -> None:
-        """Let moving targets stand where they are at time ``at`` [s] of the step."""
+    def _at(self, time: float) -> UpcomingStep:
+        """The step, as terms see it at a time [s] of it."""
         system = self._system
-        step = UpcomingStep(system.t0, system.t1, at, system.x, system.reference.at)
-        system.active.frozen |= {term: term.freeze(step) for term in system.active.elastic}
+        return UpcomingStep(system.t0, system.t1, time, system.x, system.reference.at)
 
 
 @dataclass

@@ -17,6 +17,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     StressCase,
     as_it_is,
     blow,
+    by_directors,
     damp,
     sheet,
 )
@@ -185,6 +186,18 @@ def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: st
     assert {"equations", "resolved", "energy", "momentum"} < set(outcome.verdicts)
     assert "no gain" not in outcome.verdicts
     assert all(balance.moved > 1e3 * balance.tolerance for balance in outcome.record.balances)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
+def test_stages_with_directors_are_balanced(comm: MPI.Comm, integrator: str) -> None:
+    """Clamped, damped and turning fast: forces are in balance in the frames of the step."""
+    turn = [{"time": 0.0}, {"time": 0.04, "rotate": {"axis": [1, 0, 0], "degrees": 120}}]
+    handles = [{"group": "bottom", "clamp": True, "motion": "turn"}]
+    content = by_directors(blow(sheet(CELLS), 3.0)) | {"handles": handles, "motions": {"turn": turn}}
+    content["time"]["integrator"] = integrator
+    case = StressCase("a", "b", as_it_is, steps=4)
+    assert run_case(comm, case, Setting(content, True, Scope.QUICK)).failures == {}
 
 
 @pytest.mark.parametrize(("term", "factor"), [(Membrane, 1.001), (Bending, 1.01)])

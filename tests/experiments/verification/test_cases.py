@@ -18,7 +18,7 @@ SOME = (
 LONG = (
     "plate", "plate-vibration", "column", "post-buckling", "lateral-buckling", "elastica-tip",
     "elastica-weight", "elastica-roll-up", "elastica-overhang", "slit-annulus", "sze-end-moment",
-    "pinched-cylinder", "incline", "rest", "capstan", "collision", "ruck",
+    "pinched-cylinder", "open-cylinder", "hinged-roof", "incline", "rest", "capstan", "collision", "ruck",
     "pole", "table-edge", "cusick",
 )  # fmt: skip
 """Cases whose finest resolutions take minutes."""

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.stress.cases.shapes_and_handles import spinning
 from lyra_petsc.experiments.stress.stress_scenes import (
+    FULL,
     QUICK,
     STEP,
     Content,
     Setting,
     StressCase,
+    blow,
     by_directors,
     changed,
     family,
@@ -53,12 +56,23 @@ def _folded(x: Array, spacing: float) -> Array:
     return y
 
 
-def _strip(setting: Setting, bench: Bench, frames: list[dict[str, Any]], stiffer: bool) -> Content:
+def _spun(setting: Setting, bench: Bench) -> Content:
+    return by_directors(spinning(setting, bench))
+
+
+def _strip(
+    setting: Setting,
+    bench: Bench,
+    frames: list[dict[str, Any]],
+    stiffer: bool,
+    integrator: str = "beuler",
+) -> Content:
     """A strip of the base scene's sheet, or a stiffer one, clamped at both ends, one of which moves."""
     content = by_directors(setting.content())
     if stiffer:
         content = scale(content, stretching=8.0, bending=10.0)
     content["mesh"] = grid(1.0, 0.3, 40, 12, "alternating") | {"transform": {"translate": [0.0, -0.15, 0.0]}}
+    content["time"] = {**content["time"], "integrator": integrator}
     content["handles"] = [{"group": "right", "clamp": True}]
     content = move(content, frames)
     content["handles"].append({"group": "left", "clamp": True})
@@ -97,6 +111,8 @@ directors = family(
         for ms in (5, 40)
     ),
     StressCase("directors-bending-1e6", "bending × 1e6", partial(_changed, scale, bending=1e6)),
+    StressCase("directors-wind-200", "wind 200 m/s", partial(_changed, blow, speed=200.0)),
+    StressCase("directors-spin", "handles turn ten times a second", _spun, steps=FEW, level=FULL),
     StressCase("directors-folded", "a crease of 179°, no handle", partial(_changed, release), shape=_folded),
     StressCase(
         "directors-twist", "a stiff strip twisted by 720°", steps=STEPS, own=True,
@@ -105,6 +121,10 @@ directors = family(
     StressCase(
         "directors-twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", steps=FEW, step=LONG, own=True,
         scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False),
+    ),
+    StressCase(
+        "directors-twist-bdf2", "the same with bdf2", steps=FEW, step=LONG, own=True,
+        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False, integrator="bdf2"),
     ),
     StressCase(
         "directors-crush", "a stiff strip crushed to 2 %", steps=STEPS, own=True,

@@ -166,7 +166,7 @@ def _jump(setting: Setting, bench: Bench) -> Content:
     return move(setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}])
 
 
-def _spin(setting: Setting, bench: Bench) -> Content:
+def spinning(setting: Setting, bench: Bench) -> Content:
     quarters = int(4.0 * TURNS * STEPS * setting.step) + 2
     turn = [
         {"time": k / (4.0 * TURNS), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
@@ -188,7 +188,7 @@ handles = family(
     "handles",
     "handles that jump, spin, squeeze and stretch",
     StressCase("jump", "handles jump by a quarter of the sheet in one step", _jump, level=QUICK),
-    StressCase("spin", "handles turn ten times a second", _spin, steps=STEPS),
+    StressCase("spin", "handles turn ten times a second", spinning, steps=STEPS),
     StressCase("squeeze", "handles come together to a tenth", partial(_pull, to=0.1), steps=STEPS),
     StressCase("stretch", "handles go apart threefold", partial(_pull, to=3.0), steps=STEPS, level=QUICK),
 )

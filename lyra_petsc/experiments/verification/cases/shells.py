@@ -107,6 +107,15 @@ def sze_end_moment(bench: Bench, n: float) -> Sequence[Measured]:
     return [*found, Measured("−U at full load", float(tip[0]), length, "m")]
 
 
+def _line_load(ends: Sequence[int], force: Array) -> list[dict[str, Any]]:
+    """The loads of a force [N] that is spread evenly over a line of vertices."""
+    part = force / (len(ends) - 1)
+    return [
+        {"nodes": list(ends[1:-1]), "force": (part * (len(ends) - 2)).tolist()},
+        {"nodes": [ends[0], ends[-1]], "force": part.tolist()},
+    ]
+
+
 def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int, int]]:
     """The plate with n cells across, and the vertices A, B of its loaded edge; collective."""
     around = round(20 * n / 3)
@@ -114,10 +123,7 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
     radius = 6.0 + 4.0 * flat[:, 1]
     vertices = np.column_stack([radius * np.cos(flat[:, 0]), radius * np.sin(flat[:, 0]), 0.0 * radius])
     edge = [j * (around + 1) for j in range(n + 1)]
-    loads = [  # 0.8 N/m on 4 m
-        {"nodes": edge[1:-1], "force": [0.0, 0.0, 3.2 * (n - 1) / n]},
-        {"nodes": [edge[0], edge[-1]], "force": [0.0, 0.0, 3.2 / n]},
-    ]
+    loads = _line_load(edge, np.array([0.0, 0.0, 3.2]))  # 0.8 N/m on 4 m
     material = {"young": 21e6, "poisson": 0.0, "thickness": 0.03, "density": 1.0}
     held = [{"nodes": [each + around for each in edge], "clamp": True}]
     made = scene(bench.mesh(vertices, faces[:, ::-1]), material, handles=held, loads=loads)
@@ -277,3 +283,124 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
         _, way = _curved(bench, cells, pattern, surface, material, loads=loads, handles=held)
         mean = 0.5 * float(way[0, 0] - way[cells, 1]) / part
         yield Measured(f"way of the loads, {pattern}", mean, LINEAR["hemisphere"], "m")
+
+
+@case(
+    "Beam twisted by a right angle, very thin, with a force at its end in its plane there or across it, "
+    "bending_model: midedge: way of the force",
+    source=TABLES["twisted_beam"]["source"],
+    resolutions=(48, 96, 192),
+    claim=at_finest(5e-3),
+    counts="cells along the beam",
+)
+def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
+    length, width, force = 12.0, 1.1, 1e-6
+    for pattern in PATTERNS:
+        along, across = round(n), round(n / 12)
+        flat, faces = rectangle(along, across, 1.0, width, alternating=pattern == "alternating")
+        turned, beside = 0.5 * math.pi * flat[:, 0], flat[:, 1] - 0.5 * width
+        vertices = np.column_stack([length * flat[:, 0], beside * np.cos(turned), beside * np.sin(turned)])
+        mesh = bench.mesh(vertices, faces)
+        end = [along + row * (along + 1) for row in range(across + 1)]
+        for name, axis in (("in_plane", 2), ("out_of_plane", 1)):
+            content = scene(
+                mesh,
+                {"young": 2.9e7, "poisson": 0.22, "thickness": 0.0032, "density": 1.0},
+                STATIC | {"step": 1.0},
+                gravity=[0, 0, 0],
+                handles=[{"box": _on("x", 0.0, length), "clamp": True}],
+                loads=_line_load(end, force * np.eye(3)[axis]),
+                solver={"force_tolerance": 1e-6},
+            )
+            with bench.simulation(content) as trial:
+                way = float((trial.run().x - vertices)[end[len(end) // 2], axis])
+            yield Measured(
+                f"way {name.replace('_', ' ')}, {pattern}", way, TABLES["twisted_beam"][name], "in"
+            )
+
+
+# -- curved shells, large rotations --------------------------------------------------------------------
+
+
+@case(
+    "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: ways of the load (A) "
+    "and of the middle (B) and the end (C) of its side at 20 loads against the table",
+    source=TABLES["open_cylinder"]["source"],
+    resolutions=(16, 32, 64),
+    claim=at_finest(1e-2),
+    quick=1,
+)
+def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
+    radius, half = 4.953, 5.175
+    cells = round(n), round(n * half / (0.5 * math.pi * radius))
+    table = {round(row[0], 6): row[1:] for row in TABLES["open_cylinder"]["rows"]}
+    for pattern in PATTERNS:
+        flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
+        vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
+        content = scene(
+            bench.mesh(vertices, faces),
+            {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
+            handles=_symmetric("xyz", radius),
+            loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
+        )
+        worst: list[Measured] = []
+        for factor, trial in increments(bench, content, INCREMENT):
+            way = trial.x - vertices
+            found = way[0, 2], -way[cells[0], 0], -way[-1, 0]
+            here = [
+                Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
+                for point, value, of in zip("ABC", found, table[round(factor, 6)], strict=True)
+            ]
+            worst = [max(pair, key=lambda each: each.error) for pair in zip(here, worst or here, strict=True)]
+        yield from worst
+
+
+DEFLECTION = 30.0
+"""Of the roof's middle at the end [mm]."""
+
+
+@case(
+    "Shallow cylindrical roof, hinged at its straight edges, whose middle is pushed through, a quarter, "
+    "bending_model: midedge: how far the table is from the curve of load over deflection, of its extent in "
+    "both, and the largest and the least load",
+    source=TABLES["hinged_roof"]["source"],
+    resolutions=(8, 16, 32),
+    claim=at_finest(1e-2),
+    quick=2,
+)
+def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
+    radius, half, angle = 2540.0, 254.0, 0.1
+    loads, deflections = np.array(TABLES["hinged_roof"]["rows"]).T
+    for pattern in PATTERNS:
+        flat, faces = rectangle(round(n), round(n), 1.0, 1.0, alternating=pattern == "alternating")
+        vertices = np.column_stack(_cylinder(radius, angle, half)(flat[:, 0], flat[:, 1]))
+        content = scene(
+            bench.mesh(vertices, faces),
+            {"young": 3102.75, "poisson": 0.3, "thickness": 12.7, "density": 1.0},
+            handles=[
+                *_symmetric("xy", radius),
+                {"box": _on("x", radius * math.sin(angle), radius)},
+                {"nodes": [0], "axes": ["z"], "motion": "push", "interpolation": "linear"},
+            ],
+            motions={"push": [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, -DEFLECTION]}]},
+        )
+        curve = [(0.0, 0.0)]
+        for factor, trial in increments(bench, content, INCREMENT / 3.0):
+            push = trial.simulation.ledger.handle_forces(4)[3][2]
+            curve.append((factor * DEFLECTION, -4.0 * push / 3000.0))  # of the largest load [N]
+        extent = deflections.max(), loads.max()
+        apart = _distance(np.column_stack([deflections, loads]) / extent, np.array(curve) / extent)
+        found = np.interp(deflections, *np.array(curve).T)
+        up, down = loads[:16], slice(16, 25)  # until it snaps, and beyond
+        yield Measured(f"table beside the curve, {pattern}", 1.0 + float(apart.max()), 1.0)
+        yield Measured(f"largest load, {pattern}", float(found[: len(up)].max()), float(up.max()))
+        yield Measured(f"least load, {pattern}", float(found[down].min()), float(loads[down].min()))
+
+
+def _distance(points: Array, line: Array) -> Array:
+    """Of points (n, 2) from a line through others (m, 2)."""
+    start, way = line[:-1], np.diff(line, axis=0)
+    along = np.sum((points[:, None] - start) * way, axis=2) / np.sum(way**2, axis=1)
+    foot = start + np.clip(along, 0.0, 1.0)[:, :, None] * way
+    distance: Array = np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1)
+    return distance
