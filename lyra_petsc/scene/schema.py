@@ -28,7 +28,7 @@ from typing_extensions import Self
 
 from lyra_petsc.errors import nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.materials.library import is_isotropic, names
+from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured, names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, some, when
 from lyra_petsc.scene.values import (
@@ -249,6 +249,7 @@ def _one_word_of(words: Any) -> BeforeValidator:
 
 
 BendingModel = Literal["hinge", "midedge"]
+MembraneLaw = Literal["stvk", "measured", "neo-hookean"]
 _AnyBending = Annotated[
     Annotated[Bending, Tag("[number]")] | Annotated[PlateStiffness, Tag("[plate]")],
     Discriminator(lambda value: "[plate]" if isinstance(value, (dict, PlateStiffness)) else "[number]"),
@@ -299,6 +300,10 @@ class Material(Block):
         ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
         ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
         poisson and thickness, also of the library, and for an orthotropic plate, else ``hinge``.
+    law : str
+        How the membrane's stiffness depends on strain. ``stvk``: not at all; ``measured``: as measured on a
+        cloth of the library; ``neo-hookean``: as that of rubber, for young, poisson and thickness, also of
+        the library. At rest it is the same. Under compression ``stvk`` softens, the others do not.
     young : float [Pa] or None
         Young's modulus of an isotropic shell.
     poisson : float or None
@@ -326,6 +331,23 @@ class Material(Block):
             "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three",
             "bending",
         ),
+        Rule(
+            when(given(law={"const": "measured"}), given(cloth={"enum": measured()})),
+            lambda m: (
+                f"measured is for cloths that were: {', '.join(measured())}"
+                f"{'' if m.cloth is None else f'; {m.cloth} was not, leave law out'}"
+            ),
+            "law",
+        ),
+        Rule(
+            when(
+                given(law={"const": "neo-hookean"}),
+                {"anyOf": [given("young"), given(cloth={"enum": isotropic()})]},
+            ),
+            "neo-hookean is for isotropic sheets: give young, poisson, thickness and density, "
+            "or leave law out",
+            "law",
+        ),
     )
     sometimes_filled = frozenset({"bending_model"})
 
@@ -335,6 +357,7 @@ class Material(Block):
     membrane: MembraneStiffness | None = None
     bending: _AnyBending | None = None
     bending_model: Annotated[BendingModel | None, _one_word_of(BendingModel)] = None
+    law: Annotated[MembraneLaw, _one_word_of(MembraneLaw)] = "stvk"
     young: Positive | None = None
     poisson: Poisson | None = None
     thickness: Positive | None = None

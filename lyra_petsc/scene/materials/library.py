@@ -64,6 +64,10 @@ class ShellMaterial:
         κ11, κ22, κ12 [1/m] in the material axes.
     law : str
         Name of the membrane law.
+    cloth : str
+        Name in the library, for laws with further numbers of it.
+    stretching : float
+        Factor on these.
     model : str
         Name of the bending model.
     plate : tuple of four floats
@@ -81,6 +85,8 @@ class ShellMaterial:
     warp_degrees: float = 0.0
     rest_curvature: Triple | None = None
     law: str = "stvk"
+    cloth: str = ""
+    stretching: float = 1.0
     model: str = "hinge"
     plate: Plate = (0.0, 0.0, 0.0, 0.0)
 
@@ -107,6 +113,8 @@ class ClothTable:
         Small-strain row of the stretching table [N/m].
     bending : (3,)
         First column of the bending table, k_e [N·m], edges at 0°, 45°, 90° to the warp.
+    measured : bool
+        Whether a fabric was.
     """
 
     density: float
@@ -115,6 +123,7 @@ class ClothTable:
     c22: float
     c33: float
     bending: Triple
+    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,9 +157,10 @@ def entries() -> dict[str, ClothTable | IsotropicSheet]:
     found: dict[str, ClothTable | IsotropicSheet] = {}
     for library in TABLE_LIBRARIES:
         for name, row in _read(library)["tables"].items():
-            at_0, at_45, at_90 = row["bending"]
             found[name] = ClothTable(
-                row["density"], row["c11"], row["c12"], row["c22"], row["c33"], (at_0, at_45, at_90)
+                **{key: row[key] for key in ("density", "c11", "c12", "c22", "c33")},
+                bending=tuple(row["bending"]),
+                measured=row.get("measured", True),
             )
     for library in ISOTROPIC_LIBRARIES:
         for name, row in _read(library)["isotropic"].items():
@@ -162,6 +172,16 @@ def entries() -> dict[str, ClothTable | IsotropicSheet]:
 def names() -> list[str]:
     """The names a scene's ``cloth`` may take, sorted."""
     return sorted(entries())
+
+
+def measured() -> list[str]:
+    """The names of fabrics whose stiffness was measured at several strains, sorted."""
+    return [name for name in names() if getattr(entries()[name], "measured", False)]
+
+
+def isotropic() -> list[str]:
+    """The names of engineering materials, sorted."""
+    return [name for name in names() if is_isotropic(name)]
 
 
 def is_isotropic(name: object) -> bool:
@@ -304,6 +324,9 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
     return replace(
         shell,
         density=shell.density * material.density_scale * thicken,
+        law=material.law,
+        cloth=material.cloth or "",
+        stretching=stretch,
         c11=shell.c11 * stretch,
         c12=shell.c12 * stretch,
         c22=shell.c22 * stretch,
