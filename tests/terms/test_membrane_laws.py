@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,8 @@ from scipy.optimize import brentq
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.scene.load import scene_of
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.materials.library import ShellMaterial, measured, resolve
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import LAWS, law_of
@@ -26,12 +28,20 @@ pytestmark = pytest.mark.quick
 
 Array = NDArray[np.float64]
 
+GRID = {"width": 1.0, "height": 1.0, "nx": 2, "ny": 2}
+SCENE = {"time": {"end": 1.0, "step": 0.1}}
 SHEET = {"young": 2.0e6, "thickness": 1.0e-3, "density": 1.0}
+CURVES = {
+    "warp": [[0.01, 2.0], [0.03, 10.0], [0.1, 60.0]],  # J-shaped, as cloth's
+    "weft": [[0.0, 0.0], [0.05, 4.0], [0.12, 30.0], [0.2, 70.0]],
+    "shear": [[0.1, 2.0], [0.2, 3.5], [0.4, 12.0]],
+}
 MATERIALS: list[dict[str, Any]] = [
     {"cloth": "gray-interlock"},
     *({"cloth": name, "law": "measured", "stretching_scale": 1.7} for name in measured()),
     *(SHEET | {"poisson": nu, "law": "neo-hookean"} for nu in (-0.3, 0.0, 0.3, 0.5)),
     {"cloth": "rubber-sheet-1mm", "law": "neo-hookean"},
+    {"cloth": "gray-interlock", "law": CURVES, "stretching_scale": 1.7},
 ]
 every_law = pytest.mark.parametrize("keys", MATERIALS, ids=lambda keys: "-".join(map(str, keys.values())))
 stable = pytest.mark.parametrize("keys", MATERIALS[1:], ids=lambda keys: "-".join(map(str, keys.values())))
@@ -69,7 +79,7 @@ def shell_of(keys: dict[str, Any]) -> ShellMaterial:
 
 
 def test_every_law_is_tested() -> None:
-    assert {keys.get("law", "stvk") for keys in MATERIALS} == set(LAWS)
+    assert {shell_of(keys).law for keys in MATERIALS} == set(LAWS)
 
 
 @every_law
@@ -82,7 +92,7 @@ def test_stress_and_tangent_are_the_derivatives(keys: dict[str, Any]) -> None:
             slope = (law.energy(e + step) - law.energy(e - step)) / (2.0 * h)
             assert slope == pytest.approx(stress[i], abs=1e-7 * np.abs(tangent).max())
             change = (law.stress(e + step) - law.stress(e - step)) / (2.0 * h)
-            np.testing.assert_allclose(change, tangent[i], rtol=0.0, atol=1e-4 * np.abs(tangent).max())
+            np.testing.assert_allclose(change, tangent[i], rtol=0.0, atol=2e-4 * np.abs(tangent).max())
 
 
 @every_law
@@ -144,6 +154,57 @@ def test_incompressible_sheet_is_pulled_as_theory_says() -> None:
         assert force == pytest.approx(2.0e3 / 3.0 * (stretch - stretch**-2), rel=1e-9)
 
 
+def test_curves_are_met_at_their_points() -> None:
+    law = Law(shell_of({"density": 0.2, "law": CURVES}))
+    for x, force in [*CURVES["warp"], [0.2, 60.0 + 0.1 * 50.0 / 0.07]]:
+        e = 0.5 * ((1.0 + x) ** 2 - 1.0)
+        assert (1.0 + x) * law.stress(np.array([e, 0.0, 0.0]))[0] == pytest.approx(force, rel=1e-12)
+    for x, force in CURVES["shear"]:
+        # across, where no stretch is below what keeps it from collapsing
+        assert law.stress(np.array([0.0, 0.3, -x]))[2] == pytest.approx(-force, rel=1e-12)
+
+
+def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
+    (tmp_path / "curves").mkdir()
+    (tmp_path / "curves" / "warp.csv").write_text("strain; N/m\n# KES\n0.01; 2\n\n0.03;10\n")
+    law = CURVES | {"warp": "curves/warp.csv"}
+    scene = SCENE | {"mesh": {"grid": GRID}, "material": {"density": 0.2, "bending": 1e-5, "law": law}}
+    (tmp_path / "scene.yaml").write_text(json.dumps(scene))
+    loaded = load_scene(tmp_path / "scene.yaml")
+    stored = tmp_path / "stored.yaml"
+    stored.write_text(dump_scene(loaded))
+    (tmp_path / "curves" / "warp.csv").unlink()
+    assert load_scene(stored) == loaded
+    assert resolve(loaded.material[0])[0].curves[0] == ((0.0, 0.0), (0.01, 2.0), (0.03, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0,0\n0.02,5\n0.01,7\n", "line 3: strain 0.01 is not more than 0.02"),
+        ("0,0\n0.02,5\n\n0.03,5\n", "line 4: force 5 is not more than 5"),
+        ("0,0\n0.02,-5\n", "line 2: force -5 is not more than 0"),
+        ("0,1\n0.02,5\n", "line 1: no strain has no force"),
+        ("-0.1,-3\n0.02,5\n", "line 1: strain -0.1 is negative"),
+        ("0,0\n", "no point but the origin"),
+        ("strain,force\n", "has 0 points"),
+        ("0.1,5\n0.2,x\n", "line 2: must be two numbers"),
+        ("0.1,5,6\n", "line 1: must be two numbers"),
+        ("0.1,nan\n", "line 1: must be two numbers"),
+        (None, "no such file"),
+    ],
+)
+def test_curves_that_are_none_are_refused(text: str | None, words: str, tmp_path: Path) -> None:
+    if text is not None:
+        (tmp_path / "shear.csv").write_text(text)
+    law = CURVES | {"shear": "shear.csv"}
+    scene = SCENE | {"mesh": {"grid": GRID}, "material": {"cloth": "paper", "law": law}}
+    (tmp_path / "scene.yaml").write_text(json.dumps(scene))
+    with pytest.raises(InputError, match=r"material\.law\.shear: .*shear\.csv") as refused:
+        load_scene(tmp_path / "scene.yaml")
+    assert words in str(refused.value)
+
+
 def test_fitted_cloths_are_nearer_to_their_tables() -> None:
     errors = fit_errors()
     assert set(errors) == set(measured())
@@ -179,16 +240,16 @@ def test_forces_of_a_sheet_are_the_derivatives_of_its_energy(cloth: str, tmp_pat
         ({"cloth": "aluminium", "law": "measured"}, "aluminium was not"),
         (SHEET | {"poisson": 0.3, "law": "measured"}, "measured is for cloths that were: 11oz"),
         ({"cloth": "gray-interlock", "law": "neo-hookean"}, "is for isotropic sheets"),
+        ({"density": 1.0, "law": CURVES | {"warp": [1.0, 2.0]}}, "law.warp: must be a file, or points"),
+        (SHEET | {"poisson": 0.3, "law": CURVES}, "curves take the place of membrane"),
+        ({"law": CURVES | {"weft": "no.csv"}, "density": 1.0}, "no.csv: no such file"),
         ({"cloth": "gray-interlock", "law": "ogden"}, "must be one of stvk, measured, neo-hookean"),
     ],
 )
 def test_laws_of_other_materials_are_refused(material: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=r"material\.law") as refused:
-        scene_of({"mesh": {"grid": GRID}, "material": material, "time": {"end": 1.0, "step": 0.1}})
+        scene_of(SCENE | {"mesh": {"grid": GRID}, "material": material})
     assert words in str(refused.value)
-
-
-GRID = {"width": 1.0, "height": 1.0, "nx": 2, "ny": 2}
 
 
 def test_two_laws_in_a_scene_are_refused() -> None:

@@ -24,9 +24,10 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.materials.curves import Points, interpolation
 
 if TYPE_CHECKING:
-    from lyra_petsc.scene.schema import Material
+    from lyra_petsc.scene.schema import Material, PlateStiffness
 
 TABLE_LIBRARIES = ("wang2011.json", "original.json")
 ISOTROPIC_LIBRARIES = ("engineering.json",)
@@ -67,7 +68,9 @@ class ShellMaterial:
     cloth : str
         Name in the library, for laws with further numbers of it.
     stretching : float
-        Factor on these.
+        Factor on these, and on forces of curves.
+    curves : tuple of three curves
+        Strain and force [N/m] along warp and weft and in shear, of the law ``curves``.
     model : str
         Name of the bending model.
     plate : tuple of four floats
@@ -87,6 +90,7 @@ class ShellMaterial:
     law: str = "stvk"
     cloth: str = ""
     stretching: float = 1.0
+    curves: tuple[Points, ...] = ()
     model: str = "hinge"
     plate: Plate = (0.0, 0.0, 0.0, 0.0)
 
@@ -223,11 +227,9 @@ def resolve(
     else:
         assert material.density is not None
         if (c := material.membrane) is not None:
-            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33)
-            if isinstance(d := material.bending, (float, tuple)):
-                shell = replace(shell, bending=_triple(d))
-            elif d is not None:
-                shell = replace(shell, plate=(d.d11, d.d12, d.d22, d.d33))
+            shell = _bent(ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33), material.bending)
+        elif material.young is None:  # what is left is by curves, see below
+            shell = _bent(ShellMaterial(material.density, 1.0, 0.0, 1.0, 1.0), material.bending)
         else:
             assert material.young is not None
             assert material.poisson is not None
@@ -237,6 +239,10 @@ def resolve(
     if material.bending_model == "midedge":
         shell, more = _with_plate(shell, name)
         notes += more
+    if not isinstance(material.law, str):
+        curves = material.law.warp, material.law.weft, material.law.shear
+        c11, c22, c33 = (float(interpolation(points)[0, 2]) for points in curves)
+        shell = replace(shell, c11=c11, c12=0.0, c22=c22, c33=c33, curves=curves)
     shell = _scaled(shell, material)
     numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending, *shell.plate)
     if not all(math.isfinite(value) for value in numbers):
@@ -296,11 +302,13 @@ def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[st
     return replace(shell, plate=(at_0, 0.0, at_90, twist)), notes
 
 
-def _triple(bending: float | Triple | None) -> Triple:
-    if isinstance(bending, tuple):
-        return bending
-    value = bending or 0.0
-    return value, value, value
+def _bent(shell: ShellMaterial, bending: float | Triple | PlateStiffness | None) -> ShellMaterial:
+    """A shell with the bending stiffness that a scene gives."""
+    if isinstance(bending, float):
+        bending = bending, bending, bending
+    if bending is None or isinstance(bending, tuple):
+        return replace(shell, bending=bending or (0.0, 0.0, 0.0))
+    return replace(shell, plate=(bending.d11, bending.d12, bending.d22, bending.d33))
 
 
 def _projected(c11: float, c12: float, c22: float) -> Triple:
@@ -324,7 +332,7 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
     return replace(
         shell,
         density=shell.density * material.density_scale * thicken,
-        law=material.law,
+        law=material.law if isinstance(material.law, str) else "curves",
         cloth=material.cloth or "",
         stretching=stretch,
         c11=shell.c11 * stretch,

@@ -15,6 +15,7 @@ from types import ModuleType
 LAWS = {
     "stvk": "lyra_petsc.terms.membrane_laws.stvk",
     "measured": "lyra_petsc.terms.membrane_laws.measured",
+    "curves": "lyra_petsc.terms.membrane_laws.curves",
     "neo-hookean": "lyra_petsc.terms.membrane_laws.neo_hookean",
 }
 
