@@ -26,9 +26,10 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from lyra_petsc.errors import nearest
+from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.block import Block
-from lyra_petsc.scene.materials.library import is_isotropic, names
+from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
+from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured, names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
 from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, some, when
 from lyra_petsc.scene.values import (
@@ -56,6 +57,7 @@ from lyra_petsc.scene.values import (
     Until,
     Vec3,
     Vector,
+    number,
     problem,
     shown,
     vector,
@@ -123,15 +125,21 @@ def _file(*endings: str) -> dict[str, Any]:
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
 
+def _path_beside(value: Any, info: ValidationInfo) -> Path:
+    """A path, of which a relative one stands beside the scene file."""
+    directory = (info.context or {}).get("directory", Path.cwd())
+    path = Path(value)
+    # normalised by name only: a symbolic link may be what the user wants to see
+    return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
+
+
 def _beside_scene(value: Any, info: ValidationInfo) -> Any:
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
         raise problem(f"must be the path of a mesh file, not {shown(value)}")
     path = Path(value)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
-    directory = (info.context or {}).get("directory", Path.cwd())
-    # normalised by name only: a symbolic link may be what the user wants to see
-    return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
+    return _path_beside(value, info)
 
 
 MeshPath = Annotated[Path, BeforeValidator(_beside_scene), JsonSchema(_file("geo", "msh", "obj"))]
@@ -249,6 +257,63 @@ def _one_word_of(words: Any) -> BeforeValidator:
 
 
 BendingModel = Literal["hinge", "midedge"]
+MembraneLaw = Literal["stvk", "measured", "neo-hookean"]
+
+
+def _curve(value: Any, info: ValidationInfo) -> Points:
+    """A curve from a file beside the scene, or as its points: so a scene as understood needs no files."""
+    try:
+        if isinstance(value, str):
+            path = _path_beside(value, info)
+            return checked_points(read_curve(path), str(path))
+        if isinstance(value, (list, tuple)) and all(isinstance(p, (list, tuple)) for p in value):
+            pairs = [(number(x), number(y)) for x, y in value]
+            return checked_points([(f"point {n}", x, y) for n, (x, y) in enumerate(pairs, start=1)])
+    except InputError as error:
+        raise problem(": ".join(part for part in (error.file, error.message) if part)) from None
+    except ValueError:  # no pair, or no numbers
+        pass
+    raise problem(f"must be a file, or points like [[0.01, 5.0], [0.02, 12.0]], not {shown(value)}")
+
+
+_CURVE = {
+    "anyOf": [
+        {"type": "string"},
+        {
+            "type": "array",
+            "items": {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
+            "minItems": 1,
+        },
+    ]
+}
+Curve = Annotated[Points, BeforeValidator(_curve), JsonSchema(_CURVE)]
+
+
+class LawCurves(Block):
+    """One's own measurements: force [N/m], per width at rest, by strain.
+
+    Each is a file of two columns (commas, semicolons or blanks between), beside the scene file, or a list of
+    points. Both columns grow. A curve begins at (0, 0), goes on straight after its last point, and warp and
+    weft do so under compression. Nothing couples the three.
+
+    Attributes
+    ----------
+    warp, weft : curve of strain and N/m
+        Strips pulled along warp and weft.
+    shear : curve of shear strain and N/m
+        Tangent of the angle by which warp and weft are sheared, and the force.
+    """
+
+    warp: Curve
+    weft: Curve
+    shear: Curve
+
+
+_AnyLaw = Annotated[
+    Annotated[MembraneLaw, _one_word_of(MembraneLaw), Tag("[name]")] | Annotated[LawCurves, Tag("[curves]")],
+    Discriminator(lambda value: "[curves]" if isinstance(value, (dict, LawCurves)) else "[name]"),
+]
+_BY_CURVES = given(law={"type": "object"})
 _AnyBending = Annotated[
     Annotated[Bending, Tag("[number]")] | Annotated[PlateStiffness, Tag("[plate]")],
     Discriminator(lambda value: "[plate]" if isinstance(value, (dict, PlateStiffness)) else "[number]"),
@@ -273,7 +338,8 @@ def _several_ways(material: Material) -> str:
 
 def _needed(way: tuple[str, ...], key: str) -> Rule:
     """A key that has to be given beside any of the others."""
-    return Rule(when(some(*way), given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
+    ways = some(*way) if key != "membrane" else {"allOf": [some(*way), {"not": _BY_CURVES}]}
+    return Rule(when(ways, given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
 
 
 class Material(Block):
@@ -299,6 +365,11 @@ class Material(Block):
         ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
         ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
         poisson and thickness, also of the library, and for an orthotropic plate, else ``hinge``.
+    law : str or LawCurves
+        How the membrane's stiffness depends on strain. ``stvk``: not at all; ``measured``: as measured on a
+        cloth of the library; ``neo-hookean``: as that of rubber, for young, poisson and thickness, also of
+        the library. At rest it is the same. Or curves of one's own, instead of ``membrane``. Under
+        compression ``stvk`` softens, the others do not.
     young : float [Pa] or None
         Young's modulus of an isotropic shell.
     poisson : float or None
@@ -322,9 +393,31 @@ class Material(Block):
         Rule(when(given("cloth"), absent("density")), "comes with the cloth; use density_scale", "density"),
         *(_needed(way, key) for way, needed in _MATERIAL_WAYS for key in needed),
         Rule(
+            when(_BY_CURVES, absent("membrane", "young")),
+            "curves take the place of membrane; give them beside a cloth, or density and bending",
+            "law",
+        ),
+        Rule(
             when(given(bending={"type": "object"}), given(bending_model={"const": "midedge"})),
             "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three",
             "bending",
+        ),
+        Rule(
+            when(given(law={"const": "measured"}), given(cloth={"enum": measured()})),
+            lambda m: (
+                f"measured is for cloths that were: {', '.join(measured())}"
+                f"{'' if m.cloth is None else f'; {m.cloth} was not, leave law out'}"
+            ),
+            "law",
+        ),
+        Rule(
+            when(
+                given(law={"const": "neo-hookean"}),
+                {"anyOf": [given("young"), given(cloth={"enum": isotropic()})]},
+            ),
+            "neo-hookean is for isotropic sheets: give young, poisson, thickness and density, "
+            "or leave law out",
+            "law",
         ),
     )
     sometimes_filled = frozenset({"bending_model"})
@@ -335,6 +428,7 @@ class Material(Block):
     membrane: MembraneStiffness | None = None
     bending: _AnyBending | None = None
     bending_model: Annotated[BendingModel | None, _one_word_of(BendingModel)] = None
+    law: _AnyLaw = "stvk"
     young: Positive | None = None
     poisson: Poisson | None = None
     thickness: Positive | None = None
@@ -349,7 +443,8 @@ class Material(Block):
     @classmethod
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
         """Numbers without ``bending`` mean a membrane: the zero is written out."""
-        if "membrane" in data:
+        by_curves = isinstance(data.get("law"), (dict, LawCurves)) and not {"cloth", "young"} & data.keys()
+        if "membrane" in data or by_curves:
             data = {"bending": 0.0, **data}
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))

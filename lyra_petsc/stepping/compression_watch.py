@@ -39,7 +39,7 @@ class Compression:
         ends = np.array([local[0], -local[1]])
         comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
         self.smallest, self.largest = float(ends[0]), float(-ends[1])
-        if told or not self.smallest < SOFTENS_BELOW:
+        if told or not membrane.softens or not self.smallest < SOFTENS_BELOW:
             return None
         mine = n > 0 and local[0] == self.smallest
         index = int(membrane.elements.index[np.argmin(stretches[:, 0])]) if mine else np.iinfo(np.int64).max

@@ -155,9 +155,10 @@ def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
         )
     small, large = triangle.stretches
     if small < SOFTENS:
+        law = "; below 1/√3 = 0.577 the St. Venant-Kirchhoff membrane softens"
         found.append(
             f"less squeezing by motions and loads, or a finer mesh that can fold (triangle {triangle.number} "
-            f"is at {small:.3g} of its size; below 1/√3 = 0.577 the St. Venant-Kirchhoff membrane softens)"
+            f"is at {small:.3g} of its size{law if scene.material[0].law == 'stvk' else ''})"
         )
     if large > STRETCHED:
         found.append(

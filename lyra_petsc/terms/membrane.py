@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -184,21 +185,24 @@ class Membrane(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3); data ``inverse`` (E, 2, 2) inverse rest matrix [1/m], ``area`` (E,) [m²],
-        ``parameters`` (E, n) of the law, ``damping`` (E,) [s].
-    law : str
-        Name in ``membrane_laws``.
+        ``material`` (E,) number of the scene's, ``damping`` (E,) [s].
+    shells : sequence of ShellMaterial
+        The scene's materials, all of one law.
 
     Attributes
     ----------
     laws : (m, n), (E,) int32
-        The different parameters, and which of them each triangle has.
+        The parameters of each material, and which of them each triangle has.
+    softens : bool
+        Whether it gives way under compression.
     """
 
-    def __init__(self, elements: Elements, law: str) -> None:
-        data = elements.data
-        super().__init__(elements.without("parameters"))
-        self.laws = _distinct(data["parameters"])
-        self._kernels, self._stiffest = kernels_of(law), law_of(law).stiffest
+    def __init__(self, elements: Elements, shells: Sequence[ShellMaterial]) -> None:
+        data, law = elements.data, law_of(shells[0].law)
+        super().__init__(elements.without("material"))
+        rows = list(zip_longest(*map(law.parameters, shells), fillvalue=0.0))
+        self.laws = np.ascontiguousarray(np.array(rows).T), data["material"].astype(np.int32)
+        self._kernels, self._stiffest, self.softens = kernels_of(shells[0].law), law.stiffest, law.SOFTENS
         self._inverse, self._area = data["inverse"], data["area"]
 
     def energies(self, x: Array, frozen: Any = None) -> Array:
@@ -237,32 +241,25 @@ class Membrane(Elastic):
         return strain, stress
 
 
-def _distinct(parameters: Array) -> tuple[Array, NDArray[np.int32]]:
-    """The parameters (m, n) of triangles (E, n), each once, and which of them each triangle has."""
-    if len(parameters) and (parameters == parameters[0]).all():
-        return parameters[:1].copy(), np.zeros(len(parameters), dtype=np.int32)
-    laws, law = np.unique(parameters, axis=0, return_inverse=True)
-    return laws, law.reshape(-1).astype(np.int32)
+def elements(rest: RestShape) -> Elements:
+    """All triangles with their constants (rank 0).
 
-
-def _law_of_scene(shells: Sequence[ShellMaterial], scene: Scene) -> str:
-    laws = sorted({shell.law for shell in shells})
+    Raises
+    ------
+    InputError
+        Where materials have different laws.
+    """
+    laws = sorted({shell.law for shell in rest.shells})
     if len(laws) > 1:
         raise InputError(
-            f"all materials of a scene share one membrane law, not {' and '.join(laws)}",
-            file=scene.source,
-            key="material",
+            f"all materials of a scene share one membrane law, not {' and '.join(laws)}; give each the same",
+            file=rest.scene.source,
+            key=f"material[{next(n for n, s in enumerate(rest.shells) if s.law != rest.shells[0].law)}].law",
         )
-    return laws[0]
-
-
-def elements(rest: RestShape) -> Elements:
-    """All triangles with their constants (rank 0)."""
-    law = law_of(_law_of_scene(rest.shells, rest.scene))
     data = {
         "inverse": rest.inverse,
         "area": rest.area,
-        "parameters": np.array([law.parameters(shell) for shell in rest.shells])[rest.shell_of],
+        "material": rest.shell_of.astype(np.float64),
         "damping": rest.per_triangle("damping"),
     }
     return Elements(rest.mesh.triangles, data)
@@ -270,5 +267,4 @@ def elements(rest: RestShape) -> Elements:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> Membrane:
     """The term on one rank."""
-    shells = [resolve(block, file=scene.source, key="material")[0] for block in scene.material]
-    return Membrane(elements, _law_of_scene(shells, scene))
+    return Membrane(elements, [resolve(block, file=scene.source)[0] for block in scene.material])

@@ -24,9 +24,10 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.scene.materials.curves import Points, interpolation
 
 if TYPE_CHECKING:
-    from lyra_petsc.scene.schema import Material
+    from lyra_petsc.scene.schema import Material, PlateStiffness
 
 TABLE_LIBRARIES = ("wang2011.json", "original.json")
 ISOTROPIC_LIBRARIES = ("engineering.json",)
@@ -64,6 +65,12 @@ class ShellMaterial:
         κ11, κ22, κ12 [1/m] in the material axes.
     law : str
         Name of the membrane law.
+    cloth : str
+        Name in the library, for laws with further numbers of it.
+    stretching : float
+        Factor on these, and on forces of curves.
+    curves : tuple of three curves
+        Strain and force [N/m] along warp and weft and in shear, of the law ``curves``.
     model : str
         Name of the bending model.
     plate : tuple of four floats
@@ -81,6 +88,9 @@ class ShellMaterial:
     warp_degrees: float = 0.0
     rest_curvature: Triple | None = None
     law: str = "stvk"
+    cloth: str = ""
+    stretching: float = 1.0
+    curves: tuple[Points, ...] = ()
     model: str = "hinge"
     plate: Plate = (0.0, 0.0, 0.0, 0.0)
 
@@ -107,6 +117,8 @@ class ClothTable:
         Small-strain row of the stretching table [N/m].
     bending : (3,)
         First column of the bending table, k_e [N·m], edges at 0°, 45°, 90° to the warp.
+    measured : bool
+        Whether a fabric was.
     """
 
     density: float
@@ -115,6 +127,7 @@ class ClothTable:
     c22: float
     c33: float
     bending: Triple
+    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,9 +161,10 @@ def entries() -> dict[str, ClothTable | IsotropicSheet]:
     found: dict[str, ClothTable | IsotropicSheet] = {}
     for library in TABLE_LIBRARIES:
         for name, row in _read(library)["tables"].items():
-            at_0, at_45, at_90 = row["bending"]
             found[name] = ClothTable(
-                row["density"], row["c11"], row["c12"], row["c22"], row["c33"], (at_0, at_45, at_90)
+                **{key: row[key] for key in ("density", "c11", "c12", "c22", "c33")},
+                bending=tuple(row["bending"]),
+                measured=row.get("measured", True),
             )
     for library in ISOTROPIC_LIBRARIES:
         for name, row in _read(library)["isotropic"].items():
@@ -162,6 +176,16 @@ def entries() -> dict[str, ClothTable | IsotropicSheet]:
 def names() -> list[str]:
     """The names a scene's ``cloth`` may take, sorted."""
     return sorted(entries())
+
+
+def measured() -> list[str]:
+    """The names of fabrics whose stiffness was measured at several strains, sorted."""
+    return [name for name in names() if getattr(entries()[name], "measured", False)]
+
+
+def isotropic() -> list[str]:
+    """The names of engineering materials, sorted."""
+    return [name for name in names() if is_isotropic(name)]
 
 
 def is_isotropic(name: object) -> bool:
@@ -203,11 +227,9 @@ def resolve(
     else:
         assert material.density is not None
         if (c := material.membrane) is not None:
-            shell = ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33)
-            if isinstance(d := material.bending, (float, tuple)):
-                shell = replace(shell, bending=_triple(d))
-            elif d is not None:
-                shell = replace(shell, plate=(d.d11, d.d12, d.d22, d.d33))
+            shell = _bent(ShellMaterial(material.density, c.c11, c.c12, c.c22, c.c33), material.bending)
+        elif material.young is None:  # what is left is by curves, see below
+            shell = _bent(ShellMaterial(material.density, 1.0, 0.0, 1.0, 1.0), material.bending)
         else:
             assert material.young is not None
             assert material.poisson is not None
@@ -217,6 +239,10 @@ def resolve(
     if material.bending_model == "midedge":
         shell, more = _with_plate(shell, name)
         notes += more
+    if not isinstance(material.law, str):
+        curves = material.law.warp, material.law.weft, material.law.shear
+        c11, c22, c33 = (float(interpolation(points)[0, 2]) for points in curves)
+        shell = replace(shell, c11=c11, c12=0.0, c22=c22, c33=c33, curves=curves)
     shell = _scaled(shell, material)
     numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending, *shell.plate)
     if not all(math.isfinite(value) for value in numbers):
@@ -276,11 +302,13 @@ def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[st
     return replace(shell, plate=(at_0, 0.0, at_90, twist)), notes
 
 
-def _triple(bending: float | Triple | None) -> Triple:
-    if isinstance(bending, tuple):
-        return bending
-    value = bending or 0.0
-    return value, value, value
+def _bent(shell: ShellMaterial, bending: float | Triple | PlateStiffness | None) -> ShellMaterial:
+    """A shell with the bending stiffness that a scene gives."""
+    if isinstance(bending, float):
+        bending = bending, bending, bending
+    if bending is None or isinstance(bending, tuple):
+        return replace(shell, bending=bending or (0.0, 0.0, 0.0))
+    return replace(shell, plate=(bending.d11, bending.d12, bending.d22, bending.d33))
 
 
 def _projected(c11: float, c12: float, c22: float) -> Triple:
@@ -304,6 +332,9 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
     return replace(
         shell,
         density=shell.density * material.density_scale * thicken,
+        law=material.law if isinstance(material.law, str) else "curves",
+        cloth=material.cloth or "",
+        stretching=stretch,
         c11=shell.c11 * stretch,
         c12=shell.c12 * stretch,
         c22=shell.c22 * stretch,

@@ -13,6 +13,8 @@ from lyra_petsc.scene.materials.library import ShellMaterial
 
 Array = NDArray[np.float64]
 
+SOFTENS = True
+
 
 @kernel(inline="always")
 def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]

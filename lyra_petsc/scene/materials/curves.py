@@ -1,0 +1,98 @@
+"""Measured curves of force by strain: read from files, checked, and interpolated without a wiggle."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.text import read_text
+from lyra_petsc.scene.values import cut
+
+Array = NDArray[np.float64]
+Points = tuple[tuple[float, float], ...]
+Place = tuple[str, float, float]
+"""Where a point stands, in words; strain, force [N/m]."""
+
+MOST_POINTS = 1000
+"""Of a curve: every triangle looks its strain up in them."""
+
+
+def read_curve(path: Path) -> list[Place]:
+    """What the lines of a file hold: strain and force, with commas, semicolons or blanks between.
+
+    A first line without numbers is a heading, what follows # a comment.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or a line has not two numbers.
+    """
+    found: list[Place] = []
+    for number, line in enumerate(read_text(path, largest=2**20).splitlines(), start=1):
+        columns = line.split("#")[0].replace(";", " ").replace(",", " ").split()
+        try:
+            strain, force = map(float, columns)
+            if not math.isfinite(strain + force):
+                raise ValueError
+        except ValueError:
+            if not columns or (not found and columns[0][0].isalpha()):
+                continue
+            raise InputError(
+                f"{path}, line {number}: must be two numbers, strain and force [N/m], not {cut(line)!r}"
+            ) from None
+        found.append((f"{path}, line {number}", strain, force))
+    return found
+
+
+def checked_points(points: list[Place], whole: str = "the curve") -> Points:
+    """A curve from (0, 0) on; ``whole`` is its place in words.
+
+    Raises
+    ------
+    InputError
+        Naming the first place where strain or force does not grow.
+    """
+    if not points or len(points) > MOST_POINTS:
+        raise InputError(
+            f"{whole} has {len(points)} points; give 1 to {MOST_POINTS} (beside that at no strain)"
+        )
+    where, strain, force = points[0]
+    if strain == 0.0 and force != 0.0:
+        raise InputError(f"{where}: no strain has no force; take {force:g} N/m from all forces")
+    if strain > 0.0:
+        points = [("the origin", 0.0, 0.0), *points]
+    elif strain < 0.0:
+        raise InputError(
+            f"{where}: strain {strain:g} is negative; begin at 0, under compression a curve is straight"
+        )
+    if len(points) == 1:
+        raise InputError(f"{whole} has no point but the origin; give some with strain")
+    for (_, x0, y0), (place, x1, y1) in pairwise(points):
+        for what, before, after in (("strain", x0, x1), ("force", y0, y1)):
+            if not after > before:
+                raise InputError(
+                    f"{place}: {what} {after:g} is not more than {before:g} before it; sort by strain and "
+                    "leave out or smooth what does not grow"
+                )
+    return tuple((x, y) for _, x, y in points)
+
+
+def interpolation(points: Points) -> Array:
+    """Strain, force [N/m], slope [N/m] and integral of the force [N/m] at the points of a curve, (n, 4).
+
+    Cubic between them, as monotonic as they are: F. N. Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5
+    (1984) 300-304. Slopes at the ends are those of the first and last chord.
+    """
+    x, y = np.array(points).T
+    width = np.diff(x)
+    chord = np.diff(y) / width
+    one, two = 2.0 * width[1:] + width[:-1], width[1:] + 2.0 * width[:-1]
+    inside = (one + two) / (one / chord[:-1] + two / chord[1:])
+    slope = np.concatenate([chord[:1], inside, chord[-1:]])
+    area = width * (0.5 * (y[:-1] + y[1:]) + width * (slope[:-1] - slope[1:]) / 12.0)
+    return np.column_stack([x, y, slope, np.concatenate([[0.0], np.cumsum(area)])])

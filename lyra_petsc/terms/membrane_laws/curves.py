@@ -1,0 +1,111 @@
+"""Cloth by one's own curves: forces per width along warp and weft, and in shear, each by its own strain.
+
+    W = ∫ P₁ dλ₁ + ∫ P₂ dλ₂ + ∫ P₃ dγ + what keeps it from collapsing (``compression``)
+
+with the stretches λ = √(1 + 2E) of warp and weft, forces P per width at rest [N/m], and γ = 2 E_uv. Nothing
+couples them. Beyond its last point a curve goes on straight, and so do P₁ and P₂ under compression; P₃ is
+odd.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+from lyra_petsc.scene.materials.curves import interpolation
+from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.terms.membrane_laws import compression
+
+Array = NDArray[np.float64]
+
+SOFTENS = False
+
+LEAST = 0.1**2
+"""λ² below which P/λ goes on straight: strains that Newton's method expects may be of no shape."""
+
+
+@kernel()
+def _curve(x, c, m, which):  # type: ignore[no-untyped-def]
+    """Integral, force and slope of a curve at x."""
+    first, last = Index(c[m, 1 + which]), Index(c[m, 2 + which]) - Index(4)
+    if x <= 0.0:
+        slope = c[m, first + 2]
+        return 0.5 * slope * x * x, slope * x, slope
+    if x >= c[m, last]:
+        more, slope = x - c[m, last], c[m, last + 2]
+        force = c[m, last + 1]
+        return c[m, last + 3] + (force + 0.5 * slope * more) * more, force + slope * more, slope
+    low, high = first // 4, last // 4
+    while high - low > 1:
+        middle = (low + high) // 2
+        if x < c[m, 4 * middle]:
+            high = middle
+        else:
+            low = middle
+    i, j = Index(4 * low), Index(4 * low + 4)
+    h = c[m, j] - c[m, i]
+    t = (x - c[m, i]) / h
+    y0, y1, d0, d1 = c[m, i + 1], c[m, j + 1], h * c[m, i + 2], h * c[m, j + 2]
+    a, b = 3.0 * (y1 - y0) - 2.0 * d0 - d1, 2.0 * (y0 - y1) + d0 + d1
+    total = c[m, i + 3] + h * t * (y0 + t * (d0 / 2.0 + t * (a / 3.0 + t * b / 4.0)))
+    return total, y0 + t * (d0 + t * (a + t * b)), (d0 + t * (2.0 * a + 3.0 * t * b)) / h
+
+
+@kernel()
+def _along(e, c, m, which):  # type: ignore[no-untyped-def]
+    """Energy, P/λ and its derivative at the Green strain e along warp (0) or weft (1)."""
+    square = max(1.0 + 2.0 * e, LEAST)
+    stretch = math.sqrt(square)
+    # λ − 1 without cancellation
+    total, force, slope = _curve((square - 1.0) / (stretch + 1.0), c, m, which)
+    stress = force / stretch
+    rise = (slope - stress) / square
+    more = e - 0.5 * (square - 1.0)
+    return total + (stress + 0.5 * rise * more) * more, stress + rise * more, rise
+
+
+@kernel()
+def _across(e, c, m):  # type: ignore[no-untyped-def]
+    """Energy, stress and its derivative of shear."""
+    total, force, slope = _curve(abs(e), c, m, 2)
+    return total, (force if e >= 0.0 else -force), slope
+
+
+@kernel(inline="always")
+def energy(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
+    """Energy [J] per rest area [m²]."""
+    sheet = _along(e0, c, m, 0)[0] + _along(e1, c, m, 1)[0] + _across(e2, c, m)[0]
+    return sheet + compression.energy(e0, e1, e2, c[m, 0])
+
+
+@kernel(inline="always")
+def stress(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
+    """Second Piola-Kirchhoff stress (S_uu, S_vv, S_uv) [N/m]."""
+    s0, s1, s2 = compression.stress(e0, e1, e2, c[m, 0])
+    return s0 + _along(e0, c, m, 0)[1], s1 + _along(e1, c, m, 1)[1], s2 + _across(e2, c, m)[1]
+
+
+@kernel(inline="always")
+def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
+    """c11, c12, c22, c33, c13, c23 [N/m]."""
+    c11, c12, c22, c33, c13, c23 = compression.tangent(e0, e1, e2, c[m, 0])
+    c11, c22, c33 = c11 + _along(e0, c, m, 0)[2], c22 + _along(e1, c, m, 1)[2], c33 + _across(e2, c, m)[2]
+    return c11, c12, c22, c33, c13, c23
+
+
+def parameters(shell: ShellMaterial) -> list[float]:
+    """b [N/m]; where the points of the three curves begin, and where they end; the points."""
+    curves = [interpolation(points) * [1.0, *(shell.stretching,) * 3] for points in shell.curves]
+    starts = 8 + np.cumsum([0, *(4 * len(curve) for curve in curves)])
+    b = compression.PART * max(shell.c11, shell.c22, shell.c33)
+    return [b, *starts.astype(float), 0.0, 0.0, 0.0, *np.concatenate(curves).ravel()]
+
+
+def stiffest(c: Array) -> Array:
+    """Largest stiffness [N/m] of each law (n_laws, n) at rest."""
+    largest: Array = c[:, 0] / compression.PART
+    return largest

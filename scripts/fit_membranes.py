@@ -1,0 +1,97 @@
+"""Fits the law ``measured`` to the strained rows of the cloths' tables, and writes what it finds beside them.
+
+``python scripts/fit_membranes.py`` (a second). The tables are read as ARCSim does: c11, c12 and c22 count
+twice, C is linear in the larger principal strain up to its strained row and in the angle
+of that strain between rows. Sampled are six strains up to the measured one, in the five measured directions,
+with none and with ±0.3 of it across. The error is the root mean square of the stress that is wrong, over that
+of the stress.
+"""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.schema import Material
+from lyra_petsc.terms.membrane_laws import measured
+
+Array = NDArray[np.float64]
+
+FILE = Path(measured.__file__).with_name("wang2011.json")
+ANGLES = np.radians([0.0, 22.5, 45.0, 67.5, 90.0])
+STRAINS = measured.MEASURED * np.arange(1, 7) / 6.0
+ACROSS = (-0.3, 0.0, 0.3)
+NORM = np.sqrt([1.0, 1.0, 2.0])
+"""Weights of S_uu, S_vv, S_uv in the norm of a stress."""
+
+
+def stiffness(row: list[float]) -> Array:
+    """C (3, 3) [N/m] of a table's row."""
+    c11, c12, c22, c33 = row
+    return np.array([[2 * c11, 2 * c12, 0.0], [2 * c12, 2 * c22, 0.0], [0.0, 0.0, c33]])
+
+
+def samples(rest: Array, strained: list[list[float]]) -> tuple[Array, Array]:
+    """Strains e (n, 3) and the stress (n, 3) [N/m] that the tables give."""
+    found = []
+    for (number, angle), strain, across in product(enumerate(ANGLES), STRAINS, ACROSS):
+        one = 0.5 * ((1.0 + strain) ** 2 - 1.0)
+        two, c, s = across * one, np.cos(angle), np.sin(angle)
+        e = [one * c * c + two * s * s, one * s * s + two * c * c, 2.0 * (one - two) * c * s]
+        there = stiffness(strained[number])
+        part = strain / measured.MEASURED
+        found.append((e, ((1.0 - part) * rest + part * there) @ e))
+    e, stress = zip(*found, strict=True)
+    return np.array(e), np.array(stress)
+
+
+def at_rest(shell: ShellMaterial) -> Array:
+    """The library's C (3, 3) [N/m]."""
+    return np.array([[shell.c11, shell.c12, 0.0], [shell.c12, shell.c22, 0.0], [0.0, 0.0, shell.c33]])
+
+
+def slopes(e: Array) -> Array:
+    """Stress (n, 3, 6) of each a_k = 1 at strains e (n, 3)."""
+    columns = []
+    for forms in measured.FORMS:
+        n = np.array(forms)
+        s = np.maximum(e @ n.T, 0.0)
+        rise = np.where(s < measured.FULL, 0.5 * s * s / measured.FULL, s - 0.5 * measured.FULL)
+        columns.append(rise @ n)
+    return np.stack(columns, axis=2)
+
+
+def fitted(name: str, strained: list[list[float]]) -> dict[str, object]:
+    """What the file says of a cloth."""
+    rest = at_rest(resolve(Material(cloth=name))[0])
+    e, stress = samples(rest, strained)
+    size, left = np.linalg.norm(stress * NORM), (stress - e @ rest) * NORM
+    basis = (slopes(e) * NORM[:, None]).reshape(left.size, -1)
+    stiffening, error = nnls(basis, left.ravel())
+    return {
+        "strained": strained,
+        "stiffening": [float(f"{a:.5g}") for a in stiffening],
+        "error": float(f"{error / size:.3f}"),
+        "error_of_stvk": float(f"{np.linalg.norm(left) / size:.3f}"),
+    }
+
+
+def main() -> None:
+    """Fit all cloths of the file."""
+    content = json.loads(FILE.read_text(encoding="utf-8"))
+    rows = {name: fitted(name, row["strained"]) for name, row in content["cloths"].items()}
+    lines = ",\n".join(f"    {json.dumps(name)}: {json.dumps(row)}" for name, row in rows.items())
+    text = f'{{\n  "source": {json.dumps(content["source"])},\n  "cloths": {{\n{lines}\n  }}\n}}\n'
+    FILE.write_text(text, encoding="utf-8")
+    for name, row in rows.items():
+        print(f"{name:20} error {row['error']:5.1%}, of stvk {row['error_of_stvk']:5.1%}")
+
+
+if __name__ == "__main__":
+    main()
