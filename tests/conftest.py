@@ -72,7 +72,8 @@ def compile_once() -> None:
     from numba.core.dispatcher import Dispatcher
 
     compile_it = Dispatcher.compile
-    file = Path(tempfile.gettempdir(), f"lyra-petsc-tests-{os.getuid()}.lock").open("a")
+    name = f"lyra-petsc-tests-{os.getuid()}.lock"
+    file = os.open(Path(tempfile.gettempdir(), name), os.O_CREAT | os.O_RDWR, 0o600)
 
     def compile_alone(dispatcher: Any, signature: Any) -> Any:
         function = dispatcher.py_func
