@@ -8,7 +8,8 @@ in the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` 
 
 Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
 running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
-``parallel(2)`` keeps a test that takes long, and of which three ranks show no more, to two.
+``parallel(2)`` keeps a test of which three ranks show no more to two, ``parallel(3)`` one of how data lie
+on ranks to three, ``parallel(1)`` one of a module that is marked to one.
 After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
 shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
 """

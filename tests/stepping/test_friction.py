@@ -17,7 +17,7 @@ from lyra_petsc.terms.friction import CoulombFriction
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SLOPE, GAP, G = math.radians(30.0), 0.01, 9.81
 NORMAL = [math.sin(SLOPE), 0.0, math.cos(SLOPE)]
