@@ -8,7 +8,8 @@ in the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` 
 
 Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
 running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
-``parallel(2)`` keeps a test that takes long, and of which three ranks show no more, to two.
+``parallel(2)`` keeps a test of which three ranks show no more to two, ``parallel(3)`` one of how data lie
+on ranks to three, ``parallel(1)`` one of a module that is marked to one.
 After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
 shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
 """
@@ -16,13 +17,16 @@ shown by rank 0, and a rank whose partners never come to that agreement ends the
 from __future__ import annotations
 
 import faulthandler
+import fcntl
 import gc
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -61,6 +65,29 @@ def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(WORLD.bcast(tmp_path_factory.mktemp("shared") if WORLD.rank == 0 else None, root=0))
 
 
+def compile_once() -> None:
+    """Let processes that need a kernel for the first time wait for the one that compiles it.
+
+    All processes of pytest-xdist begin with the same empty cache; what one has compiled the others load.
+    """
+    from numba.core.dispatcher import Dispatcher
+
+    compile_it = Dispatcher.compile
+    name = f"lyra-petsc-tests-{os.getuid()}.lock"
+    file = os.open(Path(tempfile.gettempdir(), name), os.O_CREAT | os.O_RDWR, 0o600)
+
+    def compile_alone(dispatcher: Any, signature: Any) -> Any:
+        function = dispatcher.py_func
+        place = crc32(f"{function.__module__}.{function.__qualname__}".encode())
+        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
+        try:
+            return compile_it(dispatcher, signature)
+        finally:
+            fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
+
+    Dispatcher.compile = compile_alone
+
+
 @pytest.hookimpl(trylast=True)  # the terminal exists by then
 def pytest_configure(config: pytest.Config) -> None:
     import petsc4py.PETSc  # noqa: F401
@@ -70,6 +97,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # or a pipe that is closed, as by a film that cannot be written, ends pytest
     take_back_signals()
     if WORLD.size == 1:
+        compile_once()
         return
     capture = config.pluginmanager.getplugin("capturemanager")
     if capture is not None:

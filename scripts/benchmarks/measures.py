@@ -165,13 +165,13 @@ def _program(ranks: int, *words: str) -> list[str]:
 
 def default_scene(ranks: int, petsc: Sequence[str], folder: Path, limits: Limits, *, short: bool) -> Result:
     """Time of the default scene, and the share of it that goes into output."""
-    shorter = ["--set", "time.end=0.2"] if short else []
+    shorter = ["--set", "time.end=0.05"] if short else []
     with _scratch(folder) as scratch:
         seconds, _ = run([*_program(ranks, "--out", str(scratch / "run")), *shorter, *petsc], limits.process)
         summary = json.loads((scratch / "run" / "summary.json").read_text(encoding="utf-8"))
     phases = summary["wall_seconds"]
     return {
-        "what": f"default scene{', its first 0.2 s' if short else ''}",
+        "what": f"default scene{', its first 0.05 s' if short else ''}",
         "ranks": ranks,
         "seconds": seconds,
         "phases": phases,

@@ -26,7 +26,7 @@ SCENE = {
 }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_run_then_read(shared_tmp, comm):
     taken = []
     run = lyra_petsc.run(SCENE, shared_tmp / "out", on_step=lambda report: taken.append(report.time))
@@ -44,7 +44,7 @@ def test_run_then_read(shared_tmp, comm):
     assert lyra_petsc.run(longer, shared_tmp / "out", resume=True).times[-1] == pytest.approx(0.06)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_loop_over_the_steps_gives_what_a_run_writes(shared_tmp, comm):
     run = lyra_petsc.run(SCENE, shared_tmp / "out")
     steps = []

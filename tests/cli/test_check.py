@@ -17,7 +17,7 @@ output: {every: 0.1}
 """
 
 
-@pytest.mark.parametrize("ranks", [1, 2, 3])
+@pytest.mark.parametrize("ranks", [1, 3])
 def test_plan(tmp_path: Path, ranks: int) -> None:
     (tmp_path / "plain.yaml").write_text(MEMBRANE)
     result = lyra(["check", "plain.yaml"], tmp_path, ranks=ranks)
@@ -36,12 +36,11 @@ def test_plan(tmp_path: Path, ranks: int) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["plain.yaml"]
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_edges_with_an_unknown_are_counted_apart(tmp_path: Path, ranks: int) -> None:
+def test_edges_with_an_unknown_are_counted_apart(tmp_path: Path) -> None:
     """320 of them, three to a row of the matrix."""
     (tmp_path / "bends.yaml").write_text(MEMBRANE)
     bends = ["--set", "material.bending=1e-3", "--set", "material.bending_model=midedge"]
-    result = lyra(["check", "bends.yaml", *bends], tmp_path, ranks=ranks)
+    result = lyra(["check", "bends.yaml", *bends], tmp_path, ranks=2)
     assert result.code == 0, result.err
     assert "683 (velocities)" in result.out
     table = [

@@ -87,7 +87,7 @@ crossings in 2 of 5 states, most in state 3: 3 pairs
 NO_CONTACT = "the scene has no contact of sheets; --crossings makes a crossing exit code 1\n"
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.quick
 @pytest.mark.parametrize(
     ("contact", "asked", "code"),
@@ -115,7 +115,7 @@ def test_crossings_are_counted_on_any_number_of_ranks(
     assert said == (TABLE + ("" if code else NO_CONTACT) if comm.rank == 0 else "")
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("alone", [False, True])
 def test_obstacles(comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixture[str], alone: bool) -> None:
     """Of the second state a vertex is below the floor; the ball comes to the third one and leaves."""
@@ -135,7 +135,7 @@ def test_obstacles(comm: MPI.Comm, shared_tmp: Path, capsys: pytest.CaptureFixtu
         )
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_damaged_state_is_told_by_all_ranks(comm: MPI.Comm, folder: Path) -> None:
     if comm.rank == 0:
         (folder / "mesh.h5").write_bytes(b"none")

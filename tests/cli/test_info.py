@@ -27,7 +27,7 @@ def test_names_the_versions_in_use(comm):
     assert "gmsh's fences   scripts are read by a list of statements; " in text
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_all_ranks_return_the_same_text_and_count_the_ranks(comm):
     text = info(comm)
     assert comm.allgather(text) == [text] * comm.size

@@ -30,9 +30,8 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_cases_pass_and_leave_table_and_page(tmp_path: Path, ranks: int) -> None:
-    left = lyra(["stress", "--quick", *TWO, "--out", "out"], tmp_path, ranks)
+def test_cases_pass_and_leave_table_and_page(tmp_path: Path) -> None:
+    left = lyra(["stress", "--quick", *TWO, "--out", "out"], tmp_path)
     assert left.code == 0, left.err + left.out
     assert "2 of 2 cases passed" in left.out
     with open(tmp_path / "out" / "stress.csv", newline="") as file:
@@ -45,7 +44,7 @@ def test_cases_pass_and_leave_table_and_page(tmp_path: Path, ranks: int) -> None
     assert all(float(row["step_over_base"]) > 0.0 for row in rows)
     content = json.loads((tmp_path / "out" / "stress.json").read_text())
     assert content["passed"] is content["complete"] is True
-    assert content["ranks"] == ranks
+    assert content["ranks"] == 1
     assert set(content["cases"][1]["verdicts"]) == {
         "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit",
         "whole run"
@@ -81,13 +80,13 @@ def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: int) -> None:
     scene = write_scene(tmp_path)
-    names = "stiff-1e6-5ms,bending-1e6,jump,slivers"
+    names = "bending-1e6,jump,slivers"
     left = lyra(["stress", scene, "--quick", "--only", names, "--set", "gravity=[0, 0, -5]"], tmp_path, ranks)
     assert left.code == 0, left.err + left.out
     assert "slivers: left out" in left.out
-    assert "3 of 3 cases passed" in left.out
+    assert "2 of 2 cases passed" in left.out
     content = json.loads((tmp_path / "stress" / "scene" / "stress.json").read_text())
-    assert [case["name"] for case in content["cases"]] == ["stiff-1e6-5ms", "bending-1e6", "jump"]
+    assert [case["name"] for case in content["cases"]] == ["bending-1e6", "jump"]
     assert list(content["left_out"]) == ["slivers"]
     again = lyra(["stress", scene, "--quick", "--only", "jump"], tmp_path)
     assert again.code == 0

@@ -21,9 +21,8 @@ def test_list_names_every_case(tmp_path: Path) -> None:
     assert f"{len(CASES.modules)} cases" in left.err
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_a_case_passes(tmp_path: Path, ranks: int) -> None:
-    left = lyra(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, ranks)
+def test_a_case_passes(tmp_path: Path) -> None:
+    left = lyra(["verify", "free-fall", "patch-states", "--quick", "--out", "out"], tmp_path, 2)
     assert left.code == 0, left.err + left.out
     assert f"2 of {len(CASES.modules)} cases\n" in left.out
     assert "2 of 2 cases passed" in left.out
@@ -37,7 +36,7 @@ def test_a_case_passes(tmp_path: Path, ranks: int) -> None:
     assert {row["passed"] for row in rows} == {"True"}
     content = json.loads((tmp_path / "out" / "verify.json").read_text())
     assert content["passed"] is True
-    assert content["ranks"] == ranks
+    assert content["ranks"] == 2
     assert [case["name"] for case in content["cases"]] == ["free-fall", "patch-states"]
     report = (tmp_path / "out" / "report.md").read_text()
     assert "2 of 2 cases passed" in report
@@ -67,11 +66,10 @@ def test_tables_without_the_packages_for_plots(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_a_wrong_answer_is_exit_code_1(tmp_path: Path, ranks: int) -> None:
+def test_a_wrong_answer_is_exit_code_1(tmp_path: Path) -> None:
     # stopped after two steps the sheet has not fallen as far as it should
     arguments = ["verify", "free-fall", "patch-states", "--quick", "--out", "out", "-ts_max_steps", "2"]
-    left = lyra(arguments, tmp_path, ranks)
+    left = lyra(arguments, tmp_path)
     assert left.code == 1, left.err
     assert "1 of 2 cases passed" in left.out
     assert "FAILED" in left.out
@@ -89,9 +87,8 @@ def test_a_solver_that_gives_up_is_a_row_and_exit_code_1(tmp_path: Path) -> None
     assert left.ours == []
 
 
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path, ranks: int) -> None:
-    left = lyra(["verify", "free-fall", "patch-state", "--out", "out"], tmp_path, ranks)
+def test_an_unknown_case_is_refused_with_the_nearest(tmp_path: Path) -> None:
+    left = lyra(["verify", "free-fall", "patch-state", "--out", "out"], tmp_path, 2)
     assert left.code == 2
     assert left.ours == ["lyra-petsc: patch-state: unknown case, did you mean 'patch-states'?"]
     assert left.out == ""

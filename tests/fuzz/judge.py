@@ -26,7 +26,7 @@ CPU_SECONDS = 20
 
 WALL_SECONDS = 120.0
 MEMORY = 4 * 2**30
-"""Address space [B] of a case."""
+"""Address space [B] of a case, beside what the process that it is forked from has."""
 
 LONGEST_LINE = 1000
 STEPS = 2
@@ -186,7 +186,8 @@ def _child(case: Case, inside: Path, folder: Path) -> None:
         warnings.showwarning = lambda message, kind, file, line, *_: print(
             f"{file}:{line}: {kind.__name__}: {message}", file=sys.stderr
         )
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (here + MEMORY, here + MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         used = resource.getrusage(resource.RUSAGE_SELF)
         seconds = int(used.ru_utime + used.ru_stime) + CPU_SECONDS

@@ -1,4 +1,4 @@
-"""A few hundred fuzz cases, the same each time; ``scripts/fuzz.py`` runs thousands of others.
+"""Some hundred fuzz cases, the same each time; ``scripts/fuzz.py`` runs thousands of others.
 
 Most run in a forked process (see ``judge``), a sample in the real program, a handful on two ranks.
 """
@@ -21,9 +21,9 @@ from launch import finish, start
 from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
 from scene_cases import bomb, nested
 
-CASES = 240
-IN_THE_PROGRAM = 8
-ON_TWO_RANKS = 3
+CASES = 150
+IN_THE_PROGRAM = 5
+ON_TWO_RANKS = 2
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -13,7 +13,7 @@ from lyra_petsc.errors import OutputError
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.hdf5 import NewFile, write_collective
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 def fail() -> None:

@@ -23,7 +23,7 @@ from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import RESULT
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 REST = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [2, 0, 0]], dtype=float)
 TRIANGLES = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])

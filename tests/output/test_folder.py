@@ -6,7 +6,7 @@ import pytest
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.run_folder import LOCK_FILE, Busy, FolderLock, RunDirectory, choose
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
 from lyra_petsc.output.ordering import FileOrder
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 h5py = import_h5py()
 

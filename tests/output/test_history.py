@@ -6,7 +6,7 @@ from mpi4py import MPI
 from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.history import HISTORY_COLUMNS, History, vector_columns
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 def written(comm, path):

@@ -3,7 +3,7 @@ import pytest
 
 from lyra_petsc.output.ordering import FileOrder
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 def shuffled(comm, n_global, owners):

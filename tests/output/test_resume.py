@@ -7,7 +7,9 @@ import itertools
 import json
 import shutil
 import signal
+from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -166,15 +168,29 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
     assert mine.fields == other.fields == ("velocity", "stress")
 
 
-STOPS = [(way, stop) for way in WAYS for stop in ([1, 2] if way == "static" else [1, 2, 9])]
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The folder of a run that nobody stops."""
+
+    @cache
+    def ran(way: str) -> Path:
+        folder = tmp_path_factory.mktemp("unbroken") / "straight"
+        journey(MPI.COMM_SELF, scene_with(WAYS[way]), folder, None)
+        return folder
+
+    return ran
+
+
+# before there is a history of two steps, and after
+STOPS = [(way, stop) for way in WAYS for stop in ([2] if way == "static" else [1, 9])] + [("bdf2", 2)]
 
 
 @pytest.mark.parametrize(("way", "stop"), STOPS)
-def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path) -> None:
+def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]) -> None:
     """To round-off, on the same ranks with a direct solver."""
     scene = scene_with(WAYS[way])
-    straight, halted = tmp_path / "straight", tmp_path / "halted"
-    end = journey(MPI.COMM_SELF, scene, straight, None)
+    straight, halted = unbroken(way), tmp_path / "halted"
+    end = last(straight)
     assert journey(MPI.COMM_SELF, scene, halted, stop)[0] == stop
     assert journey(MPI.COMM_SELF, scene, halted, None, resume=True) == end
     same_files(halted, straight, 1e-11)

@@ -192,7 +192,7 @@ def test_a_file_that_changes_is_looked_at_again(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_resumed_run_follows_no_link(shared_tmp: Path, comm: MPI.Comm) -> None:
     if comm.rank == 0:
         for name, linked in (("one", "vertices/position"), ("two", None)):

@@ -7,7 +7,7 @@ import pytest
 from lyra_petsc.errors import OutputError
 from lyra_petsc.output.summary import versions, write_summary
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 def test_anything_a_run_collects_becomes_plain_json(comm, shared_tmp):

@@ -102,7 +102,7 @@ def run(comm: MPI.Comm, folder: Path, end: float, *, resume: bool = False) -> No
     simulate(comm, scene, FolderChoice(folder, resume=resume), ProgressCallbacks(), lambda: 0)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_an_older_folder_goes_on_with_three_components(
     comm: MPI.Comm, shared_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

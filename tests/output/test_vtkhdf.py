@@ -13,7 +13,7 @@ from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.states import StateWriter, stored_states
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(3)
 
 
 class Writer:

@@ -60,6 +60,7 @@ def column(table: Any, name: str) -> Array:
     return np.asarray(table[name], dtype=np.float64)
 
 
+@pytest.mark.parallel(2)
 def test_a_flag_moves_as_without_contact_until_it_meets_itself(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.size=0.1", "time.end=0.25", "time.step=0.003125")
     if (run := run_of(comm, shared_tmp, "flag-contact", *settings)) is None:
@@ -88,6 +89,7 @@ def test_a_stack_weighs_on_its_box(comm: MPI.Comm, shared_tmp: Path) -> None:
     assert (np.diff(heights) > 0.0).all()  # in the order in which they fell
 
 
+@pytest.mark.parallel(2)
 def test_a_wrung_cloth_has_eight_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.grid.nx=12", "mesh.grid.ny=3", "time.step=0.02")
     if (run := run_of(comm, shared_tmp, "wring", *settings)) is None:

@@ -77,7 +77,7 @@ def test_second_order_integrators_follow_the_free_edge(integrator: str, c11: flo
     assert in_time[0] >= 2.4 * in_time[1]
 
 
-@pytest.mark.parametrize("c11", [pytest.param(1e3, marks=pytest.mark.parallel), 1e5])
+@pytest.mark.parametrize("c11", [pytest.param(1e3, marks=pytest.mark.parallel(2)), 1e5])
 def test_backward_euler_falls_below_the_free_edge_by_its_first_order_error(
     c11: float, comm: MPI.Comm
 ) -> None:

@@ -18,7 +18,7 @@ from lyra_petsc.stepping.step_control import ToleranceControl
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SWING: dict[str, Any] = {
     "mesh": grid(0.5, 0.1, 5, 1),

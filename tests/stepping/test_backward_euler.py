@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 EXACT = reference("backward_euler")
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize(("dt", "steps", "z"), [row for row in EXACT["free_fall"]["rows"] if row[1] <= 10])
 def test_free_fall(comm: MPI.Comm, dt: float, steps: int, z: float) -> None:
     content = {"mesh": grid(1, 1, 3, 2), "gravity": [0, 0, -EXACT["free_fall"]["g"]]}
@@ -114,7 +114,7 @@ def test_spin_of_a_stiff_triangle_decays_as_the_rigid_limit(tmp_path: Path, firs
             x = new
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_fall_of_a_flat_sheet_through_air(comm: MPI.Comm) -> None:
     drop = EXACT["terminal_velocity"]
     content = {

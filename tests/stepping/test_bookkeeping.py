@@ -18,7 +18,7 @@ from lyra_petsc.terms.term import UpcomingStep
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SHEET: dict[str, Any] = {
     "mesh": grid(1.0, 0.8, 6, 5, "alternating"),

@@ -14,7 +14,7 @@ from lyra_petsc.stepping.energy_balance import Budget, Ledger
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 DT = 0.01
 

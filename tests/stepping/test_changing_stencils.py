@@ -168,6 +168,7 @@ def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
     )
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "alpha2"])
 def test_steps_by_a_tolerance(comm: MPI.Comm, integrator: str) -> None:
     time = {"end": 0.05, "step": "auto", "tolerance": 2e-3, "integrator": integrator}

@@ -35,7 +35,7 @@ def run(comm: MPI.Comm, scene: Scene) -> tuple[list[str], list[tuple[float, floa
     return simulation.notes, stretches
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_told_once_with_step_and_triangle(comm: MPI.Comm) -> None:
     notes, stretches = run(comm, pressed(0.5))
     expected = [0.875, 0.75, 0.625, 0.5, 0.5, 0.5]
@@ -49,7 +49,7 @@ def test_told_once_with_step_and_triangle(comm: MPI.Comm) -> None:
     assert comm.allgather(note) == [note] * comm.size
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_nothing_is_told_above_the_limit(comm: MPI.Comm) -> None:
     notes, stretches = run(comm, pressed(SOFTENS_BELOW + 1e-3))
     assert min(smallest for smallest, _ in stretches) < SOFTENS_BELOW + 2e-3

@@ -15,7 +15,7 @@ MATERIAL = {
 }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_damping_plus_stiffness_is_one_multiple_where_there_is_one_factor(comm: MPI.Comm) -> None:
     with Simulation({"mesh": grid(0.5, 0.4, 4, 3), "material": MATERIAL}, comm) as simulation:
         system = simulation.problem.system
@@ -61,7 +61,7 @@ def test_forces_are_asked_for_at_new_velocities_and_geometry(comm: MPI.Comm) -> 
         assert np.abs(system.damping.product(v) - once).max() > 1e-6 * np.abs(once).max()
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_forces_of_a_step_whose_matrix_holds_the_damping(comm: MPI.Comm) -> None:
     scene = {
         "mesh": grid(0.5, 0.4, 5, 4),

@@ -20,7 +20,7 @@ from lyra_petsc.stepping.failure_diagnosis import worst
 from lyra_petsc.stepping.failure_report import Failure
 from lyra_petsc.stepping.simulation import SteppedScene
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 Array = NDArray[np.float64]
 Spoil = Callable[[SteppedScene, Array], None]

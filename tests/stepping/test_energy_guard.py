@@ -42,7 +42,7 @@ def run(one: SteppedScene) -> list[float]:
     return energies
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
 def test_a_free_sheet_gains_nothing(integrator: str, comm: MPI.Comm) -> None:
     one = simulation(comm, integrator, FREE)
@@ -88,7 +88,7 @@ def test_what_it_remembers_goes_into_checkpoints() -> None:
         each.destroy()
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_linear_solve_that_is_not_enough_is_repeated_alike_on_all_ranks(comm: MPI.Comm) -> None:
     """A stiff hung sheet under long steps, which are far from linear: round-off must not grow with them."""
     stiff = {key: 1e3 * c for key, c in MEMBRANE.items()}
@@ -118,7 +118,7 @@ STIFF = FREE | {
 }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_after_six_halvings_the_run_is_given_up(comm: MPI.Comm) -> None:
     one = simulation(comm, "midpoint", STIFF, 0.8, 0.04)
     states: list[tuple[NDArray[np.float64], dict[str, Any]]] = []
@@ -159,7 +159,7 @@ DRIVEN: dict[str, Any] = {
 """Everything that does work, with much of it by moving handles."""
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_work_of_all_kinds_is_accounted_for(comm: MPI.Comm) -> None:
     """What a scheme that keeps energy gains is the error of the trapezoidal rule: second order."""
     gains = []

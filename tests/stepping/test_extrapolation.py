@@ -26,13 +26,13 @@ def expected(comm: MPI.Comm, motion: Callable[[float], float]) -> np.ndarray:
     return guess
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("motion", [lambda t: 3.0, lambda t: 2.0 - t, lambda t: 1.0 + t - 4.0 * t * t])
 def test_polynomials_are_gone_on_with(motion: Callable[[float], float], comm: MPI.Comm) -> None:
     np.testing.assert_allclose(expected(comm, motion), motion(TIMES[-1]) * SHAPE, rtol=1e-12)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
     extrapolation, sign = Extrapolation(comm), 1.0
     for step in range(6):
@@ -56,7 +56,7 @@ def test_weights_are_one_at_their_own_time() -> None:
     assert sum(weights([0.0, 1.0, 3.0], 7.0)) == pytest.approx(1.0)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_falling_sheet_takes_fewer_linear_iterations(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -65,7 +65,7 @@ def test_alpha2_damps_high_frequencies_to_its_spectral_radius(radius: float) -> 
     assert amplification(radius, 1e-3) == pytest.approx(1.0, abs=1e-8)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", SECOND_ORDER)
 def test_free_fall_is_exact(integrator: str, comm: MPI.Comm) -> None:
     content = {"mesh": grid(1, 1, 2, 2), "gravity": [0, 0, -9.81]} | timed(integrator)
@@ -102,7 +102,7 @@ def test_midpoint_keeps_energy_and_the_others_damp(tmp_path: Path) -> None:
     assert energy_left("alpha2", tmp_path, spectral_radius=0.0) < kept["alpha2"]
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_handles_are_where_their_motion_says(integrator: str, comm: MPI.Comm) -> None:
     turn = [{"time": 0}, {"time": 1, "rotate": {"axis": [0, 1, 0], "degrees": 90}, "translate": [0, 0, 1]}]

@@ -77,7 +77,7 @@ def test_one_step_differs_from_backward_euler_by_the_second_order_in_time() -> N
     assert gaps[0] > 3.5 * gaps[1] > 12.0 * gaps[2] > 0.0
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_moving_handle_gets_its_exact_positions(comm: MPI.Comm) -> None:
     motion = {"m": [{"time": 0}, {"time": 0.1, "translate": [0.1, 0, 0]}]}
     handle = {"nodes": [0, 2], "motion": "m", "interpolation": "linear"}

@@ -98,7 +98,7 @@ def journey(comm: MPI.Comm, integrator: str, step: float = 0.04) -> tuple[Any, l
     return x, notes, simulation.stepper.preset
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     incomplete = "ilu" if comm.size == 1 else "block-ilu"
     x, notes, preset = journey(comm, "semi-implicit")
@@ -112,7 +112,7 @@ def test_steps_need_no_other_solver(comm: MPI.Comm, monkeypatch: pytest.MonkeyPa
         np.testing.assert_allclose(x, other, atol=2e-5)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> None:
     ends = []
     for kind in ("cholesky", "ilu" if comm.size == 1 else "bjacobi"):
@@ -126,7 +126,7 @@ def test_newton_s_iterations_end_where_those_with_factors_do(comm: MPI.Comm) -> 
     np.testing.assert_allclose(*ends, atol=1e-5)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("lag", [False, True])
 def test_factors_are_made_once_a_step_of_the_jacobian_itself(comm: MPI.Comm, lag: bool) -> None:
     scene = HANGING | {"time": {"end": 1.0, "step": 0.005, "integrator": "semi-implicit"}}

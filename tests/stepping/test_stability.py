@@ -20,7 +20,7 @@ from lyra_petsc.terms import registry
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 BENDING, LENGTH = 1e-2, 1.0
 CRITICAL = 7.837 * 0.8 * BENDING / (9.81 * LENGTH**3)

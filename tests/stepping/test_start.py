@@ -17,7 +17,7 @@ MESH = {
 }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_spin_is_about_the_centre_of_mass(comm: MPI.Comm) -> None:
     content = {
         "mesh": [

@@ -20,7 +20,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SHEET: dict[str, Any] = {
     "mesh": grid(1.0, 0.8, 6, 5, "alternating"),
@@ -169,7 +169,13 @@ NOWHERE: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", NOWHERE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.parallel(2 if name == "nothing holds it" else 1))
+        for name in NOWHERE
+    ],
+)
 def test_without_an_equilibrium_it_gives_up_soon(name: str, comm: MPI.Comm) -> None:
     content, words = NOWHERE[name]
     time = {"time": {"analysis": "static"}}

@@ -11,7 +11,7 @@ from physics import CLOTH, gathered, grid, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 
 def sheet(stiffness: float, dt: float, tolerance: float) -> dict[str, Any]:

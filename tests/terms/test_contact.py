@@ -178,7 +178,7 @@ def height_under(point: Array, triangles: Array) -> float:
     return float((a[:, 2] + s * u[:, 2] + t * v[:, 2])[met].max(initial=-np.inf))
 
 
-@pytest.mark.parametrize("speed", [10.0, 100.0])
+@pytest.mark.parametrize("speed", [10.0, pytest.param(100.0, marks=pytest.mark.parallel(1))])
 def test_sheets_thrown_fast_with_large_steps(comm: MPI.Comm, speed: float) -> None:
     """The lower sheet is so wide and stiff that there is no way around it."""
     stiff = {"density": 0.2, "membrane": {"c11": 1e6, "c22": 1e6, "c12": 3e5, "c33": 3.5e5}}

@@ -46,7 +46,7 @@ def content(name: str, folder: Path) -> dict[str, Any]:
     return {"mesh": triangle(folder), "material": ROUND}
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", list(SOLUTIONS))
 def test_backward_euler_tends_to_it(name: str, shared_tmp: Path, comm: MPI.Comm) -> None:
     if comm.size > 1 and (name == "breathing-triangle" or not PETSc.Sys.hasExternalPackage("mumps")):

@@ -49,7 +49,7 @@ def handled(seconds: float) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize(
     "changes",
     [
@@ -69,7 +69,7 @@ def test_every_balance_holds(comm: MPI.Comm, changes: dict[str, Any]) -> None:
     assert not any(balance.jumped for balance in outcome.record.balances)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_balance_is_that_of_the_ledger(comm: MPI.Comm) -> None:
     record = run(comm, **handled(0.02)).record
     found = np.cumsum([balance.change for balance in record.balances])
@@ -84,7 +84,7 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     assert outcome.failures == {}
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_every_balance_holds_where_triangles_collapse(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,7 +178,7 @@ def stepped_by(comm: MPI.Comm, integrator: str, **changes: Any) -> StressOutcome
     return run_case(comm, StressCase("a", "b", as_it_is, steps=4), Setting(content, True, Scope.QUICK))
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2"])
 def test_stages_of_other_integrators_are_balanced(comm: MPI.Comm, integrator: str) -> None:
     outcome = stepped_by(comm, integrator, **handled(0.02))

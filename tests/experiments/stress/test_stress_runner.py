@@ -37,7 +37,7 @@ def run(comm: MPI.Comm, name: str) -> StressOutcome:
     return run_case(comm, case, SMALL)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", ["chain-1e6", "stiff-1e6-40ms", "one-triangle", "jump", "folded"])
 def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None:
     outcome = run(comm, name)
@@ -48,7 +48,7 @@ def test_a_case_passes_on_any_number_of_ranks(comm: MPI.Comm, name: str) -> None
     assert all(one == told[0] for one in told)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_start_shape_is_taken(comm: MPI.Comm) -> None:
     case = StressCase(
         "a", "b", as_it_is, steps=1, shape=lambda x, h: 0.5 * x + h, observe=lambda trial: trial.x
@@ -67,7 +67,7 @@ def test_only_the_worst_cases_keep_their_shapes(comm: MPI.Comm) -> None:
     assert sum(outcome.record.last is not None for outcome in outcomes) == PICTURES
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_max_it": 0}}
     outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
@@ -79,14 +79,14 @@ def test_a_solver_that_gives_up_is_a_verdict(comm: MPI.Comm) -> None:
     assert (outcome.record.last is not None) is (comm.rank == 0)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_sheet_whose_weight_is_left_as_residual_does_not_pass(comm: MPI.Comm) -> None:
     content = sheet(6) | {"petsc": {"snes_atol": 1e9}}
     outcome = run_case(comm, StressCase("a", "b", as_it_is), Setting(content, False, Scope.QUICK))
     assert "-snes_atol stopped Newton's method" in outcome.failures["converged"].words
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("scale", [1e9, 1e16])
 def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
     content = sheet(6)
@@ -96,7 +96,7 @@ def test_round_off_holds_no_sheet_up(comm: MPI.Comm, scale: float) -> None:
     assert min(report.newton_iterations for report in outcome.record.reports) > 1
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None:
     content = sheet(6)
     content["handles"] = [{"group": "nowhere"}]
@@ -104,7 +104,7 @@ def test_what_one_case_cannot_be_does_not_end_the_others(comm: MPI.Comm) -> None
     assert "nowhere" in outcome.failures["converged"].words
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_case_ends_when_it_has_had_its_time(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(trials.LONGEST, Scope.QUICK, 0.0)
     outcome = run_case(comm, StressCase("a", "b", as_it_is), SMALL)
@@ -119,7 +119,7 @@ def test_a_case_of_the_base_is_left_out_for_another_scene(comm: MPI.Comm) -> Non
     assert outcome.record.reports == []
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_times_are_over_the_bases(comm: MPI.Comm) -> None:
     clock = BaseClock(comm, SMALL)
     assert np.all(clock.latest > 0.0)

@@ -82,7 +82,7 @@ def pair(shared_tmp: Path, comm: MPI.Comm) -> tuple[Path, Path]:
     return one, two
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_errors_on_one_mesh(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
     one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
     errors = against_run(comm, two, one, QUANTITIES)
@@ -106,7 +106,7 @@ class Falling(ExactMotion):
         return Energies(kinetic, membrane, potential)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_errors_against_an_exact_motion(pair: tuple[Path, Path], comm: MPI.Comm) -> None:
     one, two = (read_samples(comm, folder, TIMES, 0.1, [20]) for folder in pair)
     exact = against_motion(comm, one, Falling(), QUANTITIES)
@@ -120,7 +120,7 @@ def linear(rest: Array, t: float) -> Array:
     return np.asarray(rest @ np.array([[1.1, 0.2, 0.3], [-0.1, 0.9, 0.5], [0.0, 0.0, 1.0]]) + [t, 0.0, -t])
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("rows_at_once", [7, 1 << 16])
 def test_errors_across_meshes(
     shared_tmp: Path, comm: MPI.Comm, rows_at_once: int, monkeypatch: pytest.MonkeyPatch
@@ -148,7 +148,7 @@ def surface(mesh: Mesh) -> RestSurface:
     return RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_sheets_that_lie_on_each_other_are_kept_apart(comm: MPI.Comm, shared_tmp: Path) -> None:
     two = [grid(1.0, 1.0, 2, 2), grid(1.0, 1.0, 2, 2)]
     finer = [grid(1.0, 1.0, 4, 4), grid(1.0, 1.0, 4, 4)]

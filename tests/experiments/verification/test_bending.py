@@ -94,7 +94,7 @@ def test_a_tall_cantilever_tips_at_the_published_load() -> None:
     assert tall_cantilever(0.5, 1e-4)[0] / factor - 1.0 == pytest.approx(2.0 * 0.01, rel=0.1)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_the_assembled_stiffness_solves_as_it_multiplies(comm: MPI.Comm) -> None:
     with Bench(comm).simulation(hinges.square_plate("CFFF", "criss-cross", 6)) as trial:
         operator, mass = stiffness(trial), trial.mass
@@ -103,7 +103,7 @@ def test_the_assembled_stiffness_solves_as_it_multiplies(comm: MPI.Comm) -> None
     assert operator.dense() @ height[~operator.held] == pytest.approx(mass[~operator.held], rel=1e-9)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("pattern", hinges.PATTERNS)
 def test_bending_divided_by_what_the_mesh_makes_of_it_gives_b(comm: MPI.Comm, pattern: str) -> None:
     scene: dict[str, Any] = strip(
@@ -115,7 +115,7 @@ def test_bending_divided_by_what_the_mesh_makes_of_it_gives_b(comm: MPI.Comm, pa
     assert found == pytest.approx(1.0, rel=1e-10)
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_another_stiffness_than_predicted_fails(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hinges, "expected", lambda pattern, ratio=1.0: 1.0)
     outcome = run_case(comm, hinges.hinge_strip, quick=True, warm=False)

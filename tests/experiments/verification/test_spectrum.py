@@ -14,7 +14,7 @@ from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.spectrum import lowest_modes, lowest_squares
 from lyra_petsc.terms.term import Elastic
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SHEET: dict[str, Any] = {
     "mesh": {"grid": {"width": 1.0, "height": 0.6, "nx": 4, "ny": 3}},

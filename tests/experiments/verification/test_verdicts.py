@@ -95,7 +95,7 @@ def made(**changes: object) -> VerificationCase:
     return dataclasses.replace(case, **changes)  # type: ignore[arg-type]
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_rows_and_verdicts_of_a_case(comm: MPI.Comm) -> None:
     outcome = run_case(comm, made())
     assert outcome.passed
@@ -106,7 +106,7 @@ def test_rows_and_verdicts_of_a_case(comm: MPI.Comm) -> None:
     assert [r.n for r in run_case(comm, made(), quick=True).tables()["a"]] == [4, 8]
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
     def measure(bench: Bench, n: float) -> Iterable[Measured]:
         if n == 8:
@@ -127,12 +127,12 @@ def test_what_cannot_run_says_so_and_the_rest_goes_on(comm: MPI.Comm) -> None:
     assert "n = 8" in outcome.verdicts["could not run"].words
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_nothing_measured_is_no_success(comm: MPI.Comm) -> None:
     assert not run_case(comm, made(measure=lambda bench, n: [])).passed
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_request_to_stop_ends_the_case(comm: MPI.Comm) -> None:
     def stop() -> None:
         raise Interrupted("stopped by SIGINT", 2)
@@ -155,7 +155,7 @@ def wrong_by(case: VerificationCase, fraction: float) -> VerificationCase:
 QUICK_AND_EXACT = ("patch-states", "free-fall", "oscillator", "rigid-rotation", "hanging-strip-chain")
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", QUICK_AND_EXACT)
 def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -> None:
     case = CASES.load(name)
@@ -166,7 +166,7 @@ def test_an_exact_answer_wrong_by_a_billionth_fails(comm: MPI.Comm, name: str) -
         assert not outcome.verdicts[quantity].passed, quantity
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", ["stretched-membrane", "hanging-chain", "hanging-strip"])
 def test_a_limit_wrong_by_a_few_percent_fails(comm: MPI.Comm, name: str) -> None:
     outcome = run_case(comm, wrong_by(CASES.load(name), 0.05), quick=True, warm=False)

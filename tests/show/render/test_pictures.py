@@ -231,7 +231,7 @@ def test_no_opengl_is_one_line(ring, monkeypatch):
         make_plan(RenderOptions(ring))
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_ranks_share_the_states_and_draw_the_same(comm, shared_tmp):
     run = shared_tmp / "run"
     if comm.rank == 0:
@@ -257,7 +257,7 @@ def test_ranks_share_the_states_and_draw_the_same(comm, shared_tmp):
             )
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 def test_a_state_that_one_rank_cannot_read_ends_all(comm, shared_tmp):
     run = shared_tmp / "run"
     if comm.rank == 0:

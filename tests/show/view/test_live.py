@@ -57,7 +57,7 @@ def in_its_folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL), (3, signal.SIGTERM)])
+@pytest.mark.parametrize(("ranks", "number"), [(1, signal.SIGINT), (2, signal.SIGKILL)])
 def test_the_page_goes_with_the_run(tmp_path, ranks, number):
     write_scene(tmp_path, SLOW)
     process = start(
