@@ -4,6 +4,9 @@ As ``gauss_seidel``, on ``edge_couplings``. The residual of edges is apart, (n_l
 first sweep leaves of it coarser levels see through the vertices alone: beside their correction each edge gets
 one of its own, by the diagonal. What both add between the sweeps is symmetric and positive semidefinite, so
 that the cycle stays positive definite, and conjugate gradients take a fifth fewer iterations.
+
+Bending is of fourth order, so that a sweep leaves much of it: vertices are swept more than once. The edges,
+whose block is well conditioned, are not.
 """
 
 from __future__ import annotations
@@ -141,6 +144,49 @@ def forward_vertices(  # type: ignore[no-untyped-def]
         scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
 
 
+@cached(fastmath=True)
+def backward_again(  # type: ignore[no-untyped-def]
+    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, moved, x, r, of_edges
+):
+    """As ``backward_vertices``, from where the residuals r and of_edges are those of x, b − A x.
+
+    moved (n_vertices, 3) gets what is added to x.
+    """
+    n = Index(len(inverse))
+    for below in range(n):
+        row = n - Index(1) - below
+        lo, hi = Index(indptr[row] + 1), Index(ends[row])
+        s0, s1, s2 = gather(blocks, columns, moved, lo, hi, -AHEAD)
+        y0, y1, y2 = solved(inverse, row, r[row, 0] - s0, r[row, 1] - s1, r[row, 2] - s2)
+        moved[row, 0], moved[row, 1], moved[row, 2] = y0, y1, y2
+        x[row, 0] += y0
+        x[row, 1] += y1
+        x[row, 2] += y2
+        r[row, 0] = r[row, 1] = r[row, 2] = 0.0
+        scatter(blocks, columns, r, lo, hi, (-y0, -y1, -y2))
+        first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
+        scatter_edges(groups, places, of_edges, first, last, (-y0, -y1, -y2))
+
+
+@cached(fastmath=True)
+def forward_ahead(  # type: ignore[no-untyped-def]
+    indptr, ends, columns, group_ptr, places, blocks, groups, inverse, b, x, r
+):
+    """As ``forward_vertices``, before another such sweep: what becomes of the residuals is of no use."""
+    n = Index(len(inverse))
+    for row in range(n):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(n):
+        lo, hi = Index(indptr[row] + 1), Index(indptr[row + Index(1)])
+        first, last = Index(group_ptr[row]), Index(group_ptr[row + Index(1)])
+        s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
+        t0, t1, t2 = gather_edges(groups, places, x, first, last, AHEAD_EDGES)
+        r0, r1, r2 = r[row, 0] - t0, r[row, 1] - t1, r[row, 2] - t2
+        y0, y1, y2 = solved(inverse, row, r0 - s0, r1 - s1, r2 - s2)
+        x[row, 0], x[row, 1], x[row, 2] = y0, y1, y2
+        scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
+
+
 class SweepsWithEdges:
     """``gauss_seidel.BlockSweeps`` where edges carry unknowns.
 
@@ -170,6 +216,7 @@ class SweepsWithEdges:
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
         self._values = couplings.empty(np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
+        self._moved = np.empty((n, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         self.r = np.zeros((n_local, 4), dtype=np.float32)
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
@@ -213,6 +260,17 @@ class SweepsWithEdges:
         backward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
+
+    def backward_again(self, x: Floats) -> None:
+        """Sweep over the vertices once more."""
+        blocks, groups, _ = self._values
+        rows = *self._rows, *self._groups, blocks, groups
+        backward_again(*rows, self._inverse, self._moved, x, self.r, self.of_edges)
+
+    def forward_ahead(self, b: Floats, x: Floats) -> None:
+        """Sweep over the vertices, before ``forward``."""
+        blocks, groups, _ = self._values
+        forward_ahead(*self._rows, *self._groups, blocks, groups, self._inverse, b, x, self.r)
 
     def subtract_ghosts(self, x: Floats) -> None:
         """As the function, of both residuals."""

@@ -2,7 +2,8 @@
 
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
 is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) three are visited twice,
-as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle.
+as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle. Where edges
+carry unknowns the vertices of the mesh are swept ``-pc_mg_vertex_sweeps`` times before and after.
 
 Between ranks the sweeps are Jacobi's, which diverge where three or more ranks meet in strongly coupled
 unknowns. There the diagonal is increased as in the l1 smoothers of Baker, Falgout, Kolev and Yang
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
+VERTEX_SWEEPS = 2
+"""Where edges carry unknowns."""
+
 TWICE = 3
 """Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
 
@@ -55,13 +59,19 @@ def _sweeps_of(level: Level) -> sweeps.BlockSweeps | SweepsWithEdges:
 class Smoother:
     """The arrays that a level's sweeps and its interpolation work on.
 
+    Parameters
+    ----------
+    level : Level
+    vertex_sweeps : int
+        Over the vertices, where edges carry unknowns.
+
     Attributes
     ----------
     b, x : (n_local, 3)
         Right-hand side and solution.
     """
 
-    def __init__(self, level: Level) -> None:
+    def __init__(self, level: Level, vertex_sweeps: int) -> None:
         pattern, points = level.pattern, level.points
         self.points, self.n_couplings = points, pattern.n_couplings
         self._rows = pattern.indptr, pattern.ends, pattern.columns
@@ -69,6 +79,7 @@ class Smoother:
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
         self._turns, self._sweeps = level.turns, _sweeps_of(level)
+        self.more_sweeps = vertex_sweeps - 1 if pattern.edge_couplings is not None else 0
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
@@ -126,6 +137,13 @@ class Smoother:
             self._sweeps.backward(self.x)
             PETSc.Log.logFlops(self._sweeps.flops)
         self._subtract_ghosts(seen)
+        for _ in range(self.more_sweeps):
+            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+            seen = self.x[self.points.n_owned :].copy()
+            with PETSc.Log.Event(SWEEP):
+                self._sweeps.backward_again(self.x)
+                PETSc.Log.logFlops(self._sweeps.flops)
+            self._subtract_ghosts(seen)
         with PETSc.Log.Event(TRANSFER):
             if self._turns is not None:
                 assert not isinstance(self._sweeps, sweeps.BlockSweeps)
@@ -159,12 +177,19 @@ class Smoother:
             self._coarse.update_ghosts(coarse)
             self._add_interpolated(coarse)
             PETSc.Log.logFlops(self._transfer_flops)
+        for _ in range(self.more_sweeps):
+            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+            self._sweep_after(self._sweeps.forward_ahead)
+            self.points.update_ghosts(self.x)
+        self._sweep_after(self._sweeps.forward)
+
+    def _sweep_after(self, forward: Callable[[Floats, Floats], None]) -> None:
         lagged = self._lagged
         if len(lagged):
             right, self._seen = self.b[lagged], self.x[lagged]
             self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
         with PETSc.Log.Event(SWEEP):
-            self._sweeps.forward(self.b, self.x)
+            forward(self.b, self.x)
             PETSc.Log.logFlops(self._sweeps.flops)
         if len(lagged):
             self.b[lagged] = right
@@ -222,16 +247,18 @@ class VCycle:
     def __init__(self) -> None:
         self._levels: list[Smoother | Coarsest] = []
         self._renew: Callable[[], Iterator[tuple[Array, Array]]] | None = None
-        self._twice_from = 0
+        self._twice_from, self._vertex_sweeps = 0, VERTEX_SWEEPS
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
-        """Read ``-pc_mg_w_from``."""
-        self._twice_from = PETSc.Options(pc.getOptionsPrefix()).getInt("pc_mg_w_from", 0)
+        """Read ``-pc_mg_w_from`` and ``-pc_mg_vertex_sweeps``."""
+        options = PETSc.Options(pc.getOptionsPrefix())
+        self._twice_from = options.getInt("pc_mg_w_from", 0)
+        self._vertex_sweeps = max(1, options.getInt("pc_mg_vertex_sweeps", VERTEX_SWEEPS))
 
     def attach(self, hierarchy: Hierarchy, renew: Callable[[], Iterator[tuple[Array, Array]]]) -> None:
         """Work on these levels, whose present block rows ``renew`` makes; collective."""
         *finer, coarsest = hierarchy.levels
-        self._levels = [*(Smoother(level) for level in finer), Coarsest(coarsest)]
+        self._levels = [*(Smoother(level, self._vertex_sweeps) for level in finer), Coarsest(coarsest)]
         self._renew = renew
 
     def setUp(self, pc: PETSc.PC) -> None:
@@ -295,6 +322,7 @@ class VCycle:
             if isinstance(level, Smoother):
                 lines += [
                     "  down: one backward sweep of block Gauss-Seidel, up: one forward sweep" + between,
+                    *([f"  over the vertices {level.more_sweeps + 1} each"] if level.more_sweeps else []),
                     "  one half of the matrix in single precision",
                 ]
         for line in lines:

@@ -125,6 +125,30 @@ def test_a_sweep_before_and_one_after() -> None:
     np.testing.assert_allclose(residual(), right - dense @ before - owned @ step, rtol=1e-4, atol=1e-3)
 
 
+def test_more_sweeps_over_the_vertices() -> None:
+    pattern, values, dense = mixed_rows(definite=True)
+    owned, upper = parts(dense)
+    n = 3 * N_VERTICES
+    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
+    sweeps.set(values.reshape(-1, 9))
+    b = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)
+    right, x = b[:N_OWNED].astype(float).ravel(), np.zeros((N_LOCAL, 3), dtype=np.float32)
+    sweeps.begin(b)
+    sweeps.backward(x)
+    expected = x[:N_OWNED].astype(float).ravel()
+    expected[:n] += np.linalg.solve(upper[:n, :n], (right - owned @ expected)[:n])
+    sweeps.backward_again(x)
+    np.testing.assert_allclose(x[:N_OWNED].ravel(), expected, rtol=1e-4, atol=1e-5)
+    residual = np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]])
+    np.testing.assert_allclose(residual.ravel(), right - owned @ expected, rtol=1e-4, atol=1e-4)
+
+    x[:] = RNG.normal(size=x.shape)
+    expected = x.astype(float).ravel()
+    expected[:n] += np.linalg.solve(upper[:n, :n].T, (right - dense @ expected)[:n])
+    sweeps.forward_ahead(b, x)
+    np.testing.assert_allclose(x.ravel(), expected, rtol=1e-4, atol=1e-4)
+
+
 def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
     pattern, values, _ = mixed_rows(definite=True)
     sweeps = SweepsWithEdges(pattern, couplings_of(pattern))

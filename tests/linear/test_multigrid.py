@@ -153,6 +153,21 @@ def test_our_cycle_stands_in_the_solvers_view(comm: MPI.Comm, capfd: pytest.Capt
         assert "cycles=V" in capfd.readouterr().out
 
 
+def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
+    comm: MPI.Comm, capfd: pytest.CaptureFixture[str]
+) -> None:
+    content = hanging(40)
+    content["material"]["bending_model"] = "midedge"
+    content["material"]["bending_scale"] = 100.0
+    once, counts = stepped(comm, content, 3, "python", pc_mg_vertex_sweeps=1)
+    assert "over the vertices" not in capfd.readouterr().out
+    twice, fewer = stepped(comm, content, 3, "python", ksp_view="")
+    assert sum(fewer) < sum(counts)
+    assert np.abs(once - twice).max() < 1e-6
+    if comm.rank == 0:
+        assert "over the vertices 2 each" in capfd.readouterr().out
+
+
 def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
     own = {"pc_python_type": f"{__name__}.Scaling"}
     x, counts = stepped(comm, hanging(8), 2, "python", **own)
