@@ -22,8 +22,8 @@ from lyra_petsc.scene.text import parse_json, parse_yaml
 END = 0.05
 """Seconds that runs are shortened to."""
 
-FINE, COARSE = ("size = 0.04;", "size = 0.035;"), "size = 0.1;"
-"""Edges [m] of the default scene's mesh and the tutorial's, as shown and here: most pages run one."""
+COARSE = "size = 0.1;"
+"""Edges [m] of meshes made from the scripts that pages show: most pages run one."""
 
 PATIENCE = 300.0
 
@@ -63,8 +63,7 @@ def shown(page: Path) -> str:
 
 def coarse(script: str) -> str:
     """A mesh script with long edges, whichever it has."""
-    for fine in FINE:
-        script = script.replace(fine, COARSE)
+    script = re.sub(r"\bsize = [0-9.]+;", COARSE, script)
     assert COARSE in script or "size" not in script
     return script
 
