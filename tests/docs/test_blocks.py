@@ -22,7 +22,7 @@ from lyra_petsc.scene.text import parse_json, parse_yaml
 END = 0.05
 """Seconds that runs are shortened to."""
 
-COARSE = "size = 0.1;"
+COARSE = "size = 0.1"
 """Edges [m] of meshes made from the scripts that pages show: most pages run one."""
 
 PATIENCE = 300.0
@@ -63,7 +63,7 @@ def shown(page: Path) -> str:
 
 def coarse(script: str) -> str:
     """A mesh script with long edges, whichever it has."""
-    script = re.sub(r"\bsize = [0-9.]+;", COARSE, script)
+    script = re.sub(r"\bsize = [0-9.]+", COARSE, script)
     assert COARSE in script or "size" not in script
     return script
 
