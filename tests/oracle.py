@@ -62,7 +62,7 @@ def hessian(
     blend: float = 0.0,
     *,
     weight: Array | None = None,
-    before: Array | None = None,
+    predicted: tuple[Array, Array] | None = None,
     n_owned: int | None = None,
 ) -> Array:
     """What a term adds to block rows, as a dense matrix (n_owned, 3, n, 3), at positions or velocities."""
@@ -73,7 +73,7 @@ def hessian(
         term.add_hessian(at, frozen, pattern.offsets, values)
     else:
         weight = np.ones(term.n_elements) if weight is None else weight
-        term.add_hessian(at, frozen, blend, weight, pattern.offsets, values, before)
+        term.add_hessian(at, frozen, blend, weight, pattern.offsets, values, predicted)
     return expanded(pattern, values, n)
 
 
@@ -108,21 +108,25 @@ def directors_along_normals(term: MidEdge, x: Array) -> Array:
 # -- formulas ------------------------------------------------------------------------------------------
 
 
-def membrane_blocks(term: Membrane, x: Array, blend: float, before: Array | None = None) -> Array:
+def membrane_blocks(
+    term: Membrane, x: Array, blend: float, predicted: tuple[Array, Array] | None = None
+) -> Array:
     """Element Hessians (E, 3, 3, 3, 3) of St. Venant-Kirchhoff membranes.
 
-    A (∂E/∂x : C : ∂E/∂x + S : ∂²E/∂x²), with S of the strain linearised at ``before``, and regularised of
-    what extension along the material axes alone makes, none of it compressive.
+    A (∂E/∂x : C : ∂E/∂x + S : ∂²E/∂x²), with S of the strain at z linearised at y, ``predicted``, and
+    regularised of what extension along the material axes alone makes, none of it compressive.
     """
     out = np.empty((term.n_elements, 3, 3, 3, 3))
     area, inverse, (laws, law) = term.elements.data["area"], term.elements.data["inverse"], term.laws
+    before, there = (x, x) if predicted is None else predicted
     for e, points in enumerate(term.stencil):
         c11, c12, c22, c33 = laws[law[e]]
         c = np.array([[c11, c12, 0.0], [c12, c22, 0.0], [0.0, 0.0, c33]])
         shape = np.vstack([-inverse[e].sum(axis=0), inverse[e]])  # ∂F/∂x of each corner
         f = x[points].T @ shape
-        way = f - (x if before is None else before)[points].T @ shape
-        green = 0.5 * (f.T @ f - np.eye(2) - way.T @ way)
+        g = there[points].T @ shape
+        way = g - before[points].T @ shape
+        green = 0.5 * (g.T @ g - np.eye(2) - way.T @ way)
         strain = np.array([green[0, 0], green[1, 1], 2.0 * green[0, 1]])
         extension = np.maximum(strain, 0.0) * [1.0, 1.0, 0.0]
         s = (1.0 - blend) * (c @ strain) + blend * np.maximum(c @ extension, 0.0) * [1.0, 1.0, 0.0]
@@ -213,11 +217,15 @@ def wind_blocks(term: Wind, v: Array, normals: Array) -> Array:
 
 
 def blocks_of(
-    term: Elastic | Viscous, at: Array, frozen: Any, blend: float = 0.0, before: Array | None = None
+    term: Elastic | Viscous,
+    at: Array,
+    frozen: Any,
+    blend: float = 0.0,
+    predicted: tuple[Array, Array] | None = None,
 ) -> Array:
     """Element Hessians (E, k, k, 3, 3) by the plain formulas, or what a term has for each element."""
     if isinstance(term, Membrane):
-        return membrane_blocks(term, at, blend, before)
+        return membrane_blocks(term, at, blend, predicted)
     if isinstance(term, Bending):
         return bending_blocks(term, at, blend)
     if isinstance(term, Wind):

@@ -88,12 +88,12 @@ class BlockRows:
         blend: float,
         weight: Array | float,
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
         weights = np.ascontiguousarray(weights)  # as kernels are compiled for
-        term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, before)
+        term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, predicted)
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""

@@ -56,6 +56,8 @@ class Convergence:
         Mean of recent linear iterations per Newton iteration, which the limit is for.
     stopped_by : str
         The option that ended the solve while the scene's force tolerance was not met; or nothing.
+    farthest : float
+        Way [m] of a coordinate in an iteration beyond which the solve is given up.
     """
 
     def __init__(
@@ -69,7 +71,7 @@ class Convergence:
     ) -> None:
         self._equations, self._tolerances, self._spacing, self._floor = equations, tolerances, spacing, floor
         self._linear_limit = linear_limit
-        self.usual = 0.0
+        self.usual, self.farthest = 0.0, np.inf
         self.begin()
 
     def begin(self) -> None:
@@ -106,7 +108,10 @@ class Convergence:
             return NOT_A_NUMBER
         if iteration > 0:
             increment = snes.getSolutionUpdate().norm(PETSc.NormType.INFINITY)
-            self._moved_by(increment * self._equations.stage.reach)
+            moved = increment * self._equations.stage.reach
+            if moved > self.farthest:
+                return int(Reason.DIVERGED_MAX_IT)
+            self._moved_by(moved)
             self.usual += RECENT * (spent - self._spent - self.usual)
         stalls = iteration > 0 and STALLED * before < residual <= self._floor
         self._stalled = self._stalled + 1 if stalls else 0

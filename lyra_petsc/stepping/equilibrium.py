@@ -1,8 +1,9 @@
 """Static equilibrium at a load factor, by proximal steps: backward Euler from rest with growing Δτ.
 
-Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian where the
-shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy, until
-the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
+A load step begins where the polynomial through the last equilibria leads, with their stress in the first
+Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian
+where the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy,
+until the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
 are taken anew before every solve, under-relaxed.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
@@ -12,12 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.scene.schema import Solver
+from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.newton_trace import Iteration, Stuck
 from lyra_petsc.stepping.relaxation import Relaxation
@@ -52,6 +55,9 @@ LEAP, LEAP_ITERATIONS = 1e3, 20
 
 LONGEST = 1e7
 """Largest Δτ over the first one: beyond it the last term is round-off."""
+
+ANY = float(np.finfo(np.float64).max)
+"""Beyond all Δτ."""
 
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
@@ -100,7 +106,9 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
-        self._sufficed = 0.0
+        # factors tell at once how far the first load would lead
+        self._sufficed = ANY if stepper.linear.factors else 0.0
+        self._extrapolation = Extrapolation(system.points.comm)
         self._follows = bool(system.active.viscous) or any(load.follows for load in system.active.loads)
         system.applied.factor = 0.0
         system.begin_step(0.0, 0.0)
@@ -116,6 +124,7 @@ class Equilibrium:
         system.applied.factor = factor
         newton = linear = solves = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not self._follows
+        self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
         attempt = Attempt(False, 0, 0, 0.0)
@@ -138,7 +147,7 @@ class Equilibrium:
             system.applied.given = relaxation.following(system.applied.now.copy()) if self._follows else None
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
-            system.applied.given = None
+            system.applied.given = self._integrator.ahead = None
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
@@ -170,12 +179,14 @@ class Equilibrium:
         )
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
-        """A proximal step, given up after ``most`` Newton iterations; collective."""
-        snes = self._stepper.snes
+        """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""
+        snes, convergence = self._stepper.snes, self._stepper.convergence
         allowed = snes.getTolerances()[3]
         snes.setTolerances(max_it=min(allowed, most or allowed))
+        convergence.farthest = self._size if most else np.inf
         attempt = self._stepper.attempt(before, factor)
         self._stepper.snes.setTolerances(max_it=allowed)
+        self._stepper.convergence.farthest = np.inf
         return attempt
 
     def settle(self, before: float, factor: float) -> Settled:
@@ -222,15 +233,20 @@ class Equilibrium:
         system.moving_energy_before = anchored
         return Settled(found, newton, linear, _note(found, followed, words))
 
-    def memory(self) -> dict[str, float]:
-        """What a checkpoint must hold to go on alike."""
-        return {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
+    def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Arrays (n_owned, 3) and numbers to go on with from the equilibrium at ``factor``; collective."""
+        self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned])
+        arrays, past = self._extrapolation.memory()
+        numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
+        return arrays, numbers | {"extrapolation": past}
 
-    def restore(self, memory: Mapping[str, float]) -> None:
+    def restore(self, arrays: Mapping[str, Array], memory: Mapping[str, Any], factor: float) -> None:
         """Go on with a memory; an older one is empty."""
         self._scale = float(memory.get("scale", self._scale))
         self._in_vain = int(memory.get("in_vain", self._in_vain))
         self._sufficed = float(memory.get("sufficed", self._sufficed))
+        x = self._system.x[: self._system.points.n_owned]
+        self._extrapolation.restore(arrays, memory.get("extrapolation", {}), factor, x)
 
     @property
     def in_vain(self) -> bool:

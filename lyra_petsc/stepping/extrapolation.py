@@ -1,4 +1,4 @@
-"""Initial guess of the linear solve of a semi-implicit step: a polynomial in time through past velocities."""
+"""Where a solve starts: on a polynomial through past velocities in time, or equilibria in the load factor."""
 
 from __future__ import annotations
 

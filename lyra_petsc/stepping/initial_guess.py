@@ -2,7 +2,7 @@
 
 The former is right where the motion is smooth, as those who choose a second-order integrator expect it to be.
 In stiff sheets that crumple, going on along the tangents stretches the sheet by far more than the step will,
-and staying is nearer; the objective tells.
+and staying is nearer; the objective tells. An equilibrium is sought from where those before it lead.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
@@ -18,8 +19,11 @@ Array = NDArray[np.float64]
 def first_guess(system: StageEquations, out: Array) -> None:
     """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
     n = system.points.n_owned
-    if system.integrator.lagged_loads:
-        out[:] = 0.0
+    if isinstance(system.integrator, Static):
+        ahead, out[:] = system.integrator.ahead, 0.0
+        if ahead is not None and not system.discretisation.guards:
+            out[:] = ahead / system.integrator.pseudo
+            system.leap()
         system.prescribe(out)
         return
     going_on = system.v[:n].copy()

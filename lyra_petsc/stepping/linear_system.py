@@ -45,6 +45,8 @@ class LinearSystem:
         May be the same.
     cycles : bool
         The latter is a cycle of multigrid.
+    factors : bool
+        It is exact factors of a matrix.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class LinearSystem:
         # else the preconditioner is built from the operator's own values
         self._regularised = iterates and hessian != "regularised" and not direct and not self._one_matrix
         self._shifts = not direct
+        self.factors = PETSc.Options().getString("pc_type", "") in ("cholesky", "lu")
         self.cycles = multigrid.is_asked_for()
         self._interpolations: list[InterpolationRows] | None = None
         self._multigrid: Multigrid | None = None
@@ -155,6 +158,8 @@ class LinearSystem:
             self.preconditioner.set(self.operator.rows, self.shift.value)
             return
         assert self._ksp is not None
+        # an equilibrium's Newton steps are large, and factors cost less than one more
+        keep = keep and (self._equations.integrator.moves or not self.factors)
         self.kept = keep
         self.same = convex and not keep and shows_negative_curvature(self._ksp.getPC())
         if self.same:

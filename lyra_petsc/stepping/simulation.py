@@ -458,7 +458,11 @@ class SteppedScene:
             "estimated_error": self.estimated_error,
             "integrator": self._numbers(),
             **self.stepper.memory(self.time)[1],
-            **({"equilibrium": self._seek.memory()} if isinstance(self._seek, Equilibrium) else {}),
+            **(
+                {"equilibrium": self._seek.memory(self.time)[1]}
+                if isinstance(self._seek, Equilibrium)
+                else {}
+            ),
             "energy": None if self.guard is None else self.guard.memory(),
             "late_starts": sorted(self.problem.system.reference.late),
         }
@@ -471,6 +475,8 @@ class SteppedScene:
         """Arrays of rows (n_owned, 3) that a checkpoint must hold beside positions and velocities."""
         arrays = dict(self.problem.system.integrator.memory()[0])
         arrays |= self.ledger.memory()[0] | self.stepper.memory(self.time)[0]
+        if isinstance(self._seek, Equilibrium):
+            arrays |= self._seek.memory(self.time)[0]
         if self.local_error is not None:
             arrays |= self.local_error.memory()[0]
         return arrays
@@ -545,7 +551,7 @@ class SteppedScene:
         self.ledger.restore(arrays, memory["budget"])
         self.control.restore(memory)
         if isinstance(self._seek, Equilibrium):
-            self._seek.restore(memory.get("equilibrium", {}))
+            self._seek.restore(arrays, memory.get("equilibrium", {}), self.time)
         self.estimated_error = float(memory["estimated_error"])
         system.integrator.restore(arrays, memory["integrator"])
         if self.guard is not None and memory.get("energy"):  # older ones have none

@@ -48,7 +48,7 @@ FARTHEST_TURN = 0.5
 SEARCHES = 16
 """For what is near, at most, on the way of a Newton iteration or of handles in a step."""
 
-LEAST = 1e-6
+LEAST = 1e-10
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
 
 
@@ -148,7 +148,9 @@ class StageEquations:
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
         self.followers: list[Follower] = [integrator]
         self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
-        self._iterates: tuple[Array | None, Array | None] = (None, None)
+        self._iterate: Array | None = None
+        self._predicted: tuple[Array, Array] | None = None
+        self._leaps = False
         self._last_parts: dict[str, Array] = {}
 
     @property
@@ -596,12 +598,17 @@ class StageEquations:
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
 
-        Its stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
+        Their stress is then as independent as in a mixed method, and stiff sheets converge as soft ones do.
         """
-        if v is None:
-            self._iterates = None, None
-        else:
-            self._iterates = self._iterates[1], self.evaluate_at(v)[0].copy()
+        before, self._predicted = self._iterate, None
+        self._iterate = None if v is None else self.evaluate_at(v)[0].copy()
+        if before is not None and self._iterate is not None:
+            self._predicted = before, before if self._leaps else self._iterate
+        self._leaps = False
+
+    def leap(self) -> None:
+        """Newton's method starts far from the state, whose stress the first Jacobian takes."""
+        self._iterate, self._leaps = self.x.copy(), True
 
     def forget_rows(self) -> None:
         """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
@@ -613,9 +620,9 @@ class StageEquations:
         ``blend`` 0 takes the exact elastic Hessian, 1 the regularised one, between them a mixture.
         """
         x, vs = self.evaluate_at(v)
-        rows, before = self.discretisation.rows, self._iterates[0]
-        if before is not None and len(before) != len(x):
-            before = None  # an iterate with other ghosts
+        rows, predicted = self.discretisation.rows, self._predicted
+        if predicted is not None and len(predicted[0]) != len(x):
+            predicted = None  # of an iterate with other ghosts
         lagged = self.integrator.lagged_loads
         self._last_parts = {} if lagged else self._last_parts
         for remembered in self._asked_once:  # the linear solve needs the room
@@ -628,7 +635,7 @@ class StageEquations:
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
             self.damping.into(values, inertia)
             for term in self.active.elastic:
-                rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, before)
+                rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, predicted)
         if not lagged:
             for wind in self.active.viscous:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)

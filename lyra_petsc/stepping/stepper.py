@@ -370,6 +370,11 @@ class Stepper:
         self.start(time, step)
 
     @property
+    def convergence(self) -> Convergence:
+        """The test that ends its nonlinear solves."""
+        return self._newton.convergence
+
+    @property
     def stopped_by(self) -> str:
         """The option that ended the last solve short of the scene's force tolerance; or nothing."""
         return self._newton.convergence.stopped_by

@@ -129,7 +129,7 @@ class Bending(Elastic):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         corners, sides, hinges = self._triangles
         within, across, bent = offsets[self.name], offsets[f"{self.name} across"], self._bent(x)

@@ -319,7 +319,7 @@ class ContactBarrier(Elastic):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         met = self.meeting(x, frozen.now)
         pairs = self.pairs(met)

@@ -257,7 +257,7 @@ class MidEdge(Elastic):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         data, shape = self.elements.data, self._shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape

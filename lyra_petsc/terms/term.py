@@ -230,12 +230,13 @@ class Elastic(Term):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         """Add weight (E,) × element Hessians [N/m] to block rows (n_blocks, 3, 3).
 
-        ``offsets`` are a pattern's, by the names of ``couplings``. ``before`` (n_local, 3) is the Newton
-        iterate before x: an exact Hessian may take the stress that its linearised strain predicts at x.
+        ``offsets`` are a pattern's, by the names of ``couplings``. ``predicted`` are
+        positions y and z (n_local, 3): an exact Hessian may take the stress of the strain at z, linearised at
+        y.
         """
         self._scatter(
             lambda lo, hi, out: self.hessians(x, frozen, lo, hi, blend, out), weight, offsets, values

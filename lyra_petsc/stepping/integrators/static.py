@@ -17,6 +17,8 @@ class Static(Integrator):
     ----------
     pseudo : float
         Pseudo time step [s]: the larger, the closer to equilibrium a solve gets.
+    ahead : (n_owned, 3) or None
+        Way [m] that the next solve is expected to go; where Newton's method starts.
     """
 
     name = "static"
@@ -26,6 +28,7 @@ class Static(Integrator):
 
     def __init__(self) -> None:
         self.pseudo = 1.0
+        self.ahead: Array | None = None
 
     def stage_after(self, dt: float) -> float:
         return dt

@@ -34,6 +34,7 @@ CASES: Registry[VerificationCase] = Registry(
         "scordelis-lo-roof": "shells",
         "pinched-cylinder": "shells",
         "open-hemisphere": "shells",
+        "hyperbolic-paraboloid": "shells",
         "twisted-beam": "shells",
         "open-cylinder": "shells",
         "hinged-roof": "shells",

@@ -286,6 +286,31 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
 
 
 @case(
+    "Hyperbolic paraboloid z = x² − y² that is clamped at one side, a thousandth as thick as wide, under its "
+    "weight, a half of it, bending_model: midedge: deflection in the middle of the opposite side",
+    source=TABLES["hyperbolic_paraboloid"]["source"],
+    resolutions=(16, 32, 64),
+    claim=at_finest(1e-2),
+)
+def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
+    part, cells = 1e-2, round(n)  # of the load, which alone would bend it far
+    for pattern in PATTERNS:
+        material = {"young": 2e11, "poisson": 0.3, "thickness": 1e-3, "density": 1.0}
+        gravity = [0.0, 0.0, -8.0 * part]
+        held = [{"box": _on("x", -0.5, 1.0), "clamp": True}, *_symmetric("y", 1.0)]
+
+        def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
+            x, y = s - 0.5, 0.5 * t
+            return x, y, x**2 - y**2
+
+        _, way = _curved(bench, cells, pattern, surface, material, gravity=gravity, handles=held)
+        deflection = float(-way[cells, 2]) / part
+        yield Measured(
+            f"deflection, {pattern}", deflection, TABLES["hyperbolic_paraboloid"]["deflection"], "m"
+        )
+
+
+@case(
     "Beam twisted by a right angle, very thin, with a force at its end in its plane there or across it, "
     "bending_model: midedge: way of the force",
     source=TABLES["twisted_beam"]["source"],
