@@ -299,11 +299,11 @@ class KesReport(Block):
     ----------
     B : float or (2,) [gf·cm²/cm]
         Bending stiffness.
-    2HB : float or (2,) [gf·cm/cm]
+    width_of_bending : float or (2,) [gf·cm/cm]
         Width of the loop of bending: twice ``friction_moment``.
     G : float or (2,) [gf/(cm·degree)]
         Shear stiffness, of which the mean counts.
-    2HG : float or (2,) [gf/cm]
+    width_of_shear : float or (2,) [gf/cm]
         Width of the loop of shear, likewise: twice ``friction_force``.
     """
 
