@@ -361,16 +361,18 @@ def loop_height(bending_length: float, strip: float) -> float:
     ArithmeticError
         If Newton's method does not converge.
     """
-    last, unknowns, ends = (0.5 * strip / bending_length) ** 3, np.array([-4.9, -8.8]), (0.0, 0.0, 0.0)
-    for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)):
+    last, slope, pull = (0.5 * strip / bending_length) ** 3, -4.9, -8.8
+    ends, tiny = (0.0, 0.0, 0.0), 1e-6
+    for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)).tolist():
         for _ in range(50):
-            ends = _shot(*unknowns, weight)
-            left = np.array(ends[:2])
-            if np.abs(left).max() < 1e-10:
+            ends = _shot(slope, pull, weight)
+            if max(abs(ends[0]), abs(ends[1])) < 1e-10:
                 break
-            columns = [(np.array(_shot(*(unknowns + e), weight)[:2]) - left) / 1e-6 for e in 1e-6 * np.eye(2)]
-            way = -np.linalg.solve(np.array(columns).T, left)
-            unknowns = unknowns + way / max(1.0, abs(way[0]), abs(way[1]) / 5.0)
+            sides = _shot(slope + tiny, pull, weight), _shot(slope, pull + tiny, weight)
+            matrix = [[(side[i] - ends[i]) / tiny for side in sides] for i in range(2)]
+            one, two = np.linalg.solve(matrix, [-ends[0], -ends[1]]).tolist()
+            most = max(1.0, abs(one), abs(two) / 5.0)
+            slope, pull = slope + one / most, pull + two / most
         else:
             raise ArithmeticError("the heart loop's elastica was not found")
     return -0.5 * strip * ends[2]
