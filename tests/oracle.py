@@ -12,8 +12,10 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
+from lyra_petsc.terms.hinge_friction import HingeFriction
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge, mean_directors
+from lyra_petsc.terms.midedge_friction import MidEdgeFriction
 from lyra_petsc.terms.midedge_shape import Frames, carried, fading_tangent, tangent_of, unit
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
@@ -144,20 +146,31 @@ def membrane_blocks(
 
 def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
     """Element Hessians (E, 4, 4, 3, 3) of hinges, each from its four points."""
-    data, sides = term.elements.data, term._triangles.sides
+    sides = term._triangles.sides
     out, g = np.empty((term.n_elements, 4, 4, 3, 3)), np.empty((4, 3))
     angles, limits = dihedral_angles(x, term.stencil), term._limit[sides[:-1] >> 2]
+    stiffness, rest = term.law(angles)
     for e, points in enumerate(term.stencil):
         corners = [tuple(x[p].tolist()) for p in points]
-        law = data["k"][e], data["rest_angle"][e], (limits[e, 0], limits[e, 1])
+        law = stiffness[e], rest[e], (limits[e, 0], limits[e, 1])
         hinge_hessian(*corners, angles[e], *law, blend, g, out[e])
+        if isinstance(term, HingeFriction) and abs(angles[e] - term.bent[e]) > term._friction.give[e]:
+            # what slides has no stiffness
+            out[e] -= (1.0 - blend) * 2.0 * stiffness[e] * np.einsum("ai,bj->abij", g, g)
     return out
 
 
-def midedge_blocks(term: MidEdge, x: Array, frames: Frames, blend: float, out: Array) -> None:
+def midedge_blocks(
+    term: MidEdge | MidEdgeFriction, x: Array, frames: Frames, blend: float, out: Array
+) -> None:
     """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
-    data, shape = term.elements.data, term._shape(x, frames)
-    stiffness, rest, limit = term._constants
+    data, friction = term.elements.data, np.zeros((term.n_elements, 2))
+    if isinstance(term, MidEdge):
+        (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
+        shape = term.shape(x, frames)
+    else:
+        stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
+        edges, shape = term._edges, term._sheet.shape(x, frames)
     for e, points in enumerate(term.stencil):
         corners, k = x[points], np.empty((3, 3))
         k[np.triu_indices(3)] = k.T[np.triu_indices(3)] = stiffness[e]
@@ -165,7 +178,7 @@ def midedge_blocks(term: MidEdge, x: Array, frames: Frames, blend: float, out: A
         area = np.cross(sides[1], sides[2])  # 2A n
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
-        director, spin, about = shape[term.of_edges.of_triangles[e]].reshape(3, 3, 3).transpose(1, 0, 2)
+        director, spin, about = shape[edges[e]].reshape(3, 3, 3).transpose(1, 0, 2)
         angles = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
         t, t1, t2, s, s1, s2 = np.array(angles).T
         omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double
@@ -187,11 +200,13 @@ def midedge_blocks(term: MidEdge, x: Array, frames: Frames, blend: float, out: A
             gradients[i, 9 + i] = data["sign"][e, i] / data["length"][e, i]
         bend = own @ (t - rest[e]) * t2 + between @ further * s2
         curved += gradients.T * bend @ gradients
+        curved += friction[e, 0] * np.outer(pull @ gradients, pull @ gradients)
         stiff = t1[:, None] * own * t1 + s1[:, None] * between * s1
         found = gradients.T @ stiff @ gradients + (1.0 - blend) * curved
         if double**2 < limit[e]:
             weight, first, second = fade(double**2, limit[e])
             energy = 0.5 * ((t - rest[e]) @ own @ (t - rest[e]) + further @ between @ further)
+            energy += friction[e, 1]
             force = pull @ gradients
             bent, slopes = np.zeros((4, 4, 3, 3)), np.zeros(12)
             slopes[:9] = 2.0 * np.cross(area, sides).ravel()
@@ -244,7 +259,7 @@ def plain_hessian(term: Elastic, at: Array, frozen: Any, blend: float) -> Array:
     points, unknowns = 3 * term.stencil[:, :, None] + np.arange(3), term.edges
     index = np.concatenate([points.reshape(len(points), -1), unknowns], axis=1)
     out, blocks = np.zeros((at.size, at.size)), np.empty((len(index), index.shape[1], index.shape[1]))
-    if isinstance(term, MidEdge):
+    if isinstance(term, (MidEdge, MidEdgeFriction)):
         midedge_blocks(term, at, frozen, blend, blocks)
     else:
         term.hessians(at, frozen, 0, term.n_elements, blend, blocks)

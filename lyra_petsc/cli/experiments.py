@@ -233,6 +233,60 @@ def stress(
     return _run(comm, results, cases, run, known)
 
 
+def fabric(
+    comm: MPI.Comm,
+    test: str,
+    material: str | None,
+    cloth: str | None,
+    settings: Sequence[str],
+    *,
+    out: Path | None,
+    force: bool,
+    ranks: int | None,
+    only: str | None,
+    job: Path | None,
+) -> int:
+    """Run textile tests; the exit code; collective.
+
+    Raises
+    ------
+    InputError
+        An unknown test or cloth, a bad scene, or a folder that cannot be used; nothing has run then.
+    Interrupted
+        A signal; what had been done is in the folder.
+    """
+    from lyra_petsc.experiments.fabric import records, textile_tests
+    from lyra_petsc.experiments.fabric.specimens import fabric_of
+
+    if (material is None) == (cloth is None):
+        raise InputError("give a material: a cloth's name or a scene file, once", key="fabric")
+    named = material or cloth or ""
+    cases = textile_tests.cases_of(test)
+    tested = on_root(comm, lambda: fabric_of(named, settings))
+    for case in cases:
+        if case.test not in ("tensile", "shear"):
+            tested.needs_bending(case.test)
+    launcher = case_launcher(comm, "fabric", ranks)
+    asked = [named, *words_of({"--set": settings})]
+    watch = watched(comm)
+
+    def run(case: records.FabricCase) -> records.FabricOutcome:
+        if launcher is not None:
+            return textile_tests.launched(launcher, case, asked, watch)
+        return textile_tests.run_case(comm, case, tested, watch)
+
+    if job is not None:
+        outcome = run(next(case for case in cases if case.name == only))
+        on_root(comm, lambda: records.save(outcome, job))
+        return 0 if outcome.passed else FAILED
+    first = Path("fabric") / f"{Path(named).stem}-{test}"
+    folder = out or on_root(comm, lambda: first if force else free_name(first))
+    again = command(comm, "fabric", [test, *asked, *words_of({"--ranks": ranks})])
+    view = records.Fabric(named)
+    results = Results(comm, folder, view, ranks=ranks or comm.size, command=again, force=force)
+    return _run(comm, results, cases, run, len(cases))
+
+
 def _run(
     comm: MPI.Comm, results: Results[Any], cases: Sequence[Any], run: Callable[[Any], Any], known: int
 ) -> int:

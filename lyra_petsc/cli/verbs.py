@@ -192,6 +192,30 @@ def stress(comm: Any, /, **asked: Any) -> int:
     return stress_cases(comm, **asked)
 
 
+@verb(
+    "lyra-petsc fabric bending gray-interlock",
+    "mpirun -n 2 lyra-petsc fabric cantilever scene.yaml",
+    "lyra-petsc fabric all --cloth 11oz-black-denim",
+)
+@click.argument("test")
+@click.argument("material", required=False)
+@click.option("--cloth", metavar="NAME", help="A cloth of the library, instead of MATERIAL.")
+@settings
+@out
+@click.option("--force", is_flag=True, help="Write into DIR also if it exists.")
+@click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks for each test.")
+@click.option("--only", hidden=True)
+@click.option("--job", type=click.Path(path_type=Path), hidden=True)
+def fabric(comm: Any, /, **asked: Any) -> int:
+    """Run a standard textile test on MATERIAL, a cloth of the library or a scene's first material.
+
+    TEST is tensile, shear, bending, cantilever, loop, cusick, or all of them.
+    """
+    from lyra_petsc.cli.experiments import fabric as textile_tests
+
+    return textile_tests(comm, **asked)
+
+
 @verb("lyra-petsc info")
 def info(comm: Any) -> None:
     """Print versions and what does not fit together."""
@@ -202,5 +226,5 @@ def info(comm: Any) -> None:
         click.echo(text)
 
 
-for command in (check, export, info, new, render, report, run, stress, study, verify, view):
+for command in (check, export, fabric, info, new, render, report, run, stress, study, verify, view):
     verbs.add_command(command)

@@ -128,7 +128,7 @@ class Trial:
                 directors = term.anew(problem.system.x)
                 problem.system.x.reshape(-1)[term.edge_places[own]] = directors[own]
                 problem.points.update_ghosts(problem.system.x)
-                problem.system.active.frozen[term] = term.frames
+                problem.system.active.refreeze({term: term.frames})
         self.simulation.ledger.measure()  # from which steps reckon what they did to energy
 
     def total(self, owned: Array) -> float:

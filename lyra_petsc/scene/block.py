@@ -24,7 +24,7 @@ _UNIT = re.compile(r"\[([^\]]*)\]")
 
 
 class Block(BaseModel):
-    """A block of keys; attribute names are the keys, but for ``from`` (attribute ``start``)."""
+    """A block of keys; attribute names are the keys, but for those that are no names in Python."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -102,7 +102,8 @@ class Block(BaseModel):
 
     def get(self, key: str) -> Any:
         """The value of a key of `keys`, None where it is absent."""
-        return getattr(self, "start" if key == "from" else key)
+        aliases = {field.alias: name for name, field in type(self).model_fields.items() if field.alias}
+        return getattr(self, aliases.get(key, key))
 
     def given(self, *keys: str) -> list[str]:
         """Those of ``keys`` that have a value."""

@@ -46,6 +46,7 @@ from lyra_petsc.scene.values import (
     Name,
     NonNegative,
     Number,
+    Pair,
     Poisson,
     Positive,
     PositiveScale,
@@ -289,6 +290,36 @@ _CURVE = {
 Curve = Annotated[Points, BeforeValidator(_curve), JsonSchema(_CURVE)]
 
 
+class KesReport(Block):
+    """Numbers of a KES-F report as it prints them; each takes the place of the material's own.
+
+    One number, or two along warp and weft.
+
+    Attributes
+    ----------
+    B : float or (2,) [gf·cm²/cm]
+        Bending stiffness.
+    width_of_bending : float or (2,) [gf·cm/cm]
+        Width of the loop of bending: twice ``friction_moment``.
+    G : float or (2,) [gf/(cm·degree)]
+        Shear stiffness, of which the mean counts.
+    width_of_shear : float or (2,) [gf/cm]
+        Width of the loop of shear, likewise: twice ``friction_force``.
+    """
+
+    B: Pair | None = None
+    width_of_bending: Pair | None = Field(default=None, alias="2HB")
+    G: Pair | None = None
+    width_of_shear: Pair | None = Field(default=None, alias="2HG")
+
+    @field_validator("B", "G")
+    @classmethod
+    def _positive(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and min(value) <= 0.0:
+            raise problem(f"must be > 0, not {shown(min(value))}")
+        return value
+
+
 class LawCurves(Block):
     """One's own measurements: force [N/m], per width at rest, by strain.
 
@@ -386,6 +417,13 @@ class Material(Block):
         t: density × t, membrane × t, bending × t³.
     rest_curvature : (3,) [1/m] or None
         Curvature κ11, κ22, κ12 at rest, in the material axes.
+    friction_moment : float or (2,) [N m/m]
+        Moment per width by which friction within the fabric resists bending, of warp and weft: hysteresis,
+        and folds that stay. Half of KES's 2HB. Scaled as bending.
+    friction_force : float [N/m]
+        Force per width by which it resists shear, half of 2HG. Scaled as membrane.
+    kes : KesReport or None
+        Instead of bending, c33, friction_moment and friction_force.
     """
 
     rules = (
@@ -419,6 +457,14 @@ class Material(Block):
             "or leave law out",
             "law",
         ),
+        *(
+            Rule(
+                {"not": given(kes=given(name), **{key: {"not": {"enum": [None, 0]}}})},
+                f"kes has {name}, which takes its place; leave one of them out",
+                key,
+            )
+            for name, key in (("B", "bending"), ("2HB", "friction_moment"), ("2HG", "friction_force"))
+        ),
     )
     sometimes_filled = frozenset({"bending_model"})
 
@@ -439,6 +485,9 @@ class Material(Block):
     bending_scale: NonNegative = 1.0
     thicken: Positive = 1.0
     rest_curvature: Vector | None = None
+    friction_moment: Pair | None = None
+    friction_force: NonNegative | None = None
+    kes: KesReport | None = None
 
     @classmethod
     def complete(cls, data: dict[str, Any]) -> dict[str, Any]:
@@ -446,6 +495,9 @@ class Material(Block):
         by_curves = isinstance(data.get("law"), (dict, LawCurves)) and not {"cloth", "young"} & data.keys()
         if "membrane" in data or by_curves:
             data = {"bending": 0.0, **data}
+        membrane, kes = data.get("membrane"), data.get("kes")
+        if isinstance(membrane, dict) and isinstance(kes, dict) and kes.get("G") is not None:
+            data["membrane"] = {"c33": 1.0, **membrane}  # which counts for nothing
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))
         return {"bending_model": "midedge" if isotropic or plate else "hinge", **data}

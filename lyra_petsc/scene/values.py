@@ -97,6 +97,17 @@ def vector(value: Any) -> Vec3:
     return x, y, z
 
 
+def _pair(value: Any) -> tuple[float, float]:
+    """A number that counts twice, or two, none of them negative."""
+    values = value if isinstance(value, (list, tuple)) else (value, value)
+    if len(values) != 2:
+        raise problem(f"must be a number, or two (warp, weft), not {shown(value)}")
+    one, two = (number(entry) for entry in values)
+    if min(one, two) < 0.0:
+        raise problem(f"must be >= 0, not {shown(value)}")
+    return one, two
+
+
 def _axis(value: Any) -> Vec3:
     axis = vector(value)
     if math.hypot(*axis) < 1e-150:
@@ -234,6 +245,11 @@ Vector = Annotated[Vec3, Value(VECTOR, vector)]
 Axis = Annotated[Vec3, Value(VECTOR | {"contains": {"not": {"const": 0}}}, _axis)]
 Scale = Annotated[float | Vec3, _one_or_three(_NONZERO)]
 PositiveScale = Annotated[float | Vec3, _one_or_three(_NONZERO, _ABOVE_ZERO)]
+_PART: Condition = FINITE | {"minimum": 0}
+Pair = Annotated[
+    tuple[float, float],
+    Value({"anyOf": [_PART, {"type": "array", "items": _PART, "minItems": 2, "maxItems": 2}]}, _pair),
+]
 Bending = Annotated[float | Vec3, _one_or_three(({"minimum": 0}, "must be >= 0 [N·m], not VALUE"))]
 Count = Annotated[int, _whole(1, LARGEST_INDEX)]
 INDEX = _whole(0, LARGEST_INDEX)

@@ -55,6 +55,13 @@ class ActiveTerms:
         self.frozen = {}  # there is no room for both
         self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
 
+    def refreeze(self, found: Mapping[Term, Any]) -> None:
+        """Let terms, and those that follow them, have frozen this."""
+        following: dict[Term, Any] = {
+            term: found[term.follows] for term in self.elastic if term.follows and term.follows in found
+        }
+        self.frozen = {**self.frozen, **found, **following}
+
     def turn_targets(self, step: UpcomingStep) -> None:
         """Let targets that move with handles stand where they do at ``step.at``."""
         self.frozen = self.frozen | {term: term.freeze(step) for term in (*self.moving, *self.constraints)}

@@ -31,7 +31,8 @@ class Budget:
     """Energies [J] at a state, and cumulative works [J] up to it.
 
     ``external_work`` is that of handles, springs and loads other than gravity, ``dissipation`` that of
-    material damping; ``more`` are the energies of terms with a column of their own.
+    material damping and of friction within the fabric; ``more`` are the energies of terms with a column of
+    their own.
     """
 
     kinetic: float = 0.0
@@ -115,7 +116,8 @@ class Ledger:
         for term in system.active.elastic:
             entry = term.registration
             if entry.energy:
-                energy = float(term.energies(system.x, system.active.frozen[term]).sum())
+                frozen = system.active.frozen[term]
+                energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
                 local[columns.index(entry.energy)] += energy
                 self._moving += energy if term.moving else 0.0
         for load in system.active.loads:
@@ -149,6 +151,7 @@ class Ledger:
         if "damping" in parts:
             local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
             damping = parts["damping"].take(self._at)
+        local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         del parts, external, moved  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)

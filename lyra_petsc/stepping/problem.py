@@ -293,9 +293,9 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     on_vertices = part.vertex_data["mass"]
     terms = {n: made(registered(n), part.elements.get(n), scene, on_vertices) for n in outline.terms}
     _set_up_contact(scene, outline, terms, layout, mesh)
-    for load in terms.values():
-        if isinstance(load, Load):
-            load.connect(terms.values())
+    for term in terms.values():
+        if isinstance(term, (Elastic, Load)):
+            term.connect(terms.values())
     integrator = integrator_of(scene.time.scheme, _spectral_radius(scene))
     roles = {Role.ELASTIC, Role.CONSTRAINT} | (set() if integrator.lagged_loads else {Role.VISCOUS})
     coupling = [term for term in terms.values() if term.registration.role in roles]

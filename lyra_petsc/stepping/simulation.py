@@ -163,6 +163,9 @@ class SteppedScene:
         self.stepper.start(0.0, 0)
         if self.problem.points.n_edges_global and not self.stepper.settle_edges(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
+        for term in system.active.elastic:
+            if term.registration.element_vertices:  # friction, which knows of no way before the start
+                term.begin(system.x)
         self._seek: Equilibrium | Stepper = self.stepper
         if scene.time.analysis == "static":
             self._seek = Equilibrium(system, self.stepper, scene.solver, outline.spacing, outline.size, floor)
@@ -285,7 +288,8 @@ class SteppedScene:
                 f"method at a residual of {attempt.residual:.2g} N, short of solver.force_tolerance"
             )
         for term in system.active.elastic:
-            if term.registration.state or term.registration.edge_state:
+            entry = term.registration
+            if entry.state or entry.edge_state or entry.element_vertices:
                 term.accept(system.x, system.active.frozen[term])
         system.begin(self.time)
         self.stepper.monitor()
@@ -500,13 +504,17 @@ class SteppedScene:
         return found
 
     def element_states(self) -> dict[str, Array]:
-        """What terms keep in a checkpoint of elements that change: (E, n + m) each, of which the first n are
-        numbers of vertices in the mesh.
+        """What terms keep in a checkpoint of elements: (E, n + m) each, of which the first n are numbers of
+        vertices in the mesh.
         """
         layout, found = self.problem.points, {}
-        for term in self.problem.system.active.near:
+        for term in self.problem.system.active.elastic:
             if term.registration.element_vertices:
-                vertices, values = term.element_state()
+                if term.registration.neighbours:
+                    vertices, values = term.element_state()
+                else:
+                    vertices = layout.global_number[term.stencil[: term.n_owned]]
+                    values = term.element_values()[: term.n_owned]
                 numbers = layout.in_mesh()[layout.local(vertices.ravel())].reshape(vertices.shape)
                 found[term.name] = np.concatenate([numbers, values], axis=1)
         return found
@@ -518,6 +526,9 @@ class SteppedScene:
         sent = [np.flatnonzero((owner == rank).any(axis=1)) for rank in range(comm.size)]
         came = comm.alltoall([(vertices[rows], values[rows]) for rows in sent])
         vertices, values = (np.concatenate(part) for part in zip(*came, strict=True))
+        if not term.registration.neighbours:
+            _restore_values(term, layout.global_number[term.stencil], vertices, values)
+            return
         term.restore_elements(vertices, values, range(layout.start, layout.start + layout.n_owned))
 
     def _restore_edges(self, term: Elastic, edges: Mapping[str, Array]) -> None:
@@ -543,6 +554,8 @@ class SteppedScene:
         for term in system.active.elastic:
             if term.registration.edge_state:
                 self._restore_edges(term, edges)
+            if term.name in elements and not term.registration.neighbours:
+                self._restore_elements(term, *elements[term.name])
         self.time, self.step_number = float(memory["time"]), int(memory["step"])
         # loads and handles that a changed scene lets start before now start here; the others have started
         system.begin(self.time)
@@ -563,7 +576,7 @@ class SteppedScene:
             names = term.registration.state
             if names:
                 term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
-            if term.name in elements:
+            if term.name in elements and term.registration.neighbours:
                 self._restore_elements(term, *elements[term.name])
                 term.take_pairs(system.x, system.active.frozen[term])
         self.stepper.restore(arrays, memory, self.time, self.step_number)
@@ -585,3 +598,13 @@ class SteppedScene:
     def _take_back_options(self) -> None:
         for name in self._filled:
             PETSc.Options().delValue(name)
+
+
+def _restore_values(term: Elastic, own: Ints, vertices: Ints, values: Array) -> None:
+    """Let a term whose elements have these vertices (E, n) go on with values (k, m) of others (k, n), among
+    which they are; those that are not keep what they have.
+    """
+    found, now = {tuple(key): row for row, key in enumerate(vertices.tolist())}, term.element_values().copy()
+    rows = np.array([found.get(tuple(key), -1) for key in own.tolist()], dtype=np.int64)
+    now[rows >= 0] = values[rows[rows >= 0]]
+    term.restore_values(now)

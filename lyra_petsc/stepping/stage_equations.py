@@ -349,7 +349,7 @@ class StageEquations:
             found |= {} if nearer is None else {term: nearer}
         if not self.points.comm.allreduce(len(found), MPI.MAX):
             return False
-        self.active.frozen = self.active.frozen | found
+        self.active.refreeze(found)
         if isinstance(self._internal, Remembered):
             self._internal.forget()
         self.objective.forget()

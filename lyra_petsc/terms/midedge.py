@@ -56,6 +56,8 @@ STEEPEST = np.radians(89.95)
 """Angle of a director at rest or at the start from which on a scene is refused: rounding would tell which way
 it is folded."""
 
+NO_FRICTION = np.empty((0, 2))
+
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
 
@@ -107,7 +109,7 @@ class MidEdge(Elastic):
         index = index.reshape(-1, 3).astype(np.int32)
         self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
-        self._constants = data["stiffness"], data["rest"], data["limit"]
+        self._constants = data["stiffness"], data["rest"], data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
 
@@ -220,7 +222,7 @@ class MidEdge(Elastic):
 
     # -- energy ------------------------------------------------------------------------------------
 
-    def _shape(self, x: Array, frames: Frames) -> Array:
+    def shape(self, x: Array, frames: Frames) -> Array:
         """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 9)."""
         if self._shapes is None or self._shapes_of is not frames:
             self._shapes_of = frames
@@ -240,12 +242,12 @@ class MidEdge(Elastic):
     def all_energies(self, x: Array, frozen: Frames, n: int) -> Array:
         """Energy [J] of the first n triangles of this rank, (n,)."""
         out = np.empty(n)
-        edges, shape = self.of_edges.of_triangles, self._shape(x, frozen)
+        edges, shape = self.of_edges.of_triangles, self.shape(x, frozen)
         midedge_energy.energies(x, self.stencil, edges, shape, *self._constants, out)
         return out
 
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
-        data, shape = self.elements.data, self._shape(x, frozen)
+        data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.stencil, self.of_edges.of_triangles, self.edges
         midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *self._constants, data["length"], out)
 
@@ -259,7 +261,7 @@ class MidEdge(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        data, shape = self.elements.data, self._shape(x, frozen)
+        data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
         constants = *self._constants, data["length"], self.edges
         midedge_energy.add_hessian(
@@ -280,7 +282,7 @@ class MidEdge(Elastic):
     def curvatures(self, x: Array, frozen: Frames) -> Array:
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
         found = np.empty((self.n_elements, 3))
-        tangents(x, self.stencil, self.of_edges.of_triangles, self._shape(x, frozen), found)
+        tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), found)
         curvature: Array = np.einsum("eki,ei->ek", self.elements.data["curvature"], found)
         curvature[:, 2] *= 0.5
         return curvature

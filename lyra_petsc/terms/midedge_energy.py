@@ -19,6 +19,9 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
+
+With friction, ``friction`` (E, 2) has for each triangle a factor c and an energy [J]: by the latter the
+energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact Hessian; without, it is empty.
 """
 
 from __future__ import annotations
@@ -72,7 +75,7 @@ def _twice(own, others):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def energies(x, stencil, edges, shape, stiffness, rest, limit, out):  # type: ignore[no-untyped-def]
+def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) triangles; infinite where an edge is too far from its frame."""
     for e in range(out.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
@@ -84,6 +87,8 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, out):  # type: ig
         t1, _, _, s1, _, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
         t2, _, _, s2, _, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
         out[e] = 0.5 * _twice(_own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2))
+        if friction.shape[0] > 0:
+            out[e] += friction[e, 1]
         if square < limit[e]:
             out[e] *= fade(square, limit[e])[0]
         if not out[e] < np.inf:
@@ -92,7 +97,7 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, out):  # type: ig
 
 @kernel()
 def add_gradient(  # type: ignore[no-untyped-def]
-    x, stencil, edges, places, sign, shape, stiffness, rest, limit, length, out
+    x, stencil, edges, places, sign, shape, stiffness, rest, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (E, 3)."""
     flat = out.reshape(-1)
@@ -108,7 +113,7 @@ def add_gradient(  # type: ignore[no-untyped-def]
         p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
         if square < limit[e]:
             weight, slope, _ = fade(square, limit[e])
-            energy = slope * _twice(own, others)  # 2 · ½
+            energy = slope * (_twice(own, others) + _more(friction, e))  # 2 · ½
             p0, p1, p2 = weight * p0, weight * p1, weight * p2
             for c, edge in ((0, e0), (1, e1), (2, e2)):
                 turned = cross(normal, edge)
@@ -131,6 +136,12 @@ def add_gradient(  # type: ignore[no-untyped-def]
         flat[places[e, 0]] += sign[e, 0] * p0 / length[e, 0]
         flat[places[e, 1]] += sign[e, 1] * p1 / length[e, 1]
         flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
+
+
+@kernel(inline="always")
+def _more(friction, e):  # type: ignore[no-untyped-def]
+    """Twice the energy that friction adds to that of triangle e."""
+    return 2.0 * friction[e, 1] if friction.shape[0] > 0 else 0.0
 
 
 @kernel(inline="always")
@@ -286,8 +297,9 @@ def _add_number(blocks, at, place, other, value):  # type: ignore[no-untyped-def
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
-    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, length, places, weight, offsets, values
-):
+    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, friction, length, places, weight, offsets,
+    values
+):  # fmt: skip
     """Add weight (E,) times the Hessians to block rows, where offsets (E, 21) say.
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
@@ -328,6 +340,10 @@ def add_hessian(  # type: ignore[no-untyped-def]
         k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)
         k22 = a2 * a2 * stiffness[e, 5] + exact * (own[2] * c2 + others[2] * d2)
         k01, k02, k12 = b0 * b1 * stiffness[e, 1], b0 * b2 * stiffness[e, 2], b1 * b2 * stiffness[e, 4]
+        if friction.shape[0] > 0:
+            c = exact * friction[e, 0]
+            k00, k11, k22 = k00 + c * p0 * p0, k11 + c * p1 * p1, k22 + c * p2 * p2
+            k01, k02, k12 = k01 + c * p0 * p1, k02 + c * p0 * p2, k12 + c * p1 * p2
         w1 = (
             _weighted(k00, g1[0], k01, g1[1], k02, g1[2]),
             _weighted(k01, g1[0], k11, g1[1], k12, g1[2]),
@@ -359,7 +375,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
         numbers = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02, q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
         hessian = (b11, b12, b22), one, two, numbers
         if square < limit[e]:
-            energy, pulls = 0.5 * _twice(own, others), (p0, p1, p2)
+            energy, pulls = 0.5 * (_twice(own, others) + _more(friction, e)), (p0, p1, p2)
             hessian = _faded(
                 x0, x1, x2, normal, square, limit[e], energy, exact, pulls, g1, g2, (q0, q1, q2), hessian
             )

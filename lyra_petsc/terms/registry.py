@@ -66,7 +66,7 @@ class Registration:
     state, edge_state : tuple of str
         Names of the arrays that a checkpoint must hold for it, of vertices and of edges with an unknown.
     element_vertices : int
-        Vertices of each of its elements, where these change and a checkpoint must hold something of them.
+        Vertices of each of its elements, where a checkpoint must hold something of them.
     coarse : str
         The term that stands for it on coarse levels of multigrid, which have no unknowns of edges. Its module
         offers ``coarse_elements(rest)``, of that term.
@@ -109,6 +109,10 @@ def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(max(coefficients(each)) > 0.0 for each in all_of_them if each is not None)
 
 
+def _slides_by(model: str) -> Need:
+    return lambda scene, shells: any(s.bends_by(model) and max(s.friction_moment) > 0.0 for s in shells)
+
+
 REGISTRY: list[Registration] = [
     Registration("membrane", lambda scene, shells: True, Role.ELASTIC, "membrane_energy", damped=True),
     Registration("bending", _bends_by("hinge"), Role.ELASTIC, "bending_energy", damped=True, bends=True),
@@ -121,6 +125,22 @@ REGISTRY: list[Registration] = [
         bends=True,
         edge_state=("frame",),
         coarse="bending",
+    ),
+    Registration("hinge_friction", _slides_by("hinge"), Role.ELASTIC, "bending_energy", element_vertices=4),
+    Registration(
+        "midedge_friction",
+        _slides_by("midedge"),
+        Role.ELASTIC,
+        "bending_energy",
+        element_vertices=3,
+        coarse="hinge_friction",
+    ),
+    Registration(
+        "shear_friction",
+        lambda scene, shells: any(shell.friction_force > 0.0 for shell in shells),
+        Role.ELASTIC,
+        "membrane_energy",
+        element_vertices=3,
     ),
     Registration(
         "contact",

@@ -205,6 +205,9 @@ class Elastic(Term):
         """Whether its energy depends on where something stands that moves, and does work on the sheet."""
         return self.registration.moving
 
+    def connect(self, terms: Iterable[Term]) -> None:
+        """Know the scene's terms, which it may act through; before anything else is asked."""
+
     @abstractmethod
     def energies(self, x: Array, frozen: Any) -> Array:
         """Energy [J] of each owned element, (n_owned,)."""
@@ -248,6 +251,9 @@ class Elastic(Term):
 
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
+
+    follows: Elastic | None = None
+    """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
@@ -309,6 +315,18 @@ class Elastic(Term):
 
     def accept(self, x: Array, frozen: Any) -> None:
         """The step to positions x (n_local, 3) is accepted; for terms that have a state."""
+
+    def heat(self, x: Array, frozen: Any) -> float:
+        """What of the energy [J] of its owned elements is none when the step to x is accepted, but heat."""
+        return 0.0
+
+    def element_values(self) -> Array:
+        """What a checkpoint must hold of elements that do not change, (E, m)."""
+        raise NotImplementedError
+
+    def restore_values(self, values: Array) -> None:
+        """Go on with these (E, m)."""
+        raise NotImplementedError
 
     def state(self) -> dict[str, Array]:
         """What a checkpoint must hold, by the registration's names: (n_vertices, 3) of owned vertices."""

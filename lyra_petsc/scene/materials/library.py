@@ -39,6 +39,9 @@ PROJECTION_FLOOR = 0.01
 Triple = tuple[float, float, float]
 Plate = tuple[float, float, float, float]
 
+LEAST_FRICTION = 1e-3
+"""Of warp or weft over that of the other, where that has some."""
+
 LEAST_TWIST = 0.2
 """Least 2 d33 of a measured cloth over √(d11 d22)."""
 
@@ -76,6 +79,10 @@ class ShellMaterial:
     plate : tuple of four floats
         d11, d12, d22, d33 [N·m] of ``midedge``; energy per rest area is
         ½ (d11 κ11² + 2 d12 κ11 κ22 + d22 κ22² + d33 (2 κ12)²).
+    friction_moment : tuple of two floats
+        Moment [N m/m] by which friction resists bending of the warp, and of the weft.
+    friction_force : float
+        Force [N/m] by which it resists shear.
     """
 
     density: float
@@ -93,6 +100,8 @@ class ShellMaterial:
     curves: tuple[Points, ...] = ()
     model: str = "hinge"
     plate: Plate = (0.0, 0.0, 0.0, 0.0)
+    friction_moment: tuple[float, float] = (0.0, 0.0)
+    friction_force: float = 0.0
 
     @property
     def plate_matrix(self) -> tuple[Triple, Triple, Triple]:
@@ -243,9 +252,16 @@ def resolve(
         curves = material.law.warp, material.law.weft, material.law.shear
         c11, c22, c33 = (float(interpolation(points)[0, 2]) for points in curves)
         shell = replace(shell, c11=c11, c12=0.0, c22=c22, c33=c33, curves=curves)
-    shell = _scaled(shell, material)
+    shell = _scaled(_with_friction(shell, material), material)
+    if max(shell.friction_moment) > 0.0 and not shell.bends_by(shell.model):
+        raise InputError(
+            "friction acts beside a bending stiffness; give bending, too",
+            file=file,
+            key=f"{key}.friction_moment",
+        )
     numbers = (shell.density, shell.c11, shell.c12, shell.c22, shell.c33, *shell.bending, *shell.plate)
-    if not all(math.isfinite(value) for value in numbers):
+    frictions = *shell.friction_moment, shell.friction_force
+    if not all(math.isfinite(value) for value in (*numbers, *frictions)):
         raise InputError("numbers too large: stiffness or density is not finite", file=file, key=key)
     if min(shell.density, shell.c11, shell.c22, shell.c33) <= 0.0:
         raise InputError("numbers too small: stiffness or density vanishes", file=file, key=key)
@@ -302,6 +318,33 @@ def _with_plate(shell: ShellMaterial, name: str) -> tuple[ShellMaterial, list[st
     return replace(shell, plate=(at_0, 0.0, at_90, twist)), notes
 
 
+GF_PER_CM = 0.980665
+"""N/m"""
+
+
+def _with_friction(shell: ShellMaterial, material: Material) -> ShellMaterial:
+    """A shell with friction, and with the numbers of a KES report."""
+    moment, force = material.friction_moment or (0.0, 0.0), material.friction_force or 0.0
+    if (kes := material.kes) is not None:
+        if kes.B is not None:
+            warp, weft = (1e-4 * GF_PER_CM * b for b in kes.B)
+            mean = 0.5 * (warp + weft)
+            # a hinge at 0° to the warp bends the weft
+            shell = replace(shell, bending=(weft, mean, warp))
+            if shell.model == "midedge":
+                shell = replace(shell, plate=(warp, 0.0, weft, 0.5 * mean))
+        if kes.width_of_bending is not None:
+            warp, weft = (0.5e-2 * GF_PER_CM * m for m in kes.width_of_bending)
+            moment = warp, weft
+        if kes.G is not None:
+            shell = replace(shell, c33=math.degrees(0.5 * sum(kes.G)) * GF_PER_CM)
+        if kes.width_of_shear is not None:
+            force = 0.25 * sum(kes.width_of_shear) * GF_PER_CM
+    if (moment[0] > 0.0) != (moment[1] > 0.0):
+        moment = max(moment[0], LEAST_FRICTION * moment[1]), max(moment[1], LEAST_FRICTION * moment[0])
+    return replace(shell, friction_moment=moment, friction_force=force)
+
+
 def _bent(shell: ShellMaterial, bending: float | Triple | PlateStiffness | None) -> ShellMaterial:
     """A shell with the bending stiffness that a scene gives."""
     if isinstance(bending, float):
@@ -341,6 +384,8 @@ def _scaled(shell: ShellMaterial, material: Material) -> ShellMaterial:
         c33=shell.c33 * stretch,
         bending=(at_0, at_45, at_90),
         plate=(d11, d12, d22, d33),
+        friction_moment=(shell.friction_moment[0] * bend, shell.friction_moment[1] * bend),
+        friction_force=shell.friction_force * stretch,
         damping=material.damping,
         warp_degrees=material.warp_degrees,
         rest_curvature=material.rest_curvature,

@@ -10,6 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.drape import (
+    CLOTH,
+    DRAPE_GAP,
+    NOISE,
+    STARTS,
+    disc_of,
+    drape_coefficient,
+    quarter_shadow,
+)
 from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 from lyra_petsc.experiments.verification.answers import (
     Converges,
@@ -203,15 +212,9 @@ def table_edge(bench: Bench, n: float) -> Iterator[Measured]:
 
 # -- Cusick's drape test ---------------------------------------------------------------------------------
 
-CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
-"""Radii and gap [m]"""
-
-STARTS, NOISE = 5, 2e-4
-"""How many, and the standard deviation [m] of their heights"""
-
 MESHES = ("diagonal", "alternating", "irregular")
-PIXELS = 300
-"""Along a quarter's side, of the shadow's picture"""
+PIXELS = 600
+"""Along the side of the shadow's picture, of which a quarter is seen"""
 
 
 def _quarter(kind: str, n: int) -> tuple[Array, Ints]:
@@ -224,19 +227,6 @@ def _quarter(kind: str, n: int) -> tuple[Array, Ints]:
     return np.column_stack([i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2), 0.0 * i]), faces
 
 
-def _drape_coefficient(x: Array, faces: Ints) -> float:
-    """Share of the ring beside the disc that lies in the shadow of a quarter with vertices x (V, 3) [m]."""
-    middles = (np.arange(PIXELS) + 0.5) / PIXELS * (1.05 * CLOTH)
-    at = np.stack(np.meshgrid(middles, middles), axis=-1)
-    dark = np.hypot(at[..., 0], at[..., 1]) < DISC
-    for corners in x[faces][:, :, :2]:
-        sides, beside = np.roll(corners, -1, axis=0) - corners, at[..., None, :] - corners
-        turn = sides[:, 0] * beside[..., 1] - sides[:, 1] * beside[..., 0]
-        dark |= (turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1)
-    quarter, ring = 0.25 * math.pi * DISC**2, 0.25 * math.pi * (CLOTH**2 - DISC**2)
-    return (float(dark.mean()) * (1.05 * CLOTH) ** 2 - quarter) / ring
-
-
 @case(
     "Denim (11oz-black-denim) of 30 cm over a disc of 18 cm, a quarter of it, bending_model: midedge: drape "
     "coefficients, mean of five starts, on three kinds of meshes, against the mean of all",
@@ -247,10 +237,7 @@ def _drape_coefficient(x: Array, faces: Ints) -> float:
     quick=1,
 )
 def cusick(bench: Bench, n: float) -> Sequence[Measured]:
-    angle = np.radians(np.linspace(-35.0, 125.0, 17))
-    rim = DISC * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
-    fan = np.array([[k, k + 1, len(rim)] for k in range(len(rim) - 1)])
-    disc = {"mesh": bench.mesh(np.vstack([rim, np.zeros((1, 3))]), fan)}
+    disc = {"mesh": bench.mesh(*disc_of(np.radians(np.linspace(-35.0, 125.0, 17))))}
     means: dict[str, float] = {}
     for kind in MESHES:
         flat, faces = _quarter(kind, round(n))
@@ -272,7 +259,7 @@ def cusick(bench: Bench, n: float) -> Sequence[Measured]:
                 solver={"force_tolerance": 1e-6, "step_tolerance": 1e-6},
             )
             with bench.simulation(content) as trial:
-                found.append(_drape_coefficient(trial.run().x, faces))
+                found.append(drape_coefficient(quarter_shadow(trial.run().x, faces, PIXELS)))
         means[kind] = float(np.mean(found))
     common = float(np.mean(list(means.values())))
     return [Measured(f"drape coefficient, {kind}", mean, common, scale=1.0) for kind, mean in means.items()]

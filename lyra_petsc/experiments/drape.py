@@ -1,0 +1,89 @@
+"""Cusick's drape test: a cloth of 30 cm on a disc of 18 cm, and its shadow.
+
+G. E. Cusick, The measurement of fabric drape, Journal of the Textile Institute 59 (1968) 253-260; BS 5058.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Picture = NDArray[np.bool_]
+
+CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
+"""Radii and gap [m]"""
+
+STARTS, NOISE = 5, 2e-4
+"""How many, and the standard deviation [m] of their heights"""
+
+MARGIN = 1.05
+"""Half the side of a shadow's picture over the radius of the cloth"""
+
+
+def disc_of(angle: Array) -> tuple[Array, Ints]:
+    """The disc, or a sector of it with a rim at these angles: vertices (n, 3) [m] and triangles (m, 3)."""
+    rim = DISC * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    fan = np.array([[k, k + 1, len(rim)] for k in range(len(rim) - 1)])
+    return np.vstack([rim, np.zeros((1, 3))]), fan
+
+
+def _middles(low: float, pixels: int) -> Array:
+    half = MARGIN * CLOTH
+    middles: Array = half * (low + (1.0 - low) * (np.arange(pixels) + 0.5) / pixels)
+    return middles
+
+
+def shadow(x: Array, faces: Ints, pixels: int, low: float = -1.0) -> Picture:
+    """Which pixels (pixels, pixels), rows along y, lie below the disc or triangles of vertices x (V, 3) [m].
+
+    The picture goes from ``low`` to 1 times half its side in both directions.
+    """
+    middles = _middles(low, pixels)
+    dark = np.hypot(middles, middles[:, None]) < DISC
+    for corners in x[faces][:, :, :2]:
+        first, last = (
+            np.searchsorted(middles, corners.min(axis=0)),
+            np.searchsorted(middles, corners.max(axis=0)),
+        )
+        columns, rows = slice(first[0], last[0]), slice(first[1], last[1])
+        at = np.stack(np.meshgrid(middles[columns], middles[rows]), axis=-1)
+        sides, beside = np.roll(corners, -1, axis=0) - corners, at[..., None, :] - corners
+        turn = sides[:, 0] * beside[..., 1] - sides[:, 1] * beside[..., 0]
+        dark[rows, columns] |= (turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1)
+    return dark
+
+
+def quarter_shadow(x: Array, faces: Ints, pixels: int) -> Picture:
+    """The whole shadow of which a mesh (V, 3) [m] is the quarter x, y ≥ 0."""
+    quarter = shadow(x, faces, pixels // 2, 0.0)
+    half = np.concatenate([quarter[:, ::-1], quarter], axis=1)
+    return np.concatenate([half[::-1], half])
+
+
+def drape_coefficient(dark: Picture) -> float:
+    """Share of the ring beside the disc that lies in the shadow."""
+    area = float(dark.mean()) * (2.0 * MARGIN * CLOTH) ** 2
+    return (area - math.pi * DISC**2) / (math.pi * (CLOTH**2 - DISC**2))
+
+
+def folds(dark: Picture) -> int:
+    """How often the rim of a shadow goes outwards beyond its mean, small ripples left out."""
+    middles = _middles(-1.0, len(dark))
+    angle, radius = np.radians(np.arange(0.0, 360.0, 2.0)), np.linspace(DISC, MARGIN * CLOTH, 120)
+    places = [
+        np.clip(np.searchsorted(middles, np.outer(f(angle), radius)), 0, len(dark) - 1)
+        for f in (np.cos, np.sin)
+    ]
+    rim = (dark[places[1], places[0]] * radius).max(axis=1)
+    waves = np.fft.rfft(rim - rim.mean())
+    waves[13:] = 0.0  # shorter than 30°
+    smooth = np.fft.irfft(waves, len(rim))
+    above = smooth > 0.1 * np.abs(smooth).max()
+    below = smooth < -0.1 * np.abs(smooth).max()
+    states = np.where(above, 1, np.where(below, -1, 0))
+    seen = states[states != 0]
+    return int(np.sum((seen == 1) & (np.roll(seen, 1) == -1)))

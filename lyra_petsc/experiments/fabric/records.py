@@ -1,0 +1,222 @@
+"""What came of a textile test: numbers in its own units, curves, a shadow; and the page that tells them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
+from lyra_petsc.experiments.results import Line, View
+from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
+from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
+
+OUTCOME_FILE = "outcome.json"
+
+
+@dataclass(frozen=True)
+class Number:
+    """A result; ``scatter`` is the standard deviation over the starts of a test, NaN where there is one."""
+
+    quantity: str
+    value: float
+    unit: str
+    scatter: float = math.nan
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A measured curve."""
+
+    name: str
+    x_label: str
+    y_label: str
+    x: list[float]
+    y: list[float]
+
+
+@dataclass
+class Record:
+    """What a test gave.
+
+    Attributes
+    ----------
+    numbers : list of Number
+    curves : list of Curve
+    shadow : list of list of int
+        1 where it is dark, rows from below; empty without one.
+    extent : float
+        Half of its side [cm].
+    stopped : str
+        Why it has no end; empty if it has.
+    """
+
+    numbers: list[Number] = field(default_factory=list)
+    curves: list[Curve] = field(default_factory=list)
+    shadow: list[list[int]] = field(default_factory=list)
+    extent: float = 0.0
+    stopped: str = ""
+    verdicts: dict[str, Verdict] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    def claim(self, name: str, value: float, exact: float, bound: float) -> None:
+        """The verdict on a number that is known, by its relative error."""
+        error = abs(value - exact) / abs(exact)
+        words = f"{short(value, 4)}, material {short(exact, 4)}: {100.0 * error:.2g} % off"
+        self.verdicts[name] = Verdict(error <= bound, f"{words}, {100.0 * bound:g} % allowed")
+
+
+@dataclass(frozen=True)
+class FabricCase(Case):
+    """A test of a material along one direction.
+
+    Attributes
+    ----------
+    test : str
+    degrees : float
+        Of the specimen's length to the warp.
+    """
+
+    test: str
+    degrees: float
+
+
+@dataclass
+class FabricOutcome(Outcome[FabricCase]):
+    """What came of a case."""
+
+    record: Record = field(default_factory=Record)
+
+
+def outcome_of(case: FabricCase, record: Record) -> FabricOutcome:
+    """With the verdicts on its record."""
+    verdicts = {"measured": Verdict(not record.stopped, record.stopped or "to its end"), **record.verdicts}
+    return FabricOutcome(case, verdicts, record.seconds, record=record)
+
+
+def save(outcome: FabricOutcome, folder: Path) -> None:
+    """Write the record of an outcome. On one rank."""
+    save_record(folder / OUTCOME_FILE, outcome.record)
+
+
+def restore(folder: Path, case: FabricCase) -> FabricOutcome | None:
+    """The outcome in a folder; None if there is none."""
+    record = read_record(folder / OUTCOME_FILE, Record)
+    return None if record is None else outcome_of(case, record)
+
+
+def _value(number: Number) -> str:
+    spread = "" if math.isnan(number.scatter) else f" ± {short(number.scatter, 2)}"
+    return f"{short(number.value, 4)}{spread}"
+
+
+class Fabric(View[FabricOutcome]):
+    """Numbers by test and direction.
+
+    Parameters
+    ----------
+    material : str
+        In words.
+    """
+
+    verb = "fabric"
+    pictures = "plots"
+    columns = ("test", "quantity", "value", "scatter", "unit", "passed", "problem")
+
+    def __init__(self, material: str) -> None:
+        self.title = f"Textile tests: {material}"
+        self._outcomes: Sequence[FabricOutcome] = ()
+
+    def lines(self, outcome: FabricOutcome) -> Iterable[Line]:
+        yield f"{outcome.case.name}: {outcome.case.title}", "bold"
+        for number in outcome.record.numbers:
+            yield f"  {number.quantity} = {_value(number)} {number.unit}", ""
+        for name, verdict in outcome.verdicts.items():
+            if name != "measured" or not verdict.passed:
+                word, style = ("passed", "") if verdict.passed else ("FAILED", "bold red")
+                yield f"  {name}: {word}: {verdict.words}", style
+
+    def summary(self, outcomes: Sequence[FabricOutcome]) -> list[Sequence[str]]:
+        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
+        return [("test", "verdict", "run time [s]"), *table]
+
+    def rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
+        common = {"test": outcome.case.name, "passed": outcome.passed, "problem": outcome.record.stopped}
+        for number in outcome.record.numbers:
+            yield common | vars(number)
+        if not outcome.record.numbers:
+            yield common
+
+    def told(self, outcome: FabricOutcome) -> dict[str, Any]:
+        numbers = [
+            {key: None if value != value else value for key, value in vars(number).items()}
+            for number in outcome.record.numbers
+        ]
+        return {"numbers": numbers, "passed": outcome.passed, "wall_seconds": outcome.seconds}
+
+    def page(self, report: Report, outcomes: Sequence[FabricOutcome], summary: str, *, drawn: bool) -> None:
+        self._outcomes = outcomes
+        report.paragraph(
+            f"{summary} Specimens bend by directors on edges (bending_model: midedge) whatever the scene "
+            "says, since hinges bend as their mesh is."
+        )
+        rows = [
+            [outcome.case.name, number.quantity, _value(number), number.unit]
+            for outcome in outcomes
+            for number in outcome.record.numbers
+        ]
+        report.table(["test", "quantity", "value", "unit"], rows)
+        for outcome in outcomes:
+            report.heading(outcome.case.name)
+            report.paragraph(f"{outcome.case.title}. Run time {seconds(outcome.seconds)}.")
+            for name, verdict in outcome.verdicts.items():
+                word = "passed" if verdict.passed else "FAILED"
+                report.paragraph(f"{name}: {word}: {verdict.words}.")
+            if drawn:
+                for drawing in pictures(outcome):
+                    report.figure(drawing)
+
+    def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
+        for outcome in self._outcomes:
+            for curve in outcome.record.curves:
+                text = io.StringIO()
+                lines = [(curve.x_label, curve.y_label), *zip(curve.x, curve.y, strict=True)]
+                csv.writer(text, lineterminator="\n").writerows(lines)
+                replace_text(
+                    folder / f"{outcome.case.name}{_suffix(outcome.record, curve)}.csv", text.getvalue()
+                )
+        return super().close(report, folder, command)
+
+
+def _suffix(record: Record, curve: Curve) -> str:
+    return "" if len(record.curves) == 1 else f"-{record.curves.index(curve) + 1}"
+
+
+def pictures(outcome: FabricOutcome, *, small: bool = False) -> list[Drawing]:
+    """The curves and the shadow of a test."""
+    record, name, found = outcome.record, outcome.case.name, []
+    if record.curves:
+        lines = [Series(c.name, c.x, c.y) for c in record.curves]
+        figure = empty_figure((0.45 if small else 0.8) * HEIGHT)
+        axes = figure.add_subplot(xlabel=record.curves[0].x_label, ylabel=record.curves[0].y_label)
+        for number, line in enumerate(lines):
+            axes.plot(line.x, line.y, color=colour(number), label=line.name, lw=1.4, marker=".", ms=3)
+        axes.grid(True, color="#dfe3e8", lw=0.8)
+        if len(lines) > 1:
+            axes.legend(fontsize=8)
+        found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))
+    if record.shadow:
+        figure = empty_figure(HEIGHT)
+        axes = figure.add_subplot(xlabel="x [cm]", ylabel="y [cm]")
+        half = record.extent
+        axes.imshow(
+            record.shadow, cmap="Greys", origin="lower", extent=(-half, half, -half, half),
+            interpolation="nearest", vmin=0, vmax=1.4,
+        )  # fmt: skip
+        found.append(drawn(figure, f"{PLOTS}/{name}-shadow", f"{name}: the shadow of the last start"))
+    return found

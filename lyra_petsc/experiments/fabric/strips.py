@@ -1,0 +1,433 @@
+"""Tests of strips: KES-F 1 and 2, ASTM D1388, heart loop. Lengths in m, forces in N, until they are told.
+
+KES-F: S. Kawabata, The standardization and analysis of hand evaluation, 2nd ed., Osaka 1980. Heart loop and
+bending length: F. T. Peirce, The "handle" of cloth as a measurable quantity, Journal of the Textile Institute
+21 (1930) T377-T416; ASTM D1388.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.bench import Bench, Trial
+from lyra_petsc.experiments.fabric.records import Curve, Number, Record
+from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
+from lyra_petsc.experiments.meshes import rectangle
+
+Array = NDArray[np.float64]
+
+TOLERANCES = {"force_tolerance": 1e-8, "step_tolerance": 1e-8}
+
+
+def _scene(mesh: dict[str, Any], material: dict[str, Any], **more: Any) -> dict[str, Any]:
+    static = {"time": {"analysis": "static"}, "solver": TOLERANCES}
+    return static | {"mesh": mesh, "material": material, **more}
+
+
+def _grid(width: float, height: float, nx: int, ny: int) -> dict[str, Any]:
+    return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": "criss-cross"}}
+
+
+def _number(quantity: str, value: float, unit: str) -> Number:
+    return Number(quantity, float(value), unit)
+
+
+def _steps(trial: Trial) -> Iterator[float]:
+    """Load factors of all steps of a simulation, one after the other."""
+    while not trial.simulation.finished:
+        trial.step()
+        yield trial.simulation.time
+
+
+def _path(values: Sequence[float], **keys: Any) -> dict[str, Any]:
+    """Keys of a scene whose load factor goes through equal steps, one for each value but the first."""
+    share = 1.0 / (len(values) - 1)
+    time = {"analysis": "static", "step": share}
+    return {"time": time, "petsc": {"ts_adapt_dt_max": share}} | keys
+
+
+def _to_and_fro(largest: float, steps: int, *, closed: bool) -> list[float]:
+    """From 0 to ``largest``, to its opposite, and back where the loop shall close."""
+    up = [largest * k / steps for k in range(steps + 1)]
+    down = [largest * (1.0 - k / steps) for k in range(1, 2 * steps + 1)]
+    return up + down + ([-value for value in down] if closed else [])
+
+
+def _branches(x: Sequence[float], y: Sequence[float], steps: int) -> tuple[Any, Any]:
+    """Of a path as by `_to_and_fro`: y as functions of x on the way up and down in the last loop."""
+    xs, ys = np.array(x), np.array(y)
+    down = slice(steps, 3 * steps + 1)
+    up = slice(3 * steps, 5 * steps + 1) if len(xs) > 3 * steps + 1 else down
+    falling, rising = (xs[down][::-1], ys[down][::-1]), (xs[up], ys[up])
+    if up == down:
+        rising = falling
+    return (lambda at: np.interp(at, *rising)), (lambda at: np.interp(at, *falling))
+
+
+# -- KES-F 1 ---------------------------------------------------------------------------------------------
+
+CLAMPED, GAUGE = 0.2, 0.05
+FULL_LOAD = 500.0 * GF_PER_CM
+"""Of a tensile test [N/m]"""
+
+LONGEST, PULLS = 1.0, 30
+"""Strain at which a tensile test ends at the latest, nearly, and its steps"""
+
+TENSION = 10.0 * GF_PER_CM
+"""Of a shear test [N/m]"""
+
+SHEARED = 8.0
+"""Largest angle [°]"""
+
+
+def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
+    """20 cm × 5 cm between clamps, pulled to 500 gf/cm: EMT, WT, LT."""
+    shell, record = fabric.shell(degrees), Record()
+    strain = 0.01  # where St. Venant-Kirchhoff's has the full load
+    while shell.c11 * (1.0 + strain) * 0.5 * ((1.0 + strain) ** 2 - 1.0) < FULL_LOAD and strain < LONGEST:
+        strain *= 1.02
+    path = [1.1 * strain * (k / PULLS) ** 1.5 for k in range(PULLS + 1)]
+    frames = [{"time": k / PULLS, "translate": [e * GAUGE, 0.0, 0.0]} for k, e in enumerate(path)]
+    content = _scene(
+        _grid(GAUGE, CLAMPED, 4, 12),
+        fabric.turned(degrees),
+        handles=[
+            {"group": "left"},
+            {"group": "right", "motion": "pull", "interpolation": "linear"},
+            {"group": "sheet", "axes": ["z"]},
+        ],
+        motions={"pull": frames},
+    ) | _path(path)
+    strains, forces = [0.0], [0.0]
+    with bench.simulation(content) as trial:
+        for _ in _steps(trial):
+            strains.append(path[len(strains)])
+            forces.append(abs(trial.simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
+            if forces[-1] >= FULL_LOAD:
+                break
+    record.curves = [
+        Curve(
+            "tensile",
+            "strain [%]",
+            "force [gf/cm]",
+            [100.0 * e for e in strains],
+            [f / GF_PER_CM for f in forces],
+        )
+    ]
+    if forces[-1] < FULL_LOAD:
+        record.numbers = [
+            _number(f"force at {100.0 * strains[-1]:.3g} % (less than 500)", forces[-1] / GF_PER_CM, "gf/cm")
+        ]
+        return record
+    emt = float(np.interp(FULL_LOAD, forces, strains))
+    e = np.linspace(0.0, emt, 400)
+    pulls = np.interp(e, strains, forces)
+    work = float(0.5 * np.sum((pulls[1:] + pulls[:-1]) * np.diff(e)))
+    record.numbers = [
+        _number("EMT", 100.0 * emt, "%"),
+        _number("WT", work / GF_PER_CM, "gf·cm/cm²"),
+        _number("LT", work / (0.5 * FULL_LOAD * emt), "1"),
+    ]
+    return record
+
+
+def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
+    """20 cm × 5 cm between clamps, sheared to ±8° under 10 gf/cm: G, 2HG at 0.5°, 2HG5 at 5°."""
+    record, rubs = Record(), fabric.shell().friction_force > 0.0
+    steps = 16
+    path = _to_and_fro(SHEARED, steps, closed=rubs)
+    share = 1.0 / (len(path) - 1)
+    frames = [
+        {"time": k * share, "translate": [GAUGE * math.tan(math.radians(a)), 0.0, 0.0]}
+        for k, a in enumerate(path)
+    ]
+    content = _scene(
+        _grid(CLAMPED, GAUGE, 12, 3),
+        fabric.turned(degrees),
+        handles=[
+            {"group": "bottom"},
+            {"group": "top", "axes": ["x", "z"], "motion": "shear", "interpolation": "linear"},
+            {"group": "sheet", "axes": ["z"]},
+        ],
+        motions={"shear": frames},
+        loads=[{"group": "top", "force": [0.0, TENSION * CLAMPED, 0.0]}],
+    ) | _path(path)
+    forces = [0.0]
+    with bench.simulation(content) as trial:
+        for _ in _steps(trial):
+            forces.append(-float(trial.simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
+    told = [f / GF_PER_CM for f in forces]
+    record.curves = [Curve("shear", "angle [°]", "force [gf/cm]", path[: len(told)], told)]
+    up, down = _branches(path, told, steps)
+    record.numbers = [
+        _number(
+            "G",
+            0.5 * sum((f(2.5 * s) - f(0.5 * s)) / (2.0 * s) for f, s in ((up, 1), (down, -1))),
+            "gf/(cm·°)",
+        )
+    ]
+    if rubs:
+        for name, at in (("2HG", 0.5), ("2HG5", 5.0)):
+            width = 0.5 * ((up(at) - down(at)) + (up(-at) - down(-at)))
+            record.numbers.append(_number(name, width, "gf/cm"))
+    return record
+
+
+# -- KES-F 2 ---------------------------------------------------------------------------------------------
+
+LENGTH = 0.01
+CURVED = 250.0
+"""Largest curvature [1/m]"""
+
+
+def _place(curvature: float) -> Array:
+    """Where the end of a strip stands that is bent to an arc, (3,) [m]."""
+    half = 0.5 * curvature * LENGTH
+    chord = LENGTH * np.sinc(half / math.pi)
+    return np.array([chord * math.cos(half), 0.0, chord * math.sin(half)])
+
+
+def _chuck(curvature: float) -> dict[str, Any]:
+    """The motion that takes it there and turns it with the arc."""
+    angle = curvature * LENGTH
+    turned = LENGTH * np.array([math.cos(angle), 0.0, math.sin(angle)])
+    return {
+        "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": -math.degrees(angle)},
+        "translate": (_place(curvature) - turned).tolist(),
+    }
+
+
+def _moves(curvature: float) -> Array:
+    """Derivative (3,) [m²] of the place of the chuck."""
+    before, after = (_place(curvature + way) for way in (-1e-3, 1e-3))
+    return (after - before) / 2e-3
+
+
+def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
+    """1 cm between chucks, wide, bent to ±2.5 cm⁻¹: B from 0.5 to 1.5 cm⁻¹, 2HB at both.
+
+    The moment is the power of the moving chuck over its turning: a force along the sheet, which a polygon has
+    for being a little longer than its arc, is no part of it.
+    """
+    fabric.needs_bending("bending")
+    shell, record, cells, steps = fabric.shell(degrees), Record(), 12, 10
+    limit = shell.friction_moment[0]
+    path = _to_and_fro(CURVED, steps, closed=limit > 0.0)
+    share, width = 1.0 / (len(path) - 1), LENGTH / cells
+    content = _scene(
+        _grid(LENGTH, width, cells, 1),
+        fabric.turned(degrees),
+        handles=[
+            {"group": "left", "clamp": True},
+            {"group": "right", "clamp": True, "motion": "chuck", "interpolation": "linear"},
+            {"group": "sheet", "axes": ["y"]},  # 20 cm are wide
+        ],
+        motions={"chuck": [{"time": k * share, **_chuck(kappa)} for k, kappa in enumerate(path)]},
+    ) | _path(path)
+    moments = [0.0]
+    with bench.simulation(content) as trial:
+        for _ in _steps(trial):
+            ledger, kappa = trial.simulation.ledger, path[len(moments)]
+            force, moment = ledger.handle_forces(3)[1], float(ledger.handle_moments()[1][1])
+            moments.append((np.dot(force, _moves(kappa)) / LENGTH - moment) / width)
+    told = [float(m) / (1e-2 * GF_PER_CM) for m in moments]  # gf·cm/cm
+    curvature = [1e-2 * kappa for kappa in path]
+    record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, told)]
+    up, down = _branches(curvature, told, steps)
+    stiffness = 0.5 * ((up(1.5) - up(0.5)) + (down(-0.5) - down(-1.5)))
+    record.numbers = [_number("B", stiffness, "gf·cm²/cm")]
+    record.claim("B", stiffness, shell.plate[0] / (1e-4 * GF_PER_CM), 0.01)
+    if limit > 0.0:
+        for at in (0.5, 1.5):
+            loop = 0.5 * ((up(at) - down(at)) + (up(-at) - down(-at)))
+            record.numbers.append(_number(f"2HB at {at:g} cm⁻¹", loop, "gf·cm/cm"))
+            record.claim(f"2HB at {at:g} cm⁻¹", loop, 2.0 * limit / (1e-2 * GF_PER_CM), 0.01)
+    return record
+
+
+# -- cantilever ------------------------------------------------------------------------------------------
+
+OVERHANG = 41.5
+"""Angle of the chord [°]"""
+
+CELLS = 60
+
+
+def _cantilever(bench: Bench, fabric: Fabric, degrees: float, length: float) -> tuple[float, Array]:
+    """Angle [°] of the chord of an overhanging strip, and its middle line (n, 2) [m]."""
+    content = _scene(
+        _grid(length, length / CELLS, CELLS, 1),
+        fabric.turned(degrees),
+        handles=[{"group": "left", "clamp": True}],
+        gravity=[0.0, 0.0, -G],
+    )
+    with bench.simulation(content) as trial:
+        x = trial.run().x
+    line = 0.5 * (x[: CELLS + 1] + x[CELLS + 1 : 2 * (CELLS + 1)])[:, ::2]
+    return math.degrees(math.atan2(-line[-1, 1], line[-1, 0])), line
+
+
+def cantilever(bench: Bench, fabric: Fabric, degrees: float) -> Record:
+    """A strip slid over an edge until its chord falls by 41.5°: bending length c, rigidity w c³."""
+    fabric.needs_bending("cantilever")
+    shell, record = fabric.shell(degrees), Record()
+    weight = G * shell.density
+    known = fabric.rigidity(degrees)
+    length = 2.0 * (known / weight) ** (1.0 / 3.0)
+    # the angle grows with a power of the length near it: by secants in their logarithms
+    lengths, angles = [0.97 * length, length], []
+    for tried in lengths:
+        angles.append(_cantilever(bench, fabric, degrees, tried)[0])
+    line = np.empty((0, 2))
+    for _ in range(8):
+        if abs(angles[-1] - OVERHANG) < 1e-3:
+            break
+        slope = math.log(angles[-1] / angles[-2]) / math.log(lengths[-1] / lengths[-2])
+        lengths.append(lengths[-1] * (OVERHANG / angles[-1]) ** (1.0 / slope))
+        angle, line = _cantilever(bench, fabric, degrees, lengths[-1])
+        angles.append(angle)
+    half = 0.5 * lengths[-1]
+    rigidity = weight * half**3
+    record.numbers = [
+        _number("overhang", 1e2 * lengths[-1], "cm"),
+        _number("bending length c", 1e2 * half, "cm"),
+        _number("flexural rigidity", 1e3 * rigidity / (1e-4 * GF_PER_CM), "mgf·cm"),
+        _number("B", 1e6 * rigidity, "µN·m"),
+    ]
+    record.curves = [
+        Curve("strip", "x [cm]", "z [cm]", (1e2 * line[:, 0]).tolist(), (1e2 * line[:, 1]).tolist())
+    ]
+    if not max(shell.friction_moment) > 0.0:
+        record.claim("B", rigidity, known, 0.005)
+    return record
+
+
+# -- heart loop ------------------------------------------------------------------------------------------
+
+LOOP = 0.1337
+"""Height of a loop without weight over the length of its strip, in Peirce's formula"""
+
+SHOTS = 200
+"""Steps along half a loop"""
+
+
+def loop_length(height: float, strip: float) -> float:
+    """Bending length c of a heart loop by Peirce's formula, in the unit of height and strip."""
+    first = LOOP * strip
+    angle = math.radians(32.85 * (height - first) / first)
+    return float(first * (math.cos(angle) / math.tan(angle)) ** (1.0 / 3.0))
+
+
+Ends = tuple[float, float, float]
+
+
+def _shot(slope: float, pull: float, weight: float) -> Ends:
+    """Half of a loop of length 1 with B = 1: angle and x at its lowest point but for what they shall be, z.
+
+    θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by Runge and Kutta.
+    """
+    h, state, s = 1.0 / SHOTS, (0.5 * math.pi, slope, 0.0, 0.0), 0.0
+
+    def rates(at: float, y: Sequence[float]) -> tuple[float, ...]:
+        cosine, sine = math.cos(y[0]), math.sin(y[0])
+        return y[1], weight * (1.0 - at) * cosine + pull * sine, cosine, sine
+
+    def ahead(part: float, by: Sequence[float]) -> list[float]:
+        return [y + part * h * r for y, r in zip(state, by, strict=True)]
+
+    for _ in range(SHOTS):
+        one = rates(s, state)
+        two = rates(s + 0.5 * h, ahead(0.5, one))
+        three = rates(s + 0.5 * h, ahead(0.5, two))
+        four = rates(s + h, ahead(1.0, three))
+        angle, turn, x, z = (
+            y + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+            for y, a, b, c, d in zip(state, one, two, three, four, strict=True)
+        )
+        state, s = (angle, turn, x, z), s + h
+    return state[0] + math.pi, state[2], state[3]
+
+
+def loop_height(bending_length: float, strip: float) -> float:
+    """The height of the elastica that hangs as a heart loop, in the unit of strip and bending length.
+
+    Raises
+    ------
+    ArithmeticError
+        If Newton's method does not converge.
+    """
+    last, slope, pull = (0.5 * strip / bending_length) ** 3, -4.9, -8.8
+    ends, tiny = (0.0, 0.0, 0.0), 1e-6
+    for weight in np.linspace(0.0, last, 1 + math.ceil(last / 5.0)).tolist():
+        for _ in range(50):
+            ends = _shot(slope, pull, weight)
+            if max(abs(ends[0]), abs(ends[1])) < 1e-10:
+                break
+            sides = _shot(slope + tiny, pull, weight), _shot(slope, pull + tiny, weight)
+            matrix = [[(side[i] - ends[i]) / tiny for side in sides] for i in range(2)]
+            one, two = np.linalg.solve(matrix, [-ends[0], -ends[1]]).tolist()
+            most = max(1.0, abs(one), abs(two) / 5.0)
+            slope, pull = slope + one / most, pull + two / most
+        else:
+            raise ArithmeticError("the heart loop's elastica was not found")
+    return -0.5 * strip * ends[2]
+
+
+def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
+    """A strip whose ends are held together, pointing up: heights of loops, bending length by Peirce."""
+    fabric.needs_bending("loop")
+    shell, record, cells = fabric.shell(degrees), Record(), 64
+    known = (fabric.rigidity(degrees) / (G * shell.density)) ** (1.0 / 3.0)
+    strips, heights, shapes = [4.0 * known, 6.0 * known, 8.0 * known], [], []
+    for strip in strips:
+        half = 0.5 * strip
+        flat, faces = rectangle(cells, 1, half, half / cells)
+        straight = half / cells
+        radius = (half - straight) / (1.5 * math.pi + 1.0)
+        s = flat[:, 0] - straight
+        angle = np.clip(s / radius, 0.0, 1.5 * math.pi)
+        left = np.maximum(s - 1.5 * math.pi * radius, 0.0)
+        x = radius * (1.0 - np.cos(angle)) - left
+        z = straight + radius * np.sin(angle) + np.minimum(s, 0.0)
+        x[flat[:, 0] > half - 1e-9] = 0.0
+        nodes = np.arange(len(flat))
+        content = _scene(
+            bench.mesh(np.column_stack([x, flat[:, 1], z]), faces, rest=flat[:, :2]),
+            fabric.turned(degrees),
+            handles=[
+                {"nodes": nodes[flat[:, 0] < 1e-12].tolist(), "clamp": True},
+                {"nodes": nodes[flat[:, 0] > half - 1e-9].tolist(), "symmetry": "x"},
+                {"nodes": nodes.tolist(), "axes": ["y"]},
+            ],
+            gravity=[0.0, 0.0, -G],
+        )
+        with bench.simulation(content) as trial:
+            found = trial.run().x[: cells + 1, ::2]
+        heights.append(-float(found[-1, 1]))
+        shapes.append(found)
+    lengths = [loop_length(h, strip) for h, strip in zip(heights, strips, strict=True)]
+    record.numbers = [
+        _number(f"height of {1e2 * strip:.3g} cm", 1e2 * h, "cm")
+        for h, strip in zip(heights, strips, strict=True)
+    ]
+    record.numbers.append(_number("bending length c, by Peirce's formula", 1e2 * lengths[1], "cm"))
+    record.curves = [
+        Curve(
+            f"{1e2 * strip:.3g} cm",
+            "x [cm]",
+            "z [cm]",
+            (1e2 * shape[:, 0]).tolist(),
+            (1e2 * shape[:, 1]).tolist(),
+        )
+        for strip, shape in zip(strips, shapes, strict=True)
+    ]
+    if not max(shell.friction_moment) > 0.0:
+        for strip, height in zip(strips, heights, strict=True):
+            words = f"height of {1e2 * strip:.3g} cm, against the elastica"
+            record.claim(words, height, loop_height(known, strip), 0.01)
+    return record

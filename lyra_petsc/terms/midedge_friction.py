@@ -1,0 +1,210 @@
+"""Dry friction in bending by directors on edges: a fabric's hysteresis and lasting folds.
+
+As in ``coulomb``, of the curvature κ of a triangle (``midedge``) less that, κ_p, to which it has slid, in the
+norm that weights directions by their limits M1 and M2 [N m/m] ::
+
+    |u|² = (M1² u11² + M2² u22² + 2 M1 M2 u12²) / (M1 M2),   u = κ − κ_p
+    energy = ½ A √(M1 M2) |u|² / κ_y  for |u| ≤ κ_y,   A √(M1 M2) (|u| − κ_y/2)  beyond
+
+With directors' tangents T, of which κ is a linear function, and constants K it is a function of the quadratic
+form Q of ``midedge_energy``, E = ½ Q up to r = √Q = r_y and r_y (r − r_y/2) beyond, whose gradient is that of
+the form with K r_y/r in place of K, and whose Hessian is less by p pᵀ / (r r_y), of its pulls p.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.terms import hinge_friction, midedge, midedge_energy
+from lyra_petsc.terms.hinge_friction import GIVE
+from lyra_petsc.terms.midedge import NO_FRICTION, MidEdge
+from lyra_petsc.terms.midedge_shape import Frames, tangents
+from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.rest import RestShape
+from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
+
+Array = NDArray[np.float64]
+
+
+class Sliding(NamedTuple):
+    """What triangles have at positions.
+
+    Attributes
+    ----------
+    part : (E,)
+        r_y/r where they slide, else 1.
+    friction : (E, 2)
+        As ``midedge_energy`` takes it.
+    """
+
+    part: Array
+    friction: Array
+
+
+class MidEdgeFriction(Elastic):
+    """Friction of all triangles; `connect` must follow.
+
+    Parameters
+    ----------
+    elements : Elements
+        As of `MidEdge`, with K for ``stiffness`` and data ``reach`` (E,), r_y [√J].
+
+    Attributes
+    ----------
+    bent : (E, 3)
+        Tangents of directors, to which triangles have slid.
+    """
+
+    def __init__(self, elements: Elements) -> None:
+        super().__init__(elements)
+        data = elements.data
+        self.bent: Array = data["rest"].copy()
+        self._slides: Remembered[tuple[Array, ...]] | None = None
+        self._frames: Frames | None = None
+
+    def connect(self, terms: Iterable[Term]) -> None:
+        self.follows = sheet = next(term for term in terms if isinstance(term, MidEdge))
+        assert self.edges is not None
+        self._edges = np.searchsorted(sheet.of_edges.places, self.edges).astype(np.int32)
+
+    @property
+    def _sheet(self) -> MidEdge:
+        assert isinstance(self.follows, MidEdge)
+        return self.follows
+
+    def freeze(self, step: UpcomingStep) -> Frames:
+        return self._sheet.freeze(step)
+
+    # -- energy ------------------------------------------------------------------------------------
+
+    def _sliding(self, x: Array, frames: Frames) -> Sliding:
+        if self._slides is None or self._frames is not frames:
+            self._frames = frames
+            self._slides = Remembered(lambda at: self._computed(at, frames))
+        return Sliding(*self._slides(x))
+
+    def _computed(self, x: Array, frames: Frames) -> Sliding:
+        half, data = np.empty(self.n_elements), self.elements.data
+        constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
+        shape = self._sheet.shape(x, frames)
+        midedge_energy.energies(x, self.stencil, self._edges, shape, *constants, half)
+        reach, size = data["reach"], np.sqrt(2.0 * np.maximum(half, 0.0))
+        far = np.maximum(size, reach)  # those that stick have no more than their form
+        more = np.where(size > reach, 0.5 * reach * (far - reach), 0.0)
+        bend = np.where(size > reach, -1.0 / (reach * far), 0.0)
+        return Sliding(reach / far, np.column_stack([bend, more]))
+
+    def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
+        data = self.elements.data
+        stiffness = data["stiffness"] * sliding.part[:, None]
+        return stiffness, self.bent, data["limit"], sliding.friction
+
+    def energies(self, x: Array, frozen: Frames) -> Array:
+        out, shape = np.empty(self.n_owned), self._sheet.shape(x, frozen)
+        constants = self._constants(self._sliding(x, frozen))
+        midedge_energy.energies(x, self.stencil, self._edges, shape, *constants, out)
+        return out
+
+    def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
+        data, shape = self.elements.data, self._sheet.shape(x, frozen)
+        numbers, constants = (
+            (self.stencil, self._edges, self.edges),
+            self._constants(self._sliding(x, frozen)),
+        )
+        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, data["length"], out)
+
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: Frames,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        before: Array | None = None,
+    ) -> None:
+        data, shape = self.elements.data, self._sheet.shape(x, frozen)
+        constants = *self._constants(self._sliding(x, frozen)), data["length"], self.edges
+        numbers = self._edges, data["sign"], shape
+        midedge_energy.add_hessian(
+            x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
+        )
+
+    def force_scale(self, size: float) -> Array:
+        data = self.elements.data
+        scale: Array = data["stiffness"][:, [0, 3, 5]].sum(axis=1) * size / data["height"] ** 2
+        return scale
+
+    # -- state -------------------------------------------------------------------------------------
+
+    def begin(self, x: Array) -> None:
+        self.accept(x, self._sheet.frames)
+
+    def _bent_at(self, x: Array, frames: Frames) -> Array:
+        """What ``bent`` is to be where the step ends at x."""
+        found, part = np.empty((self.n_elements, 3)), self._sliding(x, frames).part[:, None]
+        tangents(x, self.stencil, self._edges, self._sheet.shape(x, frames), found)
+        return np.where((part < 1.0) & np.isfinite(found), found - part * (found - self.bent), self.bent)
+
+    def _become(self, bent: Array) -> None:
+        self.bent, self._slides = bent, None
+
+    def accept(self, x: Array, frozen: Frames) -> None:
+        self._become(self._bent_at(x, frozen))
+
+    def heat(self, x: Array, frozen: Frames) -> float:
+        part = self._sliding(x, frozen).part
+        if not (part < 1.0).any():
+            return 0.0
+        before, bent = float(self.energies(x, frozen).sum()), self.bent
+        self._become(self._bent_at(x, frozen))
+        after = float(self.energies(x, frozen).sum())
+        self._become(bent)
+        return before - after
+
+    def element_values(self) -> Array:
+        return self.bent
+
+    def restore_values(self, values: Array) -> None:
+        self._become(values.copy())
+
+
+def elements(rest: RestShape) -> Elements:
+    """The triangles with friction that bend by this model (rank 0)."""
+    notes = list(rest.notes)
+    found = midedge.elements(rest)
+    rest.notes = notes  # which are the sheet's
+    data = dict(found.data)
+    moments = np.array([shell.friction_moment for shell in rest.shells])
+    one, two = moments[rest.shell_of[data["triangle"].astype(np.int64)]].T
+    rubs = one > 0.0
+    weight = np.stack(
+        [one / np.where(rubs, two, 1.0), two / np.where(rubs, one, 1.0), 0.5 + 0.0 * one], axis=1
+    )
+    mean, curvature = np.sqrt(one * two), data["curvature"]
+    form = (data["area"] * mean / GIVE)[:, None, None] * np.einsum(
+        "eki,ek,ekj->eij", curvature, weight, curvature
+    )
+    data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
+    data["reach"] = np.sqrt(data["area"] * mean * GIVE)
+    for name in ("tangent", "director", "curvature", "area", "triangle", "damping"):
+        del data[name]
+    assert found.edges is not None
+    kept = {name: values[rubs] for name, values in data.items()}
+    return Elements(found.stencil[rubs], kept, edges=found.edges[rubs])
+
+
+def coarse_elements(rest: RestShape) -> Elements:
+    """Friction of the hinges between the same triangles, which stands for it while nothing slides."""
+    return hinge_friction.elements(rest, "midedge")
+
+
+def make(elements: Elements, scene: Scene, mass: Array) -> MidEdgeFriction:
+    """The term on one rank."""
+    return MidEdgeFriction(elements)

@@ -1,0 +1,111 @@
+"""Textile tests: the numbers of materials that are known, shadows that are, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.drape import DISC, disc_of, drape_coefficient, folds, shadow
+from lyra_petsc.experiments.fabric import strips
+from lyra_petsc.experiments.fabric.records import FabricCase, outcome_of, restore, save
+from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
+from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
+
+FABRIC = Fabric(
+    "fabric",
+    {
+        "density": 0.2,
+        "membrane": {"c11": 900.0, "c22": 800.0, "c12": 50.0, "c33": 30.0},
+        "bending": {"d11": 1e-5, "d12": 0.0, "d22": 5e-6, "d33": 3e-6},
+        "bending_model": "midedge",
+    },
+)
+
+
+@pytest.mark.parallel
+def test_the_cantilever_gives_b_back(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strips, "CELLS", 30)
+    with Bench(comm) as bench:
+        record = strips.cantilever(bench, FABRIC, 90.0)
+    assert record.verdicts["B"].passed, record.verdicts
+    found = {number.quantity: number.value for number in record.numbers}
+    assert found["B"] == pytest.approx(5.0, rel=5e-3)  # µN·m, of the weft
+    assert found["overhang"] == pytest.approx(2.0 * found["bending length c"])
+
+
+def test_bending_reads_b_and_the_loop() -> None:
+    rubbing = Fabric("fabric", FABRIC.block | {"friction_moment": [3e-4, 1e-4]})
+    with Bench(MPI.COMM_SELF) as bench:
+        record = strips.bending(bench, rubbing, 0.0)
+    assert set(record.verdicts) == {"B", "2HB at 0.5 cm⁻¹", "2HB at 1.5 cm⁻¹"}
+    assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
+    assert record.numbers[0].value == pytest.approx(1e-5 / 9.80665e-5, rel=0.01)
+    assert record.numbers[1].value == pytest.approx(6e-4 / 9.80665e-3, rel=0.01)
+
+
+def test_shear_and_tension() -> None:
+    rubbing = Fabric("fabric", FABRIC.block | {"friction_force": 0.7})
+    with Bench(MPI.COMM_SELF) as bench:
+        sheared, pulled = strips.shear(bench, rubbing, 0.0), strips.tensile(bench, FABRIC, 90.0)
+    g, loop, _ = (number.value for number in sheared.numbers)
+    assert g == pytest.approx(np.radians(30.0) / 0.980665, rel=0.35)  # tension and free sides have their part
+    assert loop == pytest.approx(2.0 * 0.7 / 0.980665, rel=0.1)
+    emt = pulled.numbers[0].value / 100.0
+    # (1 + e) c22 E of a strip that cannot contract
+    assert 800.0 * (1.0 + emt) * 0.5 * ((1.0 + emt) ** 2 - 1.0) == pytest.approx(490.3, rel=0.02)
+
+
+def test_a_loop_without_weight_and_one_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert strips.loop_height(100.0, 1.0) == pytest.approx(0.13386, abs=1e-4)
+    # Peirce's formula is an approximation
+    assert strips.loop_length(strips.loop_height(1.0, 6.0), 6.0) == pytest.approx(1.0, rel=0.05)
+    with Bench(MPI.COMM_SELF) as bench:
+        record = strips.loop(bench, FABRIC, 0.0)
+    assert len(record.verdicts) == 3
+    assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_folds_and_coefficient_of_a_shadow_that_is_known(count: int) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    rim = 0.12 * (1.0 + 0.08 * np.cos(count * angle))
+    vertices, faces = disc_of(angle)
+    vertices[:-1] *= (rim / DISC)[:, None]
+    dark = shadow(vertices, faces, 240)
+    assert folds(dark) == count
+    area = 0.5 * np.sum(rim[:-1] * rim[1:] * np.sin(np.diff(angle)))
+    exact = (area - np.pi * DISC**2) / (np.pi * (0.15**2 - DISC**2))
+    assert drape_coefficient(dark) == pytest.approx(exact, abs=0.005)
+    assert folds(shadow(*disc_of(angle), 240)) == 0
+
+
+def test_a_record_outlives_its_process(tmp_path: Path) -> None:
+    case = FabricCase("loop-warp", "title", "loop", 0.0)
+    with Bench(MPI.COMM_SELF) as bench:
+        outcome = outcome_of(case, strips.tensile(bench, FABRIC, 0.0))
+    save(outcome, tmp_path)
+    assert restore(tmp_path, case) == outcome
+
+
+def test_all_are_the_tests() -> None:
+    assert {case.test for case in cases_of("all")} == set(TESTS)
+
+
+@pytest.mark.parametrize(
+    ("material", "settings", "words"),
+    [
+        ("gray-interlok", (), "gray-interlock"),
+        ("no.yaml", (), "no.yaml"),
+        ("gray-interlock", ("time.end=1",), "changes a scene"),
+    ],
+)
+def test_what_is_no_material_is_refused(material: str, settings: Any, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        fabric_of(material, settings)
+    assert words in str(caught.value)

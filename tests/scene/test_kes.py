@@ -1,0 +1,83 @@
+"""Friction within the fabric and numbers of KES reports, from the scene to the constants of a shell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.load import scene_of
+from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+
+pytestmark = pytest.mark.quick
+
+SCENE = {"mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}}, "time": {"end": 1.0, "step": 0.1}}
+NUMBERS = {"density": 0.2, "membrane": {"c11": 900.0, "c22": 800.0, "c12": 0.0}}
+REPORT = {"B": 0.1, "2HB": 0.05, "G": 0.6, "2HG": 1.5}
+
+
+def shell_of(**keys: Any) -> ShellMaterial:
+    return resolve(scene_of(SCENE | {"material": keys}).material[0])[0]
+
+
+@pytest.mark.parametrize("model", ["hinge", "midedge"])
+def test_a_report_in_its_own_units(model: str) -> None:
+    shell = shell_of(**NUMBERS, bending_model=model, kes=REPORT)
+    assert shell.bending == pytest.approx((9.80665e-6, 9.80665e-6, 9.80665e-6))
+    assert shell.friction_moment == pytest.approx((0.025 * 9.80665e-3,) * 2)
+    assert shell.c33 == pytest.approx(0.6 * 0.980665 * 57.29577951)
+    assert shell.friction_force == pytest.approx(0.75 * 0.980665)
+    if model == "midedge":
+        assert shell.plate == pytest.approx((9.80665e-6, 0.0, 9.80665e-6, 0.5 * 9.80665e-6))
+
+
+def test_warp_and_weft() -> None:
+    kes = {"B": [0.2, 0.1], "2HB": [0.06, 0.02]}
+    hinge, midedge = (
+        shell_of(cloth="gray-interlock", bending_model=m, kes=kes) for m in ("hinge", "midedge")
+    )
+    warp, weft = 0.2 * 9.80665e-5, 0.1 * 9.80665e-5
+    assert hinge.bending == pytest.approx((weft, 0.5 * (warp + weft), warp))  # of hinges along the warp
+    assert midedge.plate[:3] == pytest.approx((warp, 0.0, weft))
+    assert midedge.friction_moment == pytest.approx((0.03 * 9.80665e-3, 0.01 * 9.80665e-3))
+
+
+def test_it_is_scaled_as_what_it_acts_beside() -> None:
+    shell = shell_of(
+        **(NUMBERS | {"membrane": NUMBERS["membrane"] | {"c33": 1.0}}),  # type: ignore[operator]
+        bending=1e-5,
+        friction_moment=1e-4,
+        friction_force=0.5,
+        bending_scale=2.0,
+        stretching_scale=3.0,
+    )
+    assert shell.friction_moment == (2e-4, 2e-4)
+    assert shell.friction_force == 1.5
+
+
+def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
+    scene = scene_of(SCENE | {"material": NUMBERS | {"kes": REPORT}})
+    path = tmp_path / "scene.yaml"
+    path.write_text(dump_scene(scene), encoding="utf-8")
+    from lyra_petsc.scene.load import load_scene
+
+    assert load_scene(path).material == scene.material
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"bending": 1e-5, "kes": REPORT}, "kes has B"),
+        ({"friction_moment": 1e-4, "kes": REPORT}, "kes has 2HB"),
+        ({"friction_force": 1.0, "kes": REPORT}, "kes has 2HG"),
+        ({"kes": {"G": 0.5, "2HB": 0.1}}, "friction acts beside a bending stiffness"),
+        ({"kes": {"B": 0.0, "G": 1.0}}, "must be > 0"),
+        ({"kes": {"HB": 0.1, "G": 1.0}}, "unknown key"),
+        ({"bending": 1e-5, "friction_moment": -1.0, "kes": {"G": 1.0}}, "must be >= 0"),
+    ],
+)
+def test_what_contradicts_is_refused(keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        shell_of(**NUMBERS, **keys)
