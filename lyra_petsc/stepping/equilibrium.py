@@ -157,7 +157,7 @@ class Equilibrium:
                 self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
                 self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
             elif leap:  # too far, also where without inertia no preconditioner can be set up
-                self._integrator.pseudo, leaps = self._careful, False
+                self._integrator.pseudo, leaps = self._careful, self._sufficed == ANY and not arrived
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:

@@ -127,7 +127,7 @@ class MidEdgeFriction(Elastic):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
-        before: Array | None = None,
+        predicted: tuple[Array, Array] | None = None,
     ) -> None:
         data, shape = self.elements.data, self._sheet.shape(x, frozen)
         constants = *self._constants(self._sliding(x, frozen)), data["length"], self.edges
