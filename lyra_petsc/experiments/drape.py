@@ -20,6 +20,9 @@ CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
 STARTS, NOISE = 5, 2e-4
 """How many, and the standard deviation [m] of their heights"""
 
+LEAST_FOLD = 1e-3
+"""Amplitude [m] of a rim below which it has no folds"""
+
 MARGIN = 1.05
 """Half the side of a shadow's picture over the radius of the cloth"""
 
@@ -72,18 +75,17 @@ def drape_coefficient(dark: Picture) -> float:
 
 def folds(dark: Picture) -> int:
     """How often the rim of a shadow goes outwards beyond its mean, small ripples left out."""
-    middles = _middles(-1.0, len(dark))
-    angle, radius = np.radians(np.arange(0.0, 360.0, 2.0)), np.linspace(DISC, MARGIN * CLOTH, 120)
+    half, last = MARGIN * CLOTH, len(dark) - 1
+    angle, radius = np.radians(np.arange(0.0, 360.0, 2.0)), np.linspace(0.9 * DISC, half, 150)
     places = [
-        np.clip(np.searchsorted(middles, np.outer(f(angle), radius)), 0, len(dark) - 1)
+        np.clip((np.outer(f(angle), radius) / half + 1.0) * 0.5 * len(dark), 0, last).astype(int)
         for f in (np.cos, np.sin)
     ]
     rim = (dark[places[1], places[0]] * radius).max(axis=1)
     waves = np.fft.rfft(rim - rim.mean())
     waves[13:] = 0.0  # shorter than 30°
     smooth = np.fft.irfft(waves, len(rim))
-    above = smooth > 0.1 * np.abs(smooth).max()
-    below = smooth < -0.1 * np.abs(smooth).max()
-    states = np.where(above, 1, np.where(below, -1, 0))
+    least = max(LEAST_FOLD, 0.1 * float(np.abs(smooth).max()))
+    states = np.where(smooth > least, 1, np.where(smooth < -least, -1, 0))
     seen = states[states != 0]
     return int(np.sum((seen == 1) & (np.roll(seen, 1) == -1)))

@@ -1,95 +1,119 @@
-"""Writes docs/reference/fabrics.md: data sheets of the library's cloths by ``fabric all``.
+"""Writes docs/reference/fabrics.md: the library's cloths in the tests of ``fabric``.
 
-``python scripts/docs/fabrics.py [FOLDER]`` (ten minutes of one core); cloths that FOLDER has are
-not run again.
+``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: ten minutes of one core). FOLDER keeps what came
+of each test, which is not run again; the page has what is there.
 """
 
 from __future__ import annotations
 
-import csv
-import subprocess
+import math
 import sys
 from pathlib import Path
 
+from mpi4py import MPI
+
+from lyra_petsc.experiments.fabric.records import FabricCase, Record, restore, save
+from lyra_petsc.experiments.fabric.specimens import fabric_of
+from lyra_petsc.experiments.fabric.textile_tests import cases_of, run_case
 from lyra_petsc.scene.materials.library import measured
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "fabrics.md"
 PICTURE = "fabrics.png"
 MADE = "<!-- made by scripts/docs/fabrics.py; change the program, not this page -->"
+CLOTHS = [*measured(), "aluminium", "paper"]
 
 COLUMNS = {
     "EMT [%]": ("tensile", "EMT"),
     "LT": ("tensile", "LT"),
     "G [gf/(cm·°)]": ("shear", "G"),
-    "B [gf·cm²/cm]": ("bending", "B"),
     "c [cm]": ("cantilever", "bending length c"),
+    "B [µN·m]": ("cantilever", "B"),
+    "B of KES [gf·cm²/cm]": ("bending", "B"),
     "drape [%]": ("cusick", "drape coefficient"),
     "folds": ("cusick", "folds"),
 }
 """Heads, and which test and quantity each is of."""
 
 
-def sheet(cloth: str, folder: Path) -> list[dict[str, str]]:
-    """The lines of a cloth's table, run where there is none."""
-    out = folder / cloth
-    if not (out / "report.md").exists():
-        command = [sys.executable, "-m", "lyra_petsc", "fabric", "all", "--cloth", cloth]
-        subprocess.run([*command, "--out", str(out), "--force"], check=False, cwd=ROOT)
-    with open(out / "fabric.csv", encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+def records(folder: Path, cloth: str, test: str) -> list[Record]:
+    """What came of a test of a cloth, of warp and weft where they have one each."""
+    found = [restore(folder / cloth / case.name, case) for case in cases_of(test)]
+    return [outcome.record for outcome in found if outcome is not None]
 
 
-def cell(rows: list[dict[str, str]], test: str, quantity: str) -> str:
-    """A number, or those of warp and weft."""
-    found = [r for r in rows if r["test"].split("-")[0] == test and r["quantity"] == quantity]
+def measure(folder: Path, cloth: str, case: FabricCase) -> None:
+    """Run a test that has not been run."""
+    out = folder / cloth / case.name
+    if restore(out, case) is None:
+        out.mkdir(parents=True, exist_ok=True)
+        save(run_case(MPI.COMM_SELF, case, fabric_of(cloth), lambda: None), out)
+        print(cloth, case.name, flush=True)
+
+
+def cell(found: list[Record], quantity: str) -> str:
+    """A number, or those of warp and weft; – without."""
     words = []
-    for row in found:
-        scatter = f" ± {float(row['scatter']):.2g}" if row["scatter"] else ""
-        words.append(f"{float(row['value']):.3g}{scatter}")
-    return " / ".join(words) or "–"
+    for record in found:
+        number = next((n for n in record.numbers if n.quantity == quantity), None)
+        if number is None:
+            words.append("–")
+            continue
+        scatter = "" if math.isnan(number.scatter) else f" ± {number.scatter:.2g}"
+        words.append(f"{number.value:.3g}{scatter}")
+    return " / ".join(words)
 
 
-def picture(folder: Path, cloths: list[str]) -> None:
-    """All shadows beside each other."""
-    from matplotlib import image
+def picture(folder: Path) -> bool:
+    """All shadows beside each other; whether there are any."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.2, 5.0), layout="constrained")
+    shadows = {cloth: r.shadow for cloth in CLOTHS for r in records(folder, cloth, "cusick") if r.shadow}
+    if not shadows:
+        return False
+    figure = Figure(figsize=(7.2, 1.9 * math.ceil(len(shadows) / 4)), layout="constrained")
     FigureCanvasAgg(figure)
-    for number, cloth in enumerate(cloths, 1):
-        axes = figure.add_subplot(3, 4, number)
-        axes.set_title(cloth, fontsize=6)
+    for number, (cloth, shadow) in enumerate(shadows.items(), 1):
+        axes = figure.add_subplot(math.ceil(len(shadows) / 4), 4, number)
+        axes.set_title(cloth, fontsize=7)
         axes.axis("off")
-        path = folder / cloth / "plots" / "cusick-shadow.png"
-        if path.exists():
-            axes.imshow(image.imread(path))
-    figure.savefig(PAGE.with_name(PICTURE), dpi=70, metadata={"Software": None})
+        axes.imshow(shadow, cmap="Greys", origin="lower", vmin=0, vmax=1.4)
+    figure.savefig(PAGE.with_name(PICTURE), dpi=80, metadata={"Software": None})
+    return True
 
 
-def main() -> None:
-    """Run what is missing and write the page."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "runs" / "fabrics").absolute()
-    cloths = [*measured(), "aluminium", "paper"]
-    sheets = {cloth: sheet(cloth, folder) for cloth in cloths}
+def page(folder: Path) -> None:
+    """Write the page."""
+    columns = {head: of for head, of in COLUMNS.items() if any(records(folder, c, of[0]) for c in CLOTHS)}
     lines = [
         "# Fabrics",
         "",
         MADE,
         "",
-        "The library's cloths in standard tests (`lyra-petsc fabric all --cloth NAME`): warp / weft, drape "
-        "with the standard deviation of five starts, – where 500 gf/cm are not reached. The law of those that "
-        "were measured is `measured`; aluminium and paper were not. [How](../howto/kes.md).",
+        "The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, drape with the",
+        "standard deviation of five starts, – where 500 gf/cm are not reached. The law of those that were",
+        "measured is `measured`; aluminium and paper were not.",
         "",
-        "| cloth | " + " | ".join(COLUMNS) + " |",
-        "| --- " * (len(COLUMNS) + 1) + "|",
+        "| cloth | " + " | ".join(columns) + " |",
+        "| --- " * (len(columns) + 1) + "|",
     ]
-    for cloth, rows in sheets.items():
-        lines.append(f"| {cloth} | " + " | ".join(cell(rows, *of) for of in COLUMNS.values()) + " |")
-    lines += ["", f"![Shadows of the drape test]({PICTURE})", ""]
-    PAGE.write_text("\n".join(lines), encoding="utf-8")
-    picture(folder, cloths)
+    for cloth in CLOTHS:
+        cells = [cell(records(folder, cloth, test), quantity) for test, quantity in columns.values()]
+        lines.append(f"| {cloth} | " + " | ".join(cells) + " |")
+    if picture(folder):
+        lines += ["", f"![Shadows of the drape test]({PICTURE})"]
+    PAGE.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def main() -> None:
+    """Run what is missing of the tests, and write the page after each of them."""
+    folder = Path(sys.argv[1])
+    for test in sys.argv[2:] or dict.fromkeys(test for test, _ in COLUMNS.values()):
+        for cloth in CLOTHS:
+            for case in cases_of(test):
+                measure(folder, cloth, case)
+        page(folder)
 
 
 if __name__ == "__main__":
