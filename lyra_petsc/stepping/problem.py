@@ -125,8 +125,10 @@ class Problem:
         return next(term for term in self.terms.values() if isinstance(term, Membrane))
 
 
-def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
+def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases, known: Mesh | None = None) -> Problem:
     """Mesh, partition, terms and matrix pattern of a scene; collective.
+
+    ``known`` is the scene's mesh on rank 0, where it stands already.
 
     Raises
     ------
@@ -138,7 +140,7 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = mesh_of(scene, phases.tell)
+        mesh = known or mesh_of(scene, phases.tell)
         outline, whole = _whole(scene, mesh)
         return outline
 
