@@ -220,4 +220,3 @@ class Fit(Block):
     measurements: Annotated[
         list[Measurement], BeforeValidator(_some), Field(json_schema_extra={"minItems": 1})
     ]
-

@@ -9,9 +9,9 @@ positions, velocities and the integrator's memory. Its end z_{n+1} is linear in 
 one, by which V is found). The directional derivatives of G are differences of four *neighbours*: the same
 discretised scene at p ± δ and p ± 2 δ, whose states are z_n ± δ z_n' and z_n ± 2 δ z_n'. They are exact for
 polynomials of degree four in (z, p): for a St. Venant-Kirchhoff membrane whose numbers enter linearly, but
-for round-off. What a step freezes (damping at x_n, normals of the wind, loads), accelerations at its start and
-histories are so differentiated without a line of their own. What is left of the linear solve, and what the
-Jacobian lacks (the stiffness of pressure in statics), goes by generalised conjugate residuals around it.
+for round-off. What a step freezes (damping at x_n, normals of the wind, loads), accelerations at its start
+and histories are so differentiated without a line of their own. What is left of the linear solve, and what
+the Jacobian lacks (the stiffness of pressure in statics), goes by generalised conjugate residuals around it.
 
 Sources: Michaleris, Tortorelli & Vidal, Int. J. Numer. Meth. Engng 37 (1994) 2471-2499 (tangent operators of
 transient problems); Eisenstat, Elman & Schultz, SIAM J. Numer. Anal. 20 (1983) 345-357 (GCR).
@@ -23,11 +23,10 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.mesh.mesh import Mesh
@@ -46,8 +45,8 @@ Array = NDArray[np.float64]
 
 CENTRAL = {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
 FORWARD = {0: -25.0 / 12.0, 1: 4.0, 2: -3.0, 3: 4.0 / 3.0, 4: -0.25}
-"""Offsets in δ and weights of a first derivative, exact up to degree four; where a number may not be less than
-it is, that of the neighbours at and above it.
+"""Offsets in δ and weights of a first derivative, exact up to degree four; where a number may not be less,
+those of the neighbours at and above it.
 """
 
 RELATIVE = 3e-4
@@ -118,6 +117,16 @@ class _Before:
     frames: list[Frames]
 
 
+@dataclass(frozen=True)
+class _Equilibrium:
+    """Load factors of the equilibrium before and of this one, its positions (n_owned, 3) and frames."""
+
+    before: float
+    factor: float
+    x: Array
+    frames: list[Frames]
+
+
 class Sensitivities:
     """Steps a simulation and, beside it, the derivatives of its state; every method is collective.
 
@@ -164,7 +173,6 @@ class Sensitivities:
             ]
             self._neighbours.append(beside)
             self._begin(beside, step, reactions=reactions)
-        self._linear_iterations = 0
 
     def destroy(self) -> None:
         """Free what the neighbours hold."""
@@ -224,7 +232,7 @@ class Sensitivities:
         return report
 
     def _follow_motion(self, before: _Before, *, fresh: bool) -> None:
-        system, n = self._system, self._system.points.n_owned
+        system = self._system
         velocity, end = system.stage_velocity.copy(), self.simulation.time
         system.reopen(before.x)
         with self._solver(velocity, set_up=self._iterates, keep=not fresh) as solve:
@@ -236,7 +244,7 @@ class Sensitivities:
                 system.prescribed.put(prescribed, change)
                 way = self._solved(
                     solve,
-                    lambda at, beside=beside, step=step: self._change_of_stage(beside, step, velocity, at),
+                    partial(self._change_of_stage, beside, step, velocity),
                     prescribed,
                     step,
                 )
@@ -308,10 +316,7 @@ class Sensitivities:
         tangent.x = _combined(beside, step, lambda each: each.system.x[:n])
         tangent.v = _combined(beside, step, lambda each: each.system.v[:n])
         names = beside[0].system.integrator.memory()[0].keys()
-        tangent.memory = {
-            name: _combined(beside, step, lambda each, name=name: each.system.integrator.memory()[0][name])
-            for name in names
-        }
+        tangent.memory = {name: _combined(beside, step, partial(_remembered, name)) for name in names}
 
     def _to_frames(self, system: StageEquations) -> None:
         """Measure a neighbour's directors from the frames in which the simulation's now are."""
@@ -351,7 +356,7 @@ class Sensitivities:
                 system.prescribed.put(prescribed, change)
                 way = self._solved(
                     solve,
-                    lambda at, beside=beside, step=step: self._change_of_stage(beside, step, rates, at),
+                    partial(self._change_of_stage, beside, step, rates),
                     prescribed,
                     step,
                 )
@@ -367,43 +372,45 @@ class Sensitivities:
         system, n = self._system, self._system.points.n_owned
         integrator = system.integrator
         assert isinstance(integrator, Static)
-        x, factor, pseudo = system.x[:n].copy(), self.simulation.time, integrator.pseudo
-        frames = [term.frames for term in _edged(system)]
+        now = _Equilibrium(
+            before.time, self.simulation.time, system.x[:n].copy(), [term.frames for term in _edged(system)]
+        )
+        pseudo = integrator.pseudo
         integrator.pseudo = math.sqrt(LONGEST) * self._slowest()
-        system.begin_step(before.time, factor)
+        system.begin_step(now.before, now.factor)
         reach = system.stage.reach
-        with self._solver(np.zeros_like(x), set_up=True, keep=False) as solve:
+        with self._solver(np.zeros_like(now.x), set_up=True, keep=False) as solve:
             for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
-
-                def forces(
-                    at: Array, beside: list[Neighbour] = beside, step: float = step, last: bool = False
-                ) -> Array:
-                    def out_of_balance(each: Neighbour) -> Array:
-                        system = each.system
-                        system.state.set(x + each.offset * step * at, np.zeros_like(x))
-                        for term, mine in zip(_edged(system), frames, strict=True):
-                            term.frames = mine
-                        system.applied.factor = self._system.applied.factor
-                        system.begin_step(before.time, factor)
-                        if last and each.ledger is not None:
-                            system.stay()
-                            each.ledger.record(x)
-                        return -system.out_of_balance()[0]
-
-                    return self._free(_combined(beside, step, out_of_balance))
-
-                forces(np.zeros_like(x))  # so that goals are known
-                prescribed = np.zeros_like(x)
+                self._change_of_force(now, beside, step, np.zeros_like(now.x))  # so that goals are known
+                prescribed = np.zeros_like(now.x)
                 change = _combined(beside, step, lambda each: each.system.prescribed.goal)
                 system.prescribed.put(prescribed, change)
-                _drop_rounding(prescribed, x, step)
+                _drop_rounding(prescribed, now.x, step)
+                forces = partial(self._change_of_force, now, beside, step)
                 tangent.x = self._solved(lambda r: reach * solve(r), forces, prescribed, step)
-                forces(tangent.x, last=True)
+                self._change_of_force(now, beside, step, tangent.x)
                 for each in beside:
-                    each.system.begin(factor)
+                    if each.ledger is not None:
+                        each.system.stay()
+                        each.ledger.record(now.x)
+                    each.system.begin(now.factor)
         integrator.pseudo = pseudo
-        system.begin_step(before.time, factor)
+        system.begin_step(now.before, now.factor)
         system.stay()
+
+    def _change_of_force(self, now: _Equilibrium, beside: list[Neighbour], step: float, way: Array) -> Array:
+        """Derivative (n_owned, 3) [N] of what is out of balance where positions change by ``way``."""
+
+        def against(each: Neighbour) -> Array:
+            system = each.system
+            system.state.set(now.x + each.offset * step * way, np.zeros_like(now.x))
+            for term, frames in zip(_edged(system), now.frames, strict=True):
+                term.frames = frames
+            system.applied.factor = self._system.applied.factor
+            system.begin_step(now.before, now.factor)
+            return -system.out_of_balance()[0]
+
+        return self._free(_combined(beside, step, against))
 
     def _slowest(self) -> float:
         """A time [s] in which sheets of this mass fall far."""
@@ -415,9 +422,7 @@ class Sensitivities:
     # -- linear equations --------------------------------------------------------------------------
 
     @contextmanager
-    def _solver(
-        self, velocity: Array, *, set_up: bool, keep: bool
-    ) -> Iterator[Callable[[Array], Array]]:
+    def _solver(self, velocity: Array, *, set_up: bool, keep: bool) -> Iterator[Callable[[Array], Array]]:
         """Approximate solutions by the Jacobian at the velocities of the simulation's stage."""
         stepper, system = self.simulation.stepper, self._system
         ksp, linear = stepper.ksp, stepper.linear
@@ -472,8 +477,8 @@ class Sensitivities:
                 break
             direction, image = direction / size, image / size
             directions.append((direction, image))
-            way = way - self._dot(image, residual) * direction
-            residual, before = change(way), norm
+            part = self._dot(image, residual)
+            way, residual, before = way - part * direction, residual - part * image, norm
             norm = math.sqrt(self._dot(residual, residual))
             if norm > 0.5 * before and norm <= roundoff:
                 return way
@@ -501,23 +506,24 @@ class Sensitivities:
 
             def value(each: Neighbour, tangent: Tangent = tangent, step: float = step) -> Array:
                 way, system = each.offset * step, each.system
-                system.state.set(
-                    self._system.x[:n] + way * tangent.x, self._system.v[:n] + way * tangent.v
-                )
+                system.state.set(self._system.x[:n] + way * tangent.x, self._system.v[:n] + way * tangent.v)
                 return np.asarray(quantity(each.problem, each.ledger))
 
             columns.append(_combined(beside, step, value))
         return np.stack(columns, axis=1)
 
 
-def _combined(
-    beside: Sequence[Neighbour], step: float, of: Callable[[Neighbour], Array]
-) -> Array:
+def _combined(beside: Sequence[Neighbour], step: float, of: Callable[[Neighbour], Array]) -> Array:
     """The derivative of what each neighbour gives."""
     total: Array | float = 0.0
     for each in beside:
         total = total + (each.weight / step) * of(each)
     return np.asarray(total)
+
+
+def _remembered(name: str, each: Neighbour) -> Array:
+    """An array of the integrator's memory."""
+    return each.system.integrator.memory()[0][name]
 
 
 def _drop_rounding(values: Array, base: Array, step: float) -> None:
@@ -571,4 +577,3 @@ def _scenes(scene: Scene, number: Number, step: float) -> Iterator[tuple[float, 
             return
     assert problem is not None
     raise problem
-

@@ -332,7 +332,7 @@ class StageEquations:
         self.state.set(moved, rate)
 
     def reopen(self, x_before: Array) -> None:
-        """Let the equations of the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
+        """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
         if self._xh is self.x:
             self._xh = fitted(x_before, self.points.n_owned, self.points.n_local)
             self.points.update_ghosts(self._xh)

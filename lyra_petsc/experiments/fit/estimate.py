@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ STALLED = 1e-7
 MOST_ITERATIONS = 40
 
 NOTHING = 1e-9
-"""Largest derivative over the largest of all, with numbers in units of their size: a number without influence."""
+"""Largest derivative by a number without influence over that by others, in units of their sizes."""
 
 OPEN = 1.0
 """Standard deviation of a combination over its size from which on the data do not tell it."""
@@ -240,15 +241,18 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     best = min(known.values(), key=lambda trial: trial.cost)
     left = _step(best, low, high)
     if left <= SETTLED or reason > 0:
-        return best, f"the search ended; a step more would change no number by more than {left:.2g} deviations"
+        return (
+            best,
+            f"the search ended; where it tends to is {left:.2g} standard deviations away",
+        )
     if best is first and best.cost > 0.0:
         raise SolverError(
             f"TAO found nothing better than the start (reason {reason}); give other starts or bounds",
             collective=True,
         )
     return best, (
-        f"the search was stopped after {len(known)} evaluations (TAO's reason {reason}), {left:.2g} deviations "
-        "from where it tends to; go on from these numbers, or give -tao_max_it"
+        f"the search was stopped after {len(known)} evaluations (TAO: {reason}), {left:.2g} standard "
+        "deviations from where it tends to; go on from these numbers, or give -tao_max_it"
     )
 
 
@@ -270,7 +274,7 @@ def _step(trial: Trial, low: Array, high: Array) -> float:
     return float(np.linalg.norm(jacobian @ step)) / math.sqrt(free.sum())
 
 
-def _held(numbers: Array, gradient: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> NDArray[np.bool_]:
     """Which numbers lie at a bound that the cost drives them against."""
     slack = 1e-9 * (high - low)
     held: NDArray[np.bool_] = ((numbers <= low + slack) & (gradient > 0.0)) | (
@@ -327,8 +331,8 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     if freedom > 0 and misfit > 1.0 + 3.0 * spread:
         words.append(
-            f"the scene misses the measurements by {math.sqrt(misfit):.2g} times their uncertainties: these are "
-            "too small, or something that acts is not in the scene; the intervals are then too narrow"
+            f"the scene misses the measurements by {math.sqrt(misfit):.2g} times their uncertainties: these "
+            "are too small, or something that acts is not in the scene; the intervals are then too narrow"
         )
     if freedom > 0 and misfit < 1.0 - 3.0 * spread:
         words.append(
@@ -340,9 +344,7 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
     return Conclusion(estimates, correlation, values, directions, misfit, words)
 
 
-def _words(
-    estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array
-) -> list[str]:
+def _words(estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array) -> list[str]:
     keys, words = [estimate.key for estimate in estimates], []
     for estimate in estimates:
         if estimate.at_bound:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -95,8 +96,15 @@ class Model:
 
         def make() -> None:
             self.mesh = mesh_of(scene)
+            count = self.mesh.n_vertices
             for reading in self.readings:
-                reading.check(self.mesh.n_vertices)
+                wrong = [number for number in reading.vertices if not 0 <= number < count]
+                if wrong:
+                    raise InputError(
+                        f"measures vertex {wrong[0]}, but the mesh has vertices 0 to {count - 1}",
+                        file=scene.source,
+                        key=reading.key,
+                    )
 
         on_root(comm, make)
 
@@ -125,9 +133,10 @@ class Model:
                 return self._by_differences(array, progress)
             return self._evaluate(array, derivatives, progress)
         except SolverError as error:
-            with_numbers = ", ".join(f"{key} = {value:.6g}" for key, value in zip(self.keys, array, strict=True))
+            pairs = zip(self.keys, array, strict=True)
+            words = ", ".join(f"{key} = {value:.6g}" for key, value in pairs)
             raise SolverError(
-                f"with {with_numbers}: {error}", collective=error.collective, details=error.details
+                f"with {words}: {error}", collective=error.collective, details=error.details
             ) from error
 
     def _evaluate(self, numbers: Array, derivatives: bool, progress: Progress) -> Evaluation:
@@ -180,10 +189,10 @@ class Model:
                 changed = numbers.copy()
                 changed[i] += sign * WHOLE_RUNS * size
                 done = 2 * i + k
-                run = self._evaluate(changed, False, lambda part, done=done: progress((done + part) / count))
+                run = self._evaluate(changed, False, partial(_scaled, progress, done, count))
                 pair.append(run.values)
             columns.append((pair[0] - pair[1]) / (2.0 * WHOLE_RUNS * size))
-        found = self._evaluate(numbers, False, lambda part: progress((count - 1 + part) / count))
+        found = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
         return Evaluation(numbers, found.values, np.stack(columns, axis=1))
 
     def _keep_shape(self, simulation: SteppedScene) -> None:
@@ -194,6 +203,10 @@ class Model:
             self.shape = np.empty((points.n_vertices_global, 3))
             for original, rows in pieces:
                 self.shape[original] = rows
+
+
+def _scaled(progress: Progress, done: int, count: int, part: float) -> None:
+    progress((done + part) / count)
 
 
 def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:

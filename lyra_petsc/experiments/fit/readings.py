@@ -68,12 +68,14 @@ class Reading(ABC):
         """Its values (m,) of the sums."""
 
     @property
+    def vertices(self) -> list[int]:
+        """Numbers of the vertices that it names."""
+        return []
+
+    @property
     def labels(self) -> list[str]:
         """Of its values, for tables."""
         return [f"{self.name} {part}".strip() for part in self.parts]
-
-    def check(self, n_vertices: int) -> None:
-        """Refuse what the mesh does not have."""
 
 
 @dataclass
@@ -117,12 +119,9 @@ class Places(Reading):
         means = self.means(total)
         return np.concatenate([mean[list(axes)] for mean, (_, axes) in zip(means, self.wanted, strict=True)])
 
-    def check(self, n_vertices: int) -> None:
-        for what, _ in self.wanted:
-            if isinstance(what, int) and not 0 <= what < n_vertices:
-                raise InputError(
-                    f"measures vertex {what}, but the mesh has vertices 0 to {n_vertices - 1}", key=self.key
-                )
+    @property
+    def vertices(self) -> list[int]:
+        return [what for what, _ in self.wanted if isinstance(what, int)]
 
 
 @dataclass
@@ -198,7 +197,7 @@ def instants(readings: Sequence[Reading]) -> list[Instant]:
 # -- from a scene ------------------------------------------------------------------------------------
 
 
-def readings_of(scene: Scene, measurements: Sequence[Measurement], *, at: str = "fit.measurements") -> list[Reading]:
+def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Reading]:
     """What a scene's measurements say; reads their tables (one rank).
 
     Raises
@@ -208,7 +207,7 @@ def readings_of(scene: Scene, measurements: Sequence[Measurement], *, at: str = 
     """
     found: list[Reading] = []
     for number, measurement in enumerate(measurements):
-        key = f"{at}[{number}]"
+        key = f"fit.measurements[{number}]"
         try:
             found += _readings(scene, measurement, key)
         except InputError as error:
@@ -241,7 +240,8 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
         return _points(scene, table, f"{key}.points", measurement.at, measurement.uncertainty)
     if measurement.table is None:
         reading = _made(scene, measurement, key, measurement.at or scene.time.end)
-        assert measurement.value is not None and measurement.uncertainty is not None
+        assert measurement.value is not None
+        assert measurement.uncertainty is not None
         if len(measurement.value) != len(reading.parts):
             raise InputError(
                 f"must hold {len(reading.parts)} numbers ({', '.join(reading.parts)}), "
@@ -262,9 +262,7 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
     for row, time in enumerate(columns["time"]):
         reading = _made(scene, measurement, key, float(time))
         reading.measured = np.array([columns[part][row] for part in one.parts])
-        sigma = (
-            columns["uncertainty"][row] if measurement.uncertainty is None else measurement.uncertainty
-        )
+        sigma = columns["uncertainty"][row] if measurement.uncertainty is None else measurement.uncertainty
         reading.uncertainty = np.full(len(one.parts), _positive(table, row, float(sigma)))
         found.append(reading)
     return found

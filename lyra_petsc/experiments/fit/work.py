@@ -28,12 +28,18 @@ Array = NDArray[np.float64]
 
 TRIALS_FILE = "trials.json"
 
+
+def _resumable(folder: Path) -> list[Path]:
+    """The evaluations from which a fit can go on."""
+    return [file for file in [folder / TRIALS_FILE] if file.is_file()]
+
+
 FIT = FolderKind(
     "fit",
     Path("fits"),
     "fit.lock",
     re.compile(r"(trials\.json|fit\.(csv|json)|report\.(html|md)|[\w-]+\.(png|svg))(\.part)?"),
-    lambda folder: [file for file in [folder / TRIALS_FILE] if file.is_file()],
+    _resumable,
     "no evaluations to go on from",
     folders=("plots",),
 )
@@ -279,4 +285,3 @@ def _read(path: Path, new: Trials) -> Trials:
         for name in ("numbers", "residuals", "jacobian"):
             setattr(trial, name, np.asarray(getattr(trial, name), dtype=np.float64))
     return found
-
