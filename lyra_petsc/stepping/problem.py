@@ -125,10 +125,12 @@ class Problem:
         return next(term for term in self.terms.values() if isinstance(term, Membrane))
 
 
-def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases, known: Mesh | None = None) -> Problem:
+def build_problem(
+    comm: MPI.Comm, scene: Scene, phases: Phases, known: Mesh | None = None, owner: Ints | None = None
+) -> Problem:
     """Mesh, partition, terms and matrix pattern of a scene; collective.
 
-    ``known`` is the scene's mesh on rank 0, where it stands already.
+    ``known`` is the mesh and ``owner`` (V,) the rank of each vertex, on rank 0 and where these are settled.
 
     Raises
     ------
@@ -142,6 +144,7 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases, known: Mesh | No
         nonlocal whole, mesh
         mesh = known or mesh_of(scene, phases.tell)
         outline, whole = _whole(scene, mesh)
+        whole.owner = owner
         return outline
 
     with phases("mesh"):

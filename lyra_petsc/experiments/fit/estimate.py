@@ -21,7 +21,8 @@ from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.case import StoredArray
-from lyra_petsc.linear.petsc_options import is_set
+from lyra_petsc.linear.petsc_options import culprits, is_set
+from lyra_petsc.linear.reasons import last_words
 
 Array = NDArray[np.float64]
 
@@ -31,13 +32,17 @@ QUANTILE = 1.959963984540054
 SETTLED = 0.02
 """Of a standard deviation: a search ends where Gauss and Newton would go no farther."""
 
+NEAR = 0.5
+"""Of a standard deviation: what an end that TAO declares may be away."""
+
 STALLED = 1e-7
 """Relative change of all numbers below which the search ends, too."""
 
 MOST_ITERATIONS = 40
 
-NOTHING = 1e-9
-"""Largest derivative by a number without influence over that by others, in units of their sizes."""
+NOTHING, UNSEEN = 1e-9, 1e-6
+"""Largest derivative by a number without influence, in units of its size: over that by others, and in
+uncertainties."""
 
 OPEN = 1.0
 """Standard deviation of a combination over its size from which on the data do not tell it."""
@@ -147,7 +152,7 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     Raises
     ------
     InputError
-        For options that TAO refuses, or a number without influence.
+        For options that TAO refuses.
     SolverError
         If it ends in a failure.
     """
@@ -168,9 +173,17 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
                 raise
         return known[key]
 
+    comm = PETSc.COMM_SELF  # all ranks go the same way
+    tao = PETSc.TAO().create(comm)
+    try:
+        tao.setType(PETSc.Options().getString("tao_type", PETSc.TAO.Type.BRGN))
+    except PETSc.Error:
+        tao.destroy()
+        raise InputError(
+            "TAO has no such type; leave it out, or give brgn or blmvm", key="-tao_type"
+        ) from None
     first = evaluate(np.array([unknown.start for unknown in unknowns]))
     known[first.numbers.tobytes()] = first
-    refuse_idle(unknowns, first)
     m = len(first.residuals)
 
     def residual(tao: PETSc.TAO, y: PETSc.Vec, out: PETSc.Vec) -> None:
@@ -185,14 +198,12 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
         out.setArray(size * (trial.jacobian.T @ trial.residuals))
         return trial.cost
 
-    comm = PETSc.COMM_SELF  # all ranks go the same way
     start, lower, upper, values = (PETSc.Vec().createSeq(k, comm=comm) for k in (n, n, n, m))
     start.setArray(first.numbers / size)
     lower.setArray(low / size)
     upper.setArray(high / size)
     matrix = PETSc.Mat().createDense((m, n), comm=comm)
     matrix.setUp()
-    tao = PETSc.TAO().create(comm)
     before: list[Array] = []
 
     def ended(tao: PETSc.TAO) -> int | None:
@@ -209,7 +220,6 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
         return None
 
     try:
-        tao.setType(PETSc.Options().getString("tao_type", PETSc.TAO.Type.BRGN))
         least_squares = tao.getType() in LEAST_SQUARES
         if least_squares:
             tao.setResidual(residual, values)
@@ -234,13 +244,13 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     except PETSc.Error as error:
         if failure:
             raise failure[0] from None
-        raise InputError(f"TAO cannot: {error}", key="-tao_type") from None
+        raise InputError(f"PETSc cannot: {last_words(error)}", key=culprits(error)) from None
     finally:
         for thing in (tao, matrix, start, lower, upper, values):
             thing.destroy()
     best = min(known.values(), key=lambda trial: trial.cost)
     left = _step(best, low, high)
-    if left <= SETTLED or reason > 0:
+    if left <= SETTLED or (reason > 0 and left <= NEAR):
         return (
             best,
             f"the search ended; where it tends to is {left:.2g} standard deviations away",
@@ -283,7 +293,7 @@ def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> NDArray[np.bo
     return held
 
 
-def refuse_idle(unknowns: Sequence[Unknown], trial: Trial) -> None:
+def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:
     """Refuse numbers on which no measurement depends.
 
     Raises
@@ -293,9 +303,10 @@ def refuse_idle(unknowns: Sequence[Unknown], trial: Trial) -> None:
     size = np.array([unknown.size for unknown in unknowns])
     largest = np.abs(trial.jacobian * size).max(axis=0)
     for unknown, own in zip(unknowns, largest, strict=True):
-        if own <= NOTHING * largest.max():
+        if own <= max(NOTHING * largest.max(), UNSEEN):
             raise InputError(
                 "no measurement depends on it; leave it out, or measure something that does",
+                file=file,
                 key=f"fit.parameters.{unknown.key}",
             )
 

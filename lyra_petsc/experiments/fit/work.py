@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Watch, load_record, save_record
-from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, search
+from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, refuse_idle, search
 from lyra_petsc.experiments.fit.model import Model, check_keys
 from lyra_petsc.experiments.fit.readings import Reading, readings_of
 from lyra_petsc.output.run_folder import FolderKind
@@ -234,6 +234,7 @@ def fit_scene(
                 Trial(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
+            refuse_idle(unknowns, trial, scene.source)
             if folder is not None:
                 kept.trials.append(trial)
                 on_root(comm, lambda: save_record(folder / TRIALS_FILE, kept))
