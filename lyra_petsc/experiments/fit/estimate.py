@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 QUANTILE = 1.959963984540054
 """Half the width of a 95 % interval over the standard deviation."""
 
-SETTLED = 0.02
+SETTLED = 0.05
 """Of a standard deviation: a search ends where Gauss and Newton would go no farther."""
 
 NEAR = 0.5
