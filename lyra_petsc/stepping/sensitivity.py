@@ -133,7 +133,7 @@ class Sensitivities:
     Parameters
     ----------
     simulation : SteppedScene
-        Not yet stepped, of a scene without contact.
+        Not yet stepped, of a scene without contact and without friction.
     numbers : sequence of Number
     mesh : Mesh or None
         The scene's, on rank 0, where it is known.
@@ -294,7 +294,7 @@ class Sensitivities:
         pairs = zip(_edged(system), _edged(self._system), strict=True)
         found = {mine: self._system.active.frozen[theirs] for mine, theirs in pairs}
         if found:
-            system.active.frozen = system.active.frozen | found
+            system.active.refreeze(found)
             system.forget_forces()
 
     def _change_of_stage(self, beside: list[Neighbour], step: float, velocity: Array, way: Array) -> Array:

@@ -19,9 +19,11 @@ from lyra_petsc.experiments.fit.readings import HandleForce, Reading, instants
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.materials.library import resolve
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.registry import active
 
 Array = NDArray[np.float64]
 
@@ -29,7 +31,7 @@ ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
 """Blocks of a scene whose numbers can be found."""
 
 WHOLE_RUNS = 1e-3
-"""Change over the number's size of runs whose difference stands for a derivative, with contact."""
+"""Change over the number's size of runs whose difference stands for a derivative, with contact or friction."""
 
 SAME_TIME = 1e-9
 """Part of the run by which a step may miss a measurement's time."""
@@ -93,6 +95,10 @@ class Model:
         self.mesh: Mesh | None = None
         self.shape: Array | None = None
         self.runs = 0
+        # what terms keep from step to step beside the state, and stencils that change, have no tangents
+        shells = [resolve(block, file=scene.source)[0] for block in scene.material]
+        entries = active(scene, shells)
+        self._remembers = any(entry.neighbours or entry.element_vertices for entry in entries)
 
         def make() -> None:
             self.mesh = mesh_of(scene)
@@ -129,7 +135,7 @@ class Model:
         """
         array = np.array([float(number) for number in numbers])
         try:
-            if derivatives and self.scene.contact is not None:
+            if derivatives and self._remembers:
                 return self._by_differences(array, progress)
             return self._evaluate(array, derivatives, progress)
         except SolverError as error:
