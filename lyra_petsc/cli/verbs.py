@@ -216,6 +216,21 @@ def fabric(comm: Any, /, **asked: Any) -> int:
     return textile_tests(comm, **asked)
 
 
+@verb("lyra-petsc fit strip.yaml", "mpirun -n 2 lyra-petsc fit strip.yaml -tao_type blmvm --resume")
+@scene
+@settings
+@trust_mesh
+@out
+@click.option("--force", is_flag=True, help="Replace the results in DIR.")
+@click.option("--resume", is_flag=True, help="Go on without repeating evaluations.")
+@click.option("--ranks", type=int, metavar="P", help="Start one mpirun on P ranks.")
+def fit(comm: Any, /, **asked: Any) -> int:
+    """Find numbers of SCENE from measurements, as its block fit says, with 95 % intervals."""
+    from lyra_petsc.cli.fit import fit as fit_numbers
+
+    return fit_numbers(comm, **asked)
+
+
 @verb("lyra-petsc info")
 def info(comm: Any) -> None:
     """Print versions and what does not fit together."""
@@ -226,5 +241,5 @@ def info(comm: Any) -> None:
         click.echo(text)
 
 
-for command in (check, export, fabric, info, new, render, report, run, stress, study, verify, view):
+for command in (check, export, fabric, fit, info, new, render, report, run, stress, study, verify, view):
     verbs.add_command(command)

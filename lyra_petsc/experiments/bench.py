@@ -30,12 +30,14 @@ TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 
 
 @contextmanager
-def simulated(comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> Iterator[SteppedScene]:
-    """A simulation, freed with the options it set when the block ends; collective."""
+def simulated(
+    comm: MPI.Comm, scene: Scene, phases: Phases | None = None, **known: Any
+) -> Iterator[SteppedScene]:
+    """A simulation, freed with the options it set when the block ends; ``known``: of it; collective."""
     before = set(PETSc.Options().getAll())
     simulation, alone = None, False
     try:
-        simulation = SteppedScene(comm, scene, phases)
+        simulation = SteppedScene(comm, scene, phases, **known)
         yield simulation
     except BaseException as error:
         # this rank may be alone with its error, and freeing would wait for the others

@@ -34,6 +34,8 @@ class Whole:
     vertex_data : dict of name → (V, …) array
     edges : (N, 2) int64 or None
         Vertices of the mesh's edges, where elements couple unknowns on edges.
+    owner : (V,) int64 or None
+        Rank of each vertex, where that is settled already.
     """
 
     n_vertices: int
@@ -41,6 +43,7 @@ class Whole:
     elements: dict[str, Elements]
     vertex_data: dict[str, Array]
     edges: Ints | None = None
+    owner: Ints | None = None
 
 
 @dataclass
@@ -164,7 +167,10 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
     """Partition the mesh and give each rank its part; collective. ``whole`` is read on rank 0 only."""
     n_vertices = comm.bcast(whole.n_vertices if whole else 0, root=0)
     graph = vertex_graph([whole.triangles], n_vertices) if whole else None
-    owner, name = partition(comm, graph, n_vertices)
+    if comm.bcast(whole is not None and whole.owner is not None):
+        owner, name = (whole.owner if whole else None), "given"
+    else:
+        owner, name = partition(comm, graph, n_vertices)
     post = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
     if comm.rank == 0:
         assert whole is not None

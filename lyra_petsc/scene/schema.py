@@ -28,6 +28,7 @@ from typing_extensions import Self
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
 from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured, names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
@@ -59,6 +60,7 @@ from lyra_petsc.scene.values import (
     Vec3,
     Vector,
     number,
+    path_beside,
     problem,
     shown,
     vector,
@@ -126,21 +128,13 @@ def _file(*endings: str) -> dict[str, Any]:
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
 
-def _path_beside(value: Any, info: ValidationInfo) -> Path:
-    """A path, of which a relative one stands beside the scene file."""
-    directory = (info.context or {}).get("directory", Path.cwd())
-    path = Path(value)
-    # normalised by name only: a symbolic link may be what the user wants to see
-    return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
-
-
 def _beside_scene(value: Any, info: ValidationInfo) -> Any:
     if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
         raise problem(f"must be the path of a mesh file, not {shown(value)}")
     path = Path(value)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
-    return _path_beside(value, info)
+    return path_beside(value, info)
 
 
 MeshPath = Annotated[Path, BeforeValidator(_beside_scene), JsonSchema(_file("geo", "msh", "obj"))]
@@ -265,7 +259,7 @@ def _curve(value: Any, info: ValidationInfo) -> Points:
     """A curve from a file beside the scene, or as its points: so a scene as understood needs no files."""
     try:
         if isinstance(value, str):
-            path = _path_beside(value, info)
+            path = path_beside(value, info)
             return checked_points(read_curve(path), str(path))
         if isinstance(value, (list, tuple)) and all(isinstance(p, (list, tuple)) for p in value):
             pairs = [(number(x), number(y)) for x, y in value]
@@ -1354,6 +1348,8 @@ class Scene(Block):
         When a step counts as converged.
     render : Render or None
         What ``render`` shows; a run does not read it.
+    fit : Fit or None
+        Numbers to be found from measurements, by ``fit``; a run does not read it.
     petsc : dict
         PETSc options without the leading dash; an empty value is an option without one.
     """
@@ -1394,6 +1390,7 @@ class Scene(Block):
     probes: Annotated[dict[Name, Selector], BeforeValidator(_named)] = Field(default_factory=dict)
     solver: Solver = Field(default_factory=Solver)
     render: Render | None = None
+    fit: Fit | None = None
     petsc: Annotated[dict[str, PetscValue], BeforeValidator(petsc_options), JsonSchema(PETSC_BLOCK)] = Field(
         default_factory=dict
     )

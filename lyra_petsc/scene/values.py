@@ -13,9 +13,10 @@ import sys
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from lyra_petsc.scene.rules import Condition, holds
@@ -58,6 +59,14 @@ def cut(text: str, most: int = 60) -> str:
 def one_line(text: str) -> str:
     """``text`` on one line, with what cannot be printed written as an escape."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+
+
+def path_beside(value: Any, info: ValidationInfo) -> Path:
+    """A path, of which a relative one stands beside the scene file."""
+    directory = (info.context or {}).get("directory", Path.cwd())
+    path = Path(value)
+    # normalised by name only: a symbolic link may be what the user wants to see
+    return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
 
 
 def number(value: Any) -> float:

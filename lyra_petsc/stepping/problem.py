@@ -125,8 +125,12 @@ class Problem:
         return next(term for term in self.terms.values() if isinstance(term, Membrane))
 
 
-def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
+def build_problem(
+    comm: MPI.Comm, scene: Scene, phases: Phases, known: Mesh | None = None, owner: Ints | None = None
+) -> Problem:
     """Mesh, partition, terms and matrix pattern of a scene; collective.
+
+    ``known`` is the mesh and ``owner`` (V,) the rank of each vertex, on rank 0 and where these are settled.
 
     Raises
     ------
@@ -138,8 +142,9 @@ def build_problem(comm: MPI.Comm, scene: Scene, phases: Phases) -> Problem:
 
     def prepare() -> Outline:
         nonlocal whole, mesh
-        mesh = mesh_of(scene, phases.tell)
+        mesh = known or mesh_of(scene, phases.tell)
         outline, whole = _whole(scene, mesh)
+        whole.owner = owner
         return outline
 
     with phases("mesh"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -18,6 +18,7 @@ from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number
 from lyra_petsc.linear.refused_options import check_options, check_size
+from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.compression_watch import Compression
@@ -86,6 +87,10 @@ class SteppedScene:
     scene : Scene
     phases : Phases, optional
         Where wall time is charged.
+    mesh : Mesh, optional
+        The scene's on rank 0, where it stands already.
+    land : sequence of float
+        Further times [s] on which a step shall end.
 
     Attributes
     ----------
@@ -95,6 +100,8 @@ class SteppedScene:
     time : float
         [s]
     step_number : int
+    roundoff : float
+        Most that round-off may make of the norm [N] of the residual.
     totals : dict of str to int
         Newton and linear iterations, and rejected attempts, of all steps.
     stability : dict
@@ -112,8 +119,16 @@ class SteppedScene:
         On all ranks, if the scene cannot be simulated.
     """
 
-    def __init__(self, comm: MPI.Comm, scene: Scene, phases: Phases | None = None) -> None:
-        self.comm, self.scene = comm, scene
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        scene: Scene,
+        phases: Phases | None = None,
+        *,
+        mesh: Mesh | None = None,
+        land: Sequence[float] = (),
+    ) -> None:
+        self.comm, self.scene, self._mesh, self._land = comm, scene, mesh, list(land)
         self.phases = phases or Phases()
         COMPILATION.begins, COMPILATION.ends = self.phases.begin_compilation, self.phases.end_compilation
         self._filled = fill_gaps(scene.petsc)
@@ -126,7 +141,7 @@ class SteppedScene:
             raise
 
     def _set_up(self, scene: Scene) -> None:
-        self.problem: Problem = build_problem(self.comm, scene, self.phases)
+        self.problem: Problem = build_problem(self.comm, scene, self.phases, self._mesh)
         self.notes, self.earlier_notes = list(self.problem.outline.notes), 0
         outline, system = self.problem.outline, self.problem.system
         check_size(self.problem.points.n_unknowns)
@@ -139,7 +154,7 @@ class SteppedScene:
                     key="material",
                 )
             self.stepper = Stepper(scene, system, self.problem.surface, outline.spacing, floor)
-        self._floor = floor
+        self.roundoff = floor
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
@@ -180,12 +195,13 @@ class SteppedScene:
         largest = _positive("-ts_adapt_dt_max", min(largest, petsc_number("ts_adapt_dt_max", largest)))
         smallest = (SMALLEST_ADAPTED if time.adaptive else SMALLEST_FRACTION) * largest
         smallest = _positive("-ts_adapt_dt_min", petsc_number("ts_adapt_dt_min", smallest))
+        stops = [*events(self.scene), *self._land]
         if time.analysis == "static":
             most = petsc_number("ts_adapt_dt_max", end)
-            return LoadControl(largest, end, events(self.scene), smallest, most)
+            return LoadControl(largest, end, stops, smallest, most)
         if time.adaptive:
-            return ToleranceControl(step, largest, end, every, events(self.scene), smallest)
-        return StepControl(largest, end, every, events(self.scene), smallest)
+            return ToleranceControl(step, largest, end, every, stops, smallest)
+        return StepControl(largest, end, every, stops, smallest)
 
     def _check_length(self, control: StepControl) -> None:
         """Refuse what would never end."""
@@ -421,7 +437,7 @@ class SteppedScene:
             dt=end - self.time,
             nominal=self.control.step,
             spacing=outline.spacing,
-            floor=self._floor,
+            floor=self.roundoff,
             max_iterations=stepper.snes.getTolerances()[3],
             iterations_key=self._iterations_key,
             linear_iterations=stepper.ksp.getTolerances()[3],

@@ -331,6 +331,12 @@ class StageEquations:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
 
+    def reopen(self, x_before: Array) -> None:
+        """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
+        if self._xh is self.x:
+            self._xh = fitted(x_before, self.points.n_owned, self.points.n_local)
+            self.points.update_ghosts(self._xh)
+
     def begin_at_rest(self) -> float:
         """Let handles hold what they do at the start; norm [N] of the moments on free edges; collective."""
         self.prescribed.begin_step(self.t0, self.t0, self.x)
@@ -350,9 +356,7 @@ class StageEquations:
         if not self.points.comm.allreduce(len(found), MPI.MAX):
             return False
         self.active.refreeze(found)
-        if isinstance(self._internal, Remembered):
-            self._internal.forget()
-        self.objective.forget()
+        self.forget_forces()
         return True
 
     def follow_triangles(self, v: Array, way: Array) -> bool:
@@ -609,6 +613,12 @@ class StageEquations:
     def leap(self) -> None:
         """Newton's method starts far from the state, whose stress the first Jacobian takes."""
         self._iterate, self._leaps = self.x.copy(), True
+
+    def forget_forces(self) -> None:
+        """Energies and forces remembered are no longer those at hand."""
+        if isinstance(self._internal, Remembered):
+            self._internal.forget()
+        self.objective.forget()
 
     def forget_rows(self) -> None:
         """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""

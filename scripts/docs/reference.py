@@ -38,6 +38,8 @@ OPTIONS = {
     "ts_bdf_order": "With `-ts_type bdf`: 2.",
     "ts_adapt_type": "`none`: fixed steps; `basic`: steps by `time.tolerance` (1e-3).",
     "ts_theta_endpoint": "Refused: it has no meaning for the stage equations.",
+    "tao_type": "Of the search of `fit`: `brgn`, or `blmvm` and other methods by gradients.",
+    "tao_brgn_regularizer_weight": "With `brgn`: 0 unless the data leave a combination of numbers open.",
     "vec_type": "Type of every vector.",
     "ts_init_time": "Refused: a run begins at 0.",
     "snes_type": "`newtonls`, or `ksponly`: one linear solve a step.",

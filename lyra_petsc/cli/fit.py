@@ -1,0 +1,119 @@
+"""``fit``: numbers of a scene from measurements."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+from mpi4py import MPI
+
+from lyra_petsc.api.mpirun import environment, find_launcher
+from lyra_petsc.cli.experiments import command, petsc_words, watched, words_of
+from lyra_petsc.cli.progress import LINE_AT_LEAST_SECONDS, ProgressBar, duration
+from lyra_petsc.cli.run import petsc_speaks, tell_unused
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.case import Case
+from lyra_petsc.experiments.fit.estimate import Trial
+from lyra_petsc.experiments.fit.fit_report import Fit, FitOutcome, outcome_of
+from lyra_petsc.experiments.fit.work import FIT, Observer, fit_scene, unknowns_of
+from lyra_petsc.experiments.results import Results
+from lyra_petsc.output.run_folder import RunDirectory, choose
+from lyra_petsc.parallel import on_root
+from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.schema import Scene
+
+
+class FitProgress(ProgressBar, Observer):
+    """The progress of a fit: the evaluation at work, and the sum of squares of those that have ended."""
+
+    def __init__(self, comm: MPI.Comm, *, plain: bool) -> None:
+        super().__init__(comm, plain=plain)
+        self._last, self._cost = self._clock(), ""
+
+    def progress(self, number: int, part: float) -> None:
+        if not self._shown:
+            return
+        state = f"evaluation {number}{self._cost}"
+        self._draw(min(part, 0.999), state)
+        if self._bar is None and self._clock() - self._last >= LINE_AT_LEAST_SECONDS:
+            self._last = self._clock()
+            self.say(f"{part:4.0%}  {state}")
+
+    def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+        self._cost = f"  sum of squares {2.0 * trial.cost:.5g}"
+        again = " (from before)" if resumed else ""
+        self.say(f"evaluation {number}{self._cost}{again}")
+        self._last = self._clock()
+
+
+def fit(
+    comm: MPI.Comm,
+    scene: Path | None,
+    settings: tuple[str, ...],
+    *,
+    trust_mesh: bool,
+    out: Path | None,
+    force: bool,
+    resume: bool,
+    ranks: int | None,
+) -> int:
+    """Fit a scene; the exit code; collective.
+
+    Raises
+    ------
+    InputError
+        Bad input; nothing is written.
+    SolverError
+        A simulation that failed; evaluations before it are kept.
+    Interrupted
+        A signal; ``--resume`` goes on.
+    """
+    if scene is None:
+        raise InputError("needs a scene with a block fit, as in: fit strip.yaml", key="SCENE")
+    words = [str(scene), *words_of({"--set": settings, "--trust-mesh": trust_mesh})]
+    if ranks is not None:
+        words += words_of({"--out": out, "--force": force, "--resume": resume})
+        return _launched(comm, ranks, words)
+
+    def read() -> Scene:
+        loaded = load_scene(scene, settings)
+        unknowns_of(loaded)
+        return loaded.trusting_meshes() if trust_mesh else loaded
+
+    loaded = on_root(comm, read)
+    choice = choose(comm, scene.stem, out, force=force, resume=resume, kind=FIT)
+    watch = watched(comm, lambda: f"; evaluations are kept in {choice.path}, fit --resume goes on")
+    view = Fit(f"Fit of {loaded.title or scene.stem}")
+    with RunDirectory(comm, choice) as directory:
+        folder = directory.path
+        directory.clean()
+
+        def work(case: Case) -> FitOutcome:
+            with FitProgress(comm, plain=petsc_speaks()) as progress:
+                if directory.note:
+                    progress.say(f"note: {directory.note}")
+                return outcome_of(fit_scene(comm, loaded, folder=folder, watch=watch, observer=progress))
+
+        results: Results[FitOutcome] = Results(
+            comm, folder, view, ranks=comm.size, command=command(comm, "fit", words), force=True
+        )
+        note = results.run([Case("fit", "numbers from measurements")], work)
+    if comm.rank == 0:
+        outcome = results.outcomes[0]
+        for line in view.terminal(outcome):
+            click.echo(line)
+        assert outcome.fitted is not None
+        told = f"{len(outcome.fitted.trials)} evaluations in {duration(outcome.fitted.seconds)}"
+        click.echo(f"{told}; results: {folder}")
+        if note:
+            click.echo(f"note: {note}")
+        tell_unused([])
+    return 0
+
+
+def _launched(comm: MPI.Comm, ranks: int, words: list[str]) -> int:
+    """The same verb on so many ranks, whose words go where this one's would."""
+    program = [*on_root(comm, lambda: find_launcher(ranks)), sys.executable, "-m", "lyra_petsc", "fit"]
+    return subprocess.call([*program, *words, *petsc_words()], env=environment())

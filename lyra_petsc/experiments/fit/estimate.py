@@ -1,0 +1,381 @@
+"""Least squares over the numbers of a scene: the search by PETSc's TAO, and what the data say of its end.
+
+With values y(p), measurements m and their standard deviations s the residual is r = (y − m) / s, and the sum
+½ rᵀr is made least within bounds. At its end C = (JᵀJ)⁻¹ of the Jacobian J = ∂r/∂p is the covariance of the
+numbers, 1.96 √C_ii half the width of their 95 % intervals; singular values of J, with numbers in units of
+their size, tell which combinations the data leave open.
+
+Source: Seber & Wild, Nonlinear Regression, Wiley 1989, ch. 2 and 5.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from lyra_petsc.errors import InputError, SolverError
+from lyra_petsc.experiments.case import StoredArray
+from lyra_petsc.linear.petsc_options import culprits, is_set
+from lyra_petsc.linear.reasons import last_words
+
+Array = NDArray[np.float64]
+
+QUANTILE = 1.959963984540054
+"""Half the width of a 95 % interval over the standard deviation."""
+
+SETTLED = 0.05
+"""Of a standard deviation: a search ends where Gauss and Newton would go no farther."""
+
+NEAR = 0.5
+"""Of a standard deviation: what an end that TAO declares may be away."""
+
+STALLED = 1e-7
+"""Relative change of all numbers below which the search ends, too."""
+
+MOST_ITERATIONS = 40
+
+NOTHING, UNSEEN = 1e-9, 1e-6
+"""Largest derivative by a number without influence, in units of its size: over that by others, and in
+uncertainties."""
+
+OPEN = 1.0
+"""Standard deviation of a combination over its size from which on the data do not tell it."""
+
+ALIKE = 0.98
+"""Correlation from which on two numbers are not told apart."""
+
+LEAST_SQUARES = ("brgn", "pounders")
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A number to be found: where the search begins, and its bounds."""
+
+    key: str
+    start: float
+    low: float
+    high: float
+
+    @property
+    def size(self) -> float:
+        """Of its usual changes."""
+        return max(abs(self.start), 1e-3 * (self.high - self.low))
+
+
+@dataclass
+class Trial:
+    """Residuals (m,) and their derivatives (m, n) at some numbers (n,)."""
+
+    numbers: StoredArray
+    residuals: StoredArray
+    jacobian: StoredArray
+
+    @property
+    def cost(self) -> float:
+        """½ rᵀr."""
+        return 0.5 * float(self.residuals @ self.residuals)
+
+
+@dataclass
+class Estimate:
+    """A number found.
+
+    Attributes
+    ----------
+    key : str
+    start, low, high : float
+        Where the search began, and its bounds.
+    value : float
+    deviation : float
+        Standard deviation; infinite where the data do not tell.
+    at_bound : bool
+    """
+
+    key: str
+    start: float
+    low: float
+    high: float
+    value: float
+    deviation: float
+    at_bound: bool = False
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval."""
+        return self.value - QUANTILE * self.deviation, self.value + QUANTILE * self.deviation
+
+
+@dataclass
+class Conclusion:
+    """What the data say at the end of a search.
+
+    Attributes
+    ----------
+    estimates : list of Estimate
+    correlation : (n, n)
+    singular_values : (n,)
+        Of the Jacobian, with numbers in units of their size.
+    directions : (n, n)
+        Their right singular vectors, in rows.
+    misfit : float
+        rᵀr over the degrees of freedom; 1 is expected.
+    words : list of str
+        What one should know.
+    """
+
+    estimates: list[Estimate]
+    correlation: Array
+    singular_values: Array
+    directions: Array
+    misfit: float
+    words: list[str] = field(default_factory=list)
+
+
+Evaluate = Callable[[Array], Trial]
+
+
+def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]:
+    """The trial with the least cost, and why the search ended, in words; the same on every rank.
+
+    Parameters
+    ----------
+    unknowns : sequence of Unknown
+    evaluate : callable
+        Of numbers (n,), the same on all ranks and with the same result; collective.
+
+    Raises
+    ------
+    InputError
+        For options that TAO refuses.
+    SolverError
+        If it ends in a failure.
+    """
+    n = len(unknowns)
+    size = np.array([unknown.size for unknown in unknowns])
+    low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
+    known: dict[bytes, Trial] = {}
+    failure: list[BaseException] = []
+
+    def at(y: PETSc.Vec) -> Trial:
+        numbers = np.clip(np.array(y.getArray(readonly=True)) * size, low, high)
+        key = numbers.tobytes()
+        if key not in known:
+            try:
+                known[key] = evaluate(numbers)
+            except BaseException as error:
+                failure.append(error)
+                raise
+        return known[key]
+
+    comm = PETSc.COMM_SELF  # all ranks go the same way
+    tao = PETSc.TAO().create(comm)
+    try:
+        tao.setType(PETSc.Options().getString("tao_type", PETSc.TAO.Type.BRGN))
+    except PETSc.Error:
+        tao.destroy()
+        raise InputError(
+            "TAO has no such type; leave it out, or give brgn or blmvm", key="-tao_type"
+        ) from None
+    first = evaluate(np.array([unknown.start for unknown in unknowns]))
+    known[first.numbers.tobytes()] = first
+    m = len(first.residuals)
+
+    def residual(tao: PETSc.TAO, y: PETSc.Vec, out: PETSc.Vec) -> None:
+        out.setArray(at(y).residuals)
+
+    def jacobian(tao: PETSc.TAO, y: PETSc.Vec, matrix: PETSc.Mat, other: PETSc.Mat) -> None:
+        matrix.setValues(range(m), range(n), at(y).jacobian * size)
+        matrix.assemble()
+
+    def cost(tao: PETSc.TAO, y: PETSc.Vec, out: PETSc.Vec) -> float:
+        trial = at(y)
+        out.setArray(size * (trial.jacobian.T @ trial.residuals))
+        return trial.cost
+
+    start, lower, upper, values = (PETSc.Vec().createSeq(k, comm=comm) for k in (n, n, n, m))
+    start.setArray(first.numbers / size)
+    lower.setArray(low / size)
+    upper.setArray(high / size)
+    matrix = PETSc.Mat().createDense((m, n), comm=comm)
+    matrix.setUp()
+    before: list[Array] = []
+
+    def ended(tao: PETSc.TAO) -> int | None:
+        y = tao.getSolution()
+        trial = at(y)
+        left = _step(trial, low, high)
+        stalled = bool(before) and np.all(np.abs(trial.numbers - before[-1]) <= STALLED * size)
+        if not before or not np.array_equal(before[-1], trial.numbers):
+            before.append(trial.numbers)
+        if left <= SETTLED or (stalled and len(before) > 1):
+            return int(PETSc.TAO.Reason.CONVERGED_USER)
+        if tao.getIterationNumber() >= tao.getMaximumIterations():
+            return int(PETSc.TAO.Reason.DIVERGED_MAXITS)
+        return None
+
+    try:
+        least_squares = tao.getType() in LEAST_SQUARES
+        if least_squares:
+            tao.setResidual(residual, values)
+            tao.setJacobianResidual(jacobian, matrix)
+        else:
+            tao.setObjectiveGradient(cost, None)
+        tao.setVariableBounds((lower, upper))
+        tao.setMaximumIterations(MOST_ITERATIONS)
+        tao.setFromOptions()
+        tao.setSolution(start)
+        if tao.getType() == PETSc.TAO.Type.BRGN:
+            if not is_set("tao_brgn_regularizer_weight"):
+                tao.setBRGNRegularizerWeight(0.0 if _full(first, size) else 1e-6 * first.cost)
+            tao.setUp()
+            inner = tao.getBRGNSubsolver()
+            inner.setMaximumIterations(tao.getMaximumIterations())
+            inner.setConvergenceTest(ended)
+        else:
+            tao.setConvergenceTest(ended)
+        tao.solve()
+        reason = int(tao.getConvergedReason())
+    except PETSc.Error as error:
+        if failure:
+            raise failure[0] from None
+        raise InputError(f"PETSc cannot: {last_words(error)}", key=culprits(error)) from None
+    finally:
+        for thing in (tao, matrix, start, lower, upper, values):
+            thing.destroy()
+    best = min(known.values(), key=lambda trial: trial.cost)
+    left = _step(best, low, high)
+    if left <= SETTLED or (reason > 0 and left <= NEAR):
+        return (
+            best,
+            f"the search ended; where it tends to is {left:.2g} standard deviations away",
+        )
+    if best is first and best.cost > 0.0:
+        raise SolverError(
+            f"TAO found nothing better than the start (reason {reason}); give other starts or bounds",
+            collective=True,
+        )
+    return best, (
+        f"the search was stopped after {len(known)} evaluations (TAO: {reason}), {left:.2g} standard "
+        "deviations from where it tends to; go on from these numbers, or give -tao_max_it"
+    )
+
+
+def _full(trial: Trial, size: Array) -> bool:
+    """Whether the data tell all combinations of the numbers."""
+    values = np.linalg.svd(trial.jacobian * size, compute_uv=False)
+    return len(values) == len(size) and bool(values[-1] > 1e-6 * values[0])
+
+
+def _step(trial: Trial, low: Array, high: Array) -> float:
+    """How far Gauss and Newton would go from a trial, in standard deviations of the numbers."""
+    gradient = trial.jacobian.T @ trial.residuals
+    free = ~_held(trial.numbers, gradient, low, high)
+    if not free.any():
+        return 0.0
+    jacobian = trial.jacobian[:, free]
+    step = np.linalg.lstsq(jacobian, trial.residuals, rcond=1e-10)[0]
+    # in the metric of the data, which is finite also for what they do not tell
+    return float(np.linalg.norm(jacobian @ step)) / math.sqrt(free.sum())
+
+
+def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Which numbers lie at a bound that the cost drives them against."""
+    slack = 1e-9 * (high - low)
+    held: NDArray[np.bool_] = ((numbers <= low + slack) & (gradient > 0.0)) | (
+        (numbers >= high - slack) & (gradient < 0.0)
+    )
+    return held
+
+
+def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:
+    """Refuse numbers on which no measurement depends.
+
+    Raises
+    ------
+    InputError
+    """
+    size = np.array([unknown.size for unknown in unknowns])
+    largest = np.abs(trial.jacobian * size).max(axis=0)
+    for unknown, own in zip(unknowns, largest, strict=True):
+        if own <= max(NOTHING * largest.max(), UNSEEN):
+            raise InputError(
+                "no measurement depends on it; leave it out, or measure something that does",
+                file=file,
+                key=f"fit.parameters.{unknown.key}",
+            )
+
+
+def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
+    """What the data say at the numbers of a trial."""
+    n, m = len(unknowns), len(trial.residuals)
+    size = np.array([unknown.size for unknown in unknowns])
+    low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
+    held = _held(trial.numbers, trial.jacobian.T @ trial.residuals, low, high)
+    scaled = trial.jacobian * size
+    _, values, directions = np.linalg.svd(scaled, full_matrices=True)
+    values = np.concatenate([values, np.zeros(n - len(values))])
+    covariance = np.full((n, n), np.nan)
+    free = np.flatnonzero(~held)
+    if len(free):
+        _, own, across = np.linalg.svd(scaled[:, free], full_matrices=True)
+        own = np.concatenate([own, np.zeros(len(free) - len(own))])
+        with np.errstate(divide="ignore"):
+            inverse = np.where(own > 1e-12 * own[0], 1.0 / own, 1e12 / max(own[0], 1e-300))
+        half = across.T * inverse
+        covariance[np.ix_(free, free)] = half @ half.T
+    deviation = np.sqrt(np.diag(covariance)) * size
+    with np.errstate(invalid="ignore"):
+        correlation = covariance * np.outer(size, size) / np.outer(deviation, deviation)
+    estimates = [
+        Estimate(u.key, u.start, u.low, u.high, float(value), float(own), bool(bound))
+        for u, value, own, bound in zip(unknowns, trial.numbers, deviation, held, strict=True)
+    ]
+    freedom = m - len(free)
+    misfit = float(trial.residuals @ trial.residuals) / freedom if freedom > 0 else math.nan
+    words = _words(estimates, values, directions, correlation)
+    spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
+    if freedom > 0 and misfit > 1.0 + 3.0 * spread:
+        words.append(
+            f"the scene misses the measurements by {math.sqrt(misfit):.2g} times their uncertainties: these "
+            "are too small, or something that acts is not in the scene; the intervals are then too narrow"
+        )
+    if freedom > 0 and misfit < 1.0 - 3.0 * spread:
+        words.append(
+            f"the scene meets the measurements {1.0 / math.sqrt(misfit):.2g} times better than their "
+            "uncertainties say; if these are too large, so are the intervals"
+            if misfit > 0.0
+            else "the scene meets the measurements exactly"
+        )
+    return Conclusion(estimates, correlation, values, directions, misfit, words)
+
+
+def _words(estimates: Sequence[Estimate], values: Array, directions: Array, correlation: Array) -> list[str]:
+    keys, words = [estimate.key for estimate in estimates], []
+    for estimate in estimates:
+        if estimate.at_bound:
+            words.append(f"{estimate.key} is at its bound {estimate.value:.6g}: the data ask for more")
+    for value, direction in zip(values, directions, strict=True):
+        if value > 0.0 and 1.0 / value < OPEN:
+            continue
+        share = [key for key, part in zip(keys, direction, strict=True) if abs(part) > 0.3]
+        how = f"±{100.0 / value:.0f} %" if value > 1e-6 else "not at all"
+        if len(share) == 1:
+            words.append(f"the data cannot tell {share[0]} ({how} of its size)")
+        else:
+            words.append(
+                f"the data cannot tell {' and '.join(share)} apart: one combination of them is known {how}"
+            )
+    for i, one in enumerate(keys):
+        for j in range(i):
+            if abs(correlation[i, j]) > ALIKE:
+                words.append(
+                    f"{keys[j]} and {one} go together (correlation {correlation[i, j]:.3f}): "
+                    "another measurement would tell them apart"
+                )
+    return words

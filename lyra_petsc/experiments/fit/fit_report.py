@@ -1,0 +1,203 @@
+"""What a fit tells: fit.csv with the numbers, fit.json for programs, and a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.experiments.case import Case, Outcome, Verdict
+from lyra_petsc.experiments.fit.estimate import Estimate
+from lyra_petsc.experiments.fit.work import Fitted
+from lyra_petsc.experiments.results import View, aligned
+from lyra_petsc.show.report.document import PLOTS, Drawing, Report, short
+from lyra_petsc.show.report.plots import colour, drawn, empty_figure, surface
+
+MOST_ROWS = 60
+"""Measurements in the page's table; fit.json has all."""
+
+
+@dataclass
+class FitOutcome(Outcome[Case]):
+    """A fit that has ended."""
+
+    fitted: Fitted | None = None
+
+
+def outcome_of(fitted: Fitted) -> FitOutcome:
+    """The outcome of the one case of a fit."""
+    passed = fitted.words.startswith("the search ended")
+    case = Case("fit", "numbers from measurements")
+    return FitOutcome(case, {"search": Verdict(passed, fitted.words)}, fitted.seconds, fitted=fitted)
+
+
+def _deviation(estimate: Estimate) -> str:
+    if estimate.at_bound:
+        return "at its bound"
+    low, high = estimate.interval
+    return f"{low:.5g} to {high:.5g}"
+
+
+class Fit(View[FitOutcome]):
+    """Of one fit."""
+
+    verb = "fit"
+    pictures = "pictures"
+    columns = ("parameter", "start", "lowest", "highest", "value", "deviation", "from", "to", "at_bound")
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+
+    def rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
+        assert outcome.fitted is not None
+        for each in outcome.fitted.conclusion.estimates:
+            low, high = each.interval
+            numbers = each.key, each.start, each.low, each.high, each.value, each.deviation, low, high
+            yield dict(zip(self.columns, [*numbers, int(each.at_bound)], strict=True))
+
+    def summary(self, outcomes: Sequence[FitOutcome]) -> list[Sequence[str]]:
+        fitted = outcomes[0].fitted
+        assert fitted is not None
+        rows: list[Sequence[str]] = [("parameter", "start", "found", "95 % interval")]
+        for each in fitted.conclusion.estimates:
+            rows.append((each.key, f"{each.start:.5g}", f"{each.value:.5g}", _deviation(each)))
+        return rows
+
+    def told(self, outcome: FitOutcome) -> dict[str, Any]:
+        fitted = outcome.fitted
+        assert fitted is not None
+        conclusion = fitted.conclusion
+
+        def finite(value: Any) -> Any:
+            return None if isinstance(value, float) and not math.isfinite(value) else value
+
+        def numbers(values: Any) -> Any:
+            return [finite(value) for value in np.ravel(values).tolist()]
+
+        times = [reading.time for reading in fitted.readings for _ in reading.parts]
+        keys = [unknown.key for unknown in fitted.unknowns]
+        return {
+            "parameters": [
+                {
+                    name: None if isinstance(value, float) and not math.isfinite(value) else value
+                    for name, value in asdict(estimate).items()
+                }
+                for estimate in conclusion.estimates
+            ],
+            "misfit": None if math.isnan(conclusion.misfit) else conclusion.misfit,
+            "correlation": [numbers(row) for row in conclusion.correlation],
+            "singular_values": numbers(conclusion.singular_values),
+            "directions": [numbers(row) for row in conclusion.directions],
+            "words": conclusion.words,
+            "search": fitted.words,
+            "evaluations": len(fitted.trials),
+            "simulations": fitted.runs,
+            "seconds": fitted.seconds,
+            "measurements": [
+                {
+                    "name": label,
+                    "time": time,
+                    "measured": float(measured),
+                    "uncertainty": float(sigma),
+                    "before": float(before),
+                    "after": float(after),
+                    "sensitivity": dict(zip(keys, map(float, row), strict=True)),
+                }
+                for label, time, measured, sigma, before, after, row in zip(
+                    fitted.labels, times, fitted.measured, fitted.uncertainty, fitted.before, fitted.after,
+                    fitted.sensitivity, strict=True,
+                )
+            ],
+        }  # fmt: skip
+
+    def page(self, report: Report, outcomes: Sequence[FitOutcome], summary: str, *, drawn: bool) -> None:
+        fitted = outcomes[0].fitted
+        assert fitted is not None
+        conclusion = fitted.conclusion
+        report.heading("Numbers")
+        report.table(
+            ["parameter", "start", "found", "deviation", "95 % interval"],
+            [
+                [e.key, e.start, f"{e.value:.6g}", None if e.at_bound else e.deviation, _deviation(e)]
+                for e in conclusion.estimates
+            ],
+            caption="Intervals hold for the uncertainties given, where values depend linearly on parameters.",
+        )
+        report.bullets([*conclusion.words, fitted.words])
+        if not math.isnan(conclusion.misfit):
+            report.paragraph(
+                f"Sum of squares over degrees of freedom: {short(conclusion.misfit)} (1 is expected)."
+            )
+        report.heading("Before and after")
+        if drawn:
+            report.figure(_residuals(fitted))
+            report.figure(_costs(fitted))
+            if fitted.triangles is not None:
+                for shape, name in zip(fitted.shapes, ("before", "after"), strict=True):
+                    if shape is not None:
+                        caption = f"The sheet at the last measurement, {name} the fit."
+                        report.figure(
+                            surface(shape, fitted.triangles, name=f"{PLOTS}/shape-{name}", caption=caption)
+                        )
+        report.heading("Measurements")
+        keys = [unknown.key for unknown in fitted.unknowns]
+        times = [reading.time for reading in fitted.readings for _ in reading.parts]
+        shown = list(range(len(fitted.labels)))[:MOST_ROWS]
+        report.table(
+            ["measurement", "time", "measured", "uncertainty", "before", "after", *keys],
+            [
+                [fitted.labels[i], times[i], f"{fitted.measured[i]:.6g}", float(fitted.uncertainty[i])]
+                + [f"{fitted.before[i]:.6g}", f"{fitted.after[i]:.6g}"]
+                + [short(float(part)) for part in fitted.sensitivity[i]]
+                for i in shown
+            ],
+            caption="Last columns: by how many uncertainties the value changes with the whole parameter."
+            + (f" {MOST_ROWS} of {len(fitted.labels)}; fit.json has all." * (len(shown) < len(times))),
+        )
+        report.heading("What the data tell")
+        report.table(
+            ["standard deviation", *keys],
+            [
+                [f"{100.0 / value:.3g} %" if value > 0.0 else "unknown", *map(float, direction)]
+                for value, direction in zip(conclusion.singular_values, conclusion.directions, strict=True)
+            ],
+            caption="Combinations of parameters, in units of their sizes, from the best known to the least.",
+        )
+        report.paragraph(
+            f"{len(fitted.trials)} evaluations, {fitted.runs} simulations, {fitted.seconds:.1f} s."
+        )
+
+    def terminal(self, outcome: FitOutcome) -> list[str]:
+        """What the terminal shows at the end."""
+        fitted = outcome.fitted
+        assert fitted is not None
+        table = self.summary([outcome])
+        return [*aligned(table, len(table[0])), *fitted.conclusion.words, fitted.words]
+
+
+def _residuals(fitted: Fitted) -> Drawing:
+    figure = empty_figure(3.2)
+    axes = figure.add_subplot(xlabel="measurement", ylabel="misses by [uncertainties]")
+    number = np.arange(1, len(fitted.labels) + 1)
+    for i, (values, name) in enumerate([(fitted.before, "before"), (fitted.after, "after")]):
+        missed = (values - fitted.measured) / fitted.uncertainty
+        axes.plot(number, missed, ".", ms=5, color=colour(1 - i), label=name)
+    axes.axhspan(-1.96, 1.96, color="#9aa3ad", alpha=0.25, lw=0, label="95 %")
+    axes.set_yscale("symlog", linthresh=3.0)
+    axes.grid(True, color="#dfe3e8", lw=0.8)
+    axes.legend(fontsize=8)
+    return drawn(
+        figure, f"{PLOTS}/residuals", "How far the scene is from each measurement, before and after the fit."
+    )
+
+
+def _costs(fitted: Fitted) -> Drawing:
+    figure = empty_figure(2.8)
+    axes = figure.add_subplot(xlabel="evaluation", ylabel="sum of squares", yscale="log")
+    costs = [max(2.0 * trial.cost, 1e-300) for trial in fitted.trials]
+    axes.plot(range(1, len(costs) + 1), costs, color=colour(0), marker="o", ms=4)
+    axes.grid(True, color="#dfe3e8", lw=0.8)
+    return drawn(figure, f"{PLOTS}/search", "Sum of squares over the evaluations.")

@@ -1,0 +1,422 @@
+"""What was measured, as values of a simulation's state at given times.
+
+Each reading sums something over the ranks and makes its values of the sums.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.text import read_text
+from lyra_petsc.stepping.energy_balance import Ledger
+from lyra_petsc.stepping.problem import Problem
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+AXES = ("x", "y", "z")
+LARGEST_TABLE = 2**26
+
+
+@dataclass
+class Reading(ABC):
+    """One quantity at one time.
+
+    Attributes
+    ----------
+    key : str
+        Of the measurement in the scene.
+    name : str
+        Of what is measured.
+    time : float
+        [s], or load factor.
+    parts : tuple of str
+        Names of its values.
+    unit : str
+    measured, uncertainty : (m,)
+        NaN where nothing was measured.
+    """
+
+    key: str
+    name: str
+    time: float
+    parts: tuple[str, ...]
+    unit: str
+    measured: Array = field(default_factory=lambda: np.empty(0))
+    uncertainty: Array = field(default_factory=lambda: np.empty(0))
+
+    @abstractmethod
+    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+        """This rank's part of what is to be summed over the ranks."""
+
+    @abstractmethod
+    def values(self, total: Array) -> Array:
+        """Its values (m,) of the sums."""
+
+    @property
+    def vertices(self) -> list[int]:
+        """Numbers of the vertices that it names."""
+        return []
+
+    @property
+    def labels(self) -> list[str]:
+        """Of its values, for tables."""
+        return [f"{self.name} {part}".strip() for part in self.parts]
+
+
+@dataclass
+class Places(Reading):
+    """Mean positions of probes (names), or positions of vertices (numbers): of each some axes."""
+
+    wanted: list[tuple[str | int, tuple[int, ...]]] = field(default_factory=list)
+
+    @cached_property
+    def _by_problem(self) -> dict[int, list[Ints]]:
+        return {}
+
+    def _rows(self, problem: Problem) -> list[Ints]:
+        found = self._by_problem.get(id(problem))
+        if found is None:
+            original = problem.points.original
+            order = np.argsort(original)
+            found = []
+            for what, _ in self.wanted:
+                if isinstance(what, str):
+                    found.append(problem.probes[what])
+                    continue
+                at = np.searchsorted(original, what, sorter=order)
+                here = at < len(original) and original[order[at]] == what
+                found.append(order[at : at + 1] if here else np.empty(0, dtype=np.int64))
+            self._by_problem[id(problem)] = found
+        return found
+
+    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+        x, rows = problem.system.x, self._rows(problem)
+        parts = [np.append(x[mine].sum(axis=0), float(len(mine))) for mine in rows]
+        return np.concatenate(parts)
+
+    def means(self, total: Array) -> Array:
+        """Mean positions (n, 3) [m]."""
+        sums = total.reshape(-1, 4)
+        means: Array = sums[:, :3] / sums[:, 3:]
+        return means
+
+    def values(self, total: Array) -> Array:
+        means = self.means(total)
+        return np.concatenate([mean[list(axes)] for mean, (_, axes) in zip(means, self.wanted, strict=True)])
+
+    @property
+    def vertices(self) -> list[int]:
+        return [what for what, _ in self.wanted if isinstance(what, int)]
+
+
+@dataclass
+class HangingAngle(Places):
+    """Angle [°] below the horizontal of the way from one probe to another."""
+
+    def values(self, total: Array) -> Array:
+        edge, tip = self.means(total)
+        way = tip - edge
+        return np.array([math.degrees(math.atan2(-way[2], math.hypot(way[0], way[1])))])
+
+
+@dataclass
+class Shadow(Reading):
+    """Drape coefficient: area of the sheet's projection along z beyond the support, over that of the ring."""
+
+    block: DrapeCoefficient | None = None
+
+    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+        membrane = problem.membrane
+        a, b, c = (problem.system.x[membrane.stencil[: membrane.n_owned, k]] for k in range(3))
+        first, second = b - a, c - a
+        return np.array([0.5 * float(np.sum(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]))])
+
+    def values(self, total: Array) -> Array:
+        assert self.block is not None
+        support, whole = (math.pi * r * r for r in (self.block.support, self.block.radius))
+        return np.array([(abs(total[0]) - support) / (whole - support)])
+
+
+@dataclass
+class HandleForce(Reading):
+    """Force [N] of a handle on the sheet."""
+
+    handle: int = 0
+    axes: tuple[int, ...] = (0, 1, 2)
+
+    def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
+        assert ledger is not None
+        count = len(problem.scene.handles)
+        force = ledger.handle_forces(count)[self.handle]
+        # the sum over the ranks already
+        return force / problem.points.comm.size
+
+    def values(self, total: Array) -> Array:
+        return np.asarray(total)[list(self.axes)]
+
+
+@dataclass(frozen=True)
+class Instant:
+    """All readings at one time."""
+
+    time: float
+    readings: tuple[Reading, ...]
+
+    def values(self, problem: Problem, ledger: Ledger | None) -> Array:
+        """Their values; collective."""
+        sums = [reading.sums(problem, ledger) for reading in self.readings]
+        total = np.concatenate(sums)
+        problem.points.comm.Allreduce(MPI.IN_PLACE, total, MPI.SUM)
+        ends = np.cumsum([len(part) for part in sums])[:-1]
+        parts = np.split(total, ends)
+        found = [reading.values(part) for reading, part in zip(self.readings, parts, strict=True)]
+        return np.concatenate(found)
+
+
+def instants(readings: Sequence[Reading]) -> list[Instant]:
+    """The readings by time, ascending, in their order at each."""
+    times = sorted({reading.time for reading in readings})
+    return [Instant(time, tuple(r for r in readings if r.time == time)) for time in times]
+
+
+# -- from a scene ------------------------------------------------------------------------------------
+
+
+def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Reading]:
+    """What a scene's measurements say; reads their tables (one rank).
+
+    Raises
+    ------
+    InputError
+        Probes, handles, times or columns that there are not.
+    """
+    found: list[Reading] = []
+    for number, measurement in enumerate(measurements):
+        key = f"fit.measurements[{number}]"
+        try:
+            found += _readings(scene, measurement, key)
+        except InputError as error:
+            if error.key is None:
+                raise InputError(str(error), key=key) from None
+            raise
+    end = scene.time.end
+    for reading in found:
+        if not 0.0 < reading.time <= end * (1.0 + 1e-9):
+            what = "load factor" if scene.time.analysis == "static" else "time"
+            raise InputError(
+                f"measures at {what} {reading.time:g}, but the scene ends at {end:g}; times are > 0",
+                file=scene.source,
+                key=reading.key,
+            )
+    return found
+
+
+def reading_of(scene: Scene, quantity: Quantity, key: str = "quantity") -> Reading:
+    """A quantity without values."""
+    if quantity.points is not None:
+        table = _Table(quantity.points)
+        return _points(scene, table, key, quantity.at, None)[0]
+    return _made(scene, quantity, key, quantity.at or scene.time.end)
+
+
+def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]:
+    if measurement.points is not None:
+        table = _Table(measurement.points)
+        return _points(scene, table, f"{key}.points", measurement.at, measurement.uncertainty)
+    if measurement.table is None:
+        reading = _made(scene, measurement, key, measurement.at or scene.time.end)
+        assert measurement.value is not None
+        assert measurement.uncertainty is not None
+        if len(measurement.value) != len(reading.parts):
+            raise InputError(
+                f"must hold {len(reading.parts)} numbers ({', '.join(reading.parts)}), "
+                f"not {len(measurement.value)}",
+                file=scene.source,
+                key=f"{key}.value",
+            )
+        reading.measured = np.array(measurement.value)
+        reading.uncertainty = np.full(len(reading.parts), measurement.uncertainty)
+        return [reading]
+    table = _Table(measurement.table)
+    one = _made(scene, measurement, key, scene.time.end)
+    names = ["time", *one.parts]
+    if measurement.uncertainty is None:
+        names.append("uncertainty")
+    columns = table.numbers(names)
+    found = []
+    for row, time in enumerate(columns["time"]):
+        reading = _made(scene, measurement, key, float(time))
+        reading.measured = np.array([columns[part][row] for part in one.parts])
+        sigma = columns["uncertainty"][row] if measurement.uncertainty is None else measurement.uncertainty
+        reading.uncertainty = np.full(len(one.parts), _positive(table, row, float(sigma)))
+        found.append(reading)
+    return found
+
+
+def _made(scene: Scene, quantity: Quantity, key: str, time: float) -> Reading:
+    axes = tuple(AXES.index(axis) for axis in quantity.axes or AXES)
+    names = tuple(AXES[axis] for axis in axes)
+    if quantity.probe is not None:
+        _probe(scene, quantity.probe, f"{key}.probe")
+        return Places(key, quantity.probe, time, names, "m", wanted=[(quantity.probe, axes)])
+    if quantity.overhang is not None:
+        overhang: Overhang = quantity.overhang
+        _probe(scene, overhang.edge, f"{key}.overhang.edge")
+        _probe(scene, overhang.tip, f"{key}.overhang.tip")
+        wanted: list[tuple[str | int, tuple[int, ...]]] = [(overhang.edge, ()), (overhang.tip, ())]
+        return HangingAngle(key, "overhang", time, ("degrees",), "°", wanted=wanted)
+    if quantity.drape is not None:
+        return Shadow(key, "drape", time, ("coefficient",), "", block=quantity.drape)
+    assert quantity.force is not None
+    if not quantity.force < len(scene.handles):
+        raise InputError(
+            f"measures handle {quantity.force}, but the scene has {len(scene.handles)} handles, "
+            "counted from 0",
+            file=scene.source,
+            key=f"{key}.force",
+        )
+    return HandleForce(key, f"handle {quantity.force}", time, names, "N", handle=quantity.force, axes=axes)
+
+
+def _probe(scene: Scene, name: str, key: str) -> None:
+    if name not in scene.probes:
+        hint = nearest(name, list(scene.probes)) if scene.probes else "the scene has no probes"
+        raise InputError(f"unknown probe {name!r}, {hint}", file=scene.source, key=key)
+
+
+class _Table:
+    """A table with a heading, commas, semicolons or tabs between columns; what follows # is a comment.
+
+    Raises
+    ------
+    InputError
+        Without a heading or rows, or where a row has another number of columns.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        lines = [line.split("#")[0] for line in read_text(path, largest=LARGEST_TABLE).splitlines()]
+        kept = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+        if len(kept) < 2:
+            raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)
+        heading = kept[0][1]
+        sign = next((sign for sign in ";\t" if sign in heading), ",")
+        rows = list(csv.reader(io.StringIO("\n".join(line for _, line in kept)), delimiter=sign))
+        self.names = [name.strip().lower() for name in rows[0]]
+        self.lines = [number for number, _ in kept[1:]]
+        self.rows = [[cell.strip() for cell in row] for row in rows[1:]]
+        for line, row in zip(self.lines, self.rows, strict=True):
+            if len(row) != len(self.names):
+                raise InputError(
+                    f"line {line} has {len(row)} columns, the heading {len(self.names)}", file=path
+                )
+
+    def numbers(self, names: Sequence[str]) -> Mapping[str, Array]:
+        """Columns of numbers.
+
+        Raises
+        ------
+        InputError
+            If one is missing, or holds something else.
+        """
+        return {name: self._numbers(name) for name in names}
+
+    def words(self, name: str) -> list[str]:
+        """A column as it is written."""
+        column = self._column(name)
+        return [row[column] for row in self.rows]
+
+    def _column(self, name: str) -> int:
+        if name not in self.names:
+            raise InputError(
+                f"has no column {name!r}; its columns are {', '.join(self.names)}", file=self.path
+            )
+        return self.names.index(name)
+
+    def _numbers(self, name: str) -> Array:
+        found = []
+        for line, word in zip(self.lines, self.words(name), strict=True):
+            try:
+                found.append(float(word))
+                if not math.isfinite(found[-1]):
+                    raise ValueError
+            except ValueError:
+                raise InputError(
+                    f"line {line}: {name} must be a number, not {word!r}", file=self.path
+                ) from None
+        return np.array(found)
+
+
+def _positive(table: _Table, row: int, sigma: float) -> float:
+    if not sigma > 0.0:
+        raise InputError(f"line {table.lines[row]}: uncertainty must be > 0, not {sigma:g}", file=table.path)
+    return sigma
+
+
+def _points(
+    scene: Scene, table: _Table, key: str, at: float | None, uncertainty: float | None
+) -> list[Reading]:
+    """Positions of vertices or probes, at one time or several."""
+    names = [axis for axis in AXES if axis in table.names]
+    if not names:
+        raise InputError("has none of the columns x, y, z", file=table.path)
+    columns = table.numbers(names)
+    whats: list[str | int] = []
+    if "vertex" in table.names:
+        for row, number in enumerate(table.numbers(["vertex"])["vertex"]):
+            if number != int(number):
+                raise InputError(
+                    f"line {table.lines[row]}: vertex must be a whole number, not {number:g}", file=table.path
+                )
+            whats.append(int(number))
+    elif "probe" in table.names:
+        for name in table.words("probe"):
+            _probe(scene, name, key)
+            whats.append(name)
+    else:
+        raise InputError(
+            f"has neither a column 'vertex' nor 'probe'; its columns are {', '.join(table.names)}",
+            file=table.path,
+        )
+    if "uncertainty" in table.names:
+        sigmas = table.numbers(["uncertainty"])["uncertainty"]
+    elif uncertainty is not None:
+        sigmas = np.full(len(whats), uncertainty)
+    else:
+        raise InputError("has no column 'uncertainty'; add it, or give uncertainty", file=table.path, key=key)
+    times = np.full(len(whats), at or scene.time.end)
+    if "time" in table.names:
+        times = table.numbers(["time"])["time"]
+    found: list[Reading] = []
+    axes = tuple(AXES.index(name) for name in names)
+    for time in sorted(set(times.tolist())):
+        rows = np.flatnonzero(times == time)
+        parts = tuple(f"{whats[row]} {name}" for row in rows for name in names)
+        found.append(
+            Places(
+                key,
+                table.path.stem,
+                float(time),
+                parts,
+                "m",
+                np.array([columns[name][row] for row in rows for name in names]),
+                np.array([_positive(table, row, float(sigmas[row])) for row in rows for _ in names]),
+                wanted=[(whats[row], axes) for row in rows],
+            )
+        )
+    return found

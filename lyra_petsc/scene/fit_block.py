@@ -1,0 +1,222 @@
+"""The block ``fit``: numbers of a scene to be found, and what was measured of it. A run does not read it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from typing_extensions import Self
+
+from lyra_petsc.scene.block import Block
+from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, when
+from lyra_petsc.scene.values import (
+    FINITE,
+    Index,
+    JsonSchema,
+    Name,
+    NonNegative,
+    Number,
+    Positive,
+    number,
+    path_beside,
+    problem,
+    shown,
+)
+
+SUFFIXES = (".csv", ".txt")
+
+
+def _pair(value: Any) -> tuple[float, float]:
+    if not isinstance(value, (list, tuple)) or len(value) != 2:
+        raise problem(f"must be two numbers, [lowest, highest], not {shown(value)}")
+    low, high = number(value[0]), number(value[1])
+    if not low < high:
+        raise problem(f"must have the lowest number first, not [{low:g}, {high:g}]")
+    return low, high
+
+
+def _numbers(value: Any) -> tuple[float, ...]:
+    if isinstance(value, (list, tuple)):
+        if not value:
+            raise problem("must hold at least one number")
+        return tuple(number(entry) for entry in value)
+    return (number(value),)
+
+
+def _table(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
+        raise problem(f"must be the path of a table, not {shown(value)}")
+    if Path(value).suffix.lower() not in SUFFIXES:
+        raise problem(f"{Path(value).name!r} must end in {', '.join(SUFFIXES)}")
+    return path_beside(value, info)
+
+
+def _known(value: Any) -> Any:
+    if not isinstance(value, dict) or not value:
+        raise problem(f"must be a block of keys of the scene, not {shown(value)}")
+    return value
+
+
+def _some(value: Any) -> Any:
+    if not isinstance(value, (list, tuple)) or not value:
+        raise problem("must be a list of measurements; put '- ' before the entry")
+    return list(value)
+
+
+Table = Annotated[Path, BeforeValidator(_table), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})]
+Direction = Literal["x", "y", "z"]
+_PAIR = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
+_AXES = {"type": "array", "items": {"enum": ["x", "y", "z"]}, "minItems": 1, "uniqueItems": True}
+_NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]}
+
+
+def _axes(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, (list, tuple)) or not value or any(a not in ("x", "y", "z") for a in value):
+        raise problem(f"must be a list of x, y, z, not {shown(value)}")
+    return tuple(axis for axis in ("x", "y", "z") if axis in value)
+
+
+class Parameter(Block):
+    """A number to be found.
+
+    Attributes
+    ----------
+    start : float
+        Where the search begins, in the unit of the key.
+    bounds : two floats
+        Between which it is sought.
+    """
+
+    start: Number
+    bounds: Annotated[tuple[float, float], BeforeValidator(_pair), JsonSchema(_PAIR)]
+
+    @model_validator(mode="after")
+    def _inside(self) -> Self:
+        low, high = self.bounds
+        if not low <= self.start <= high:
+            raise problem(f"must lie within the bounds {low:g} to {high:g}, not {self.start:g}", "start")
+        return self
+
+
+class Overhang(Block):
+    """Angle below the horizontal at which a strip hangs over an edge (ASTM D1388: 41.5°).
+
+    Attributes
+    ----------
+    edge : str
+        Probe where the overhang begins.
+    tip : str
+        Probe at its end.
+    """
+
+    edge: Name
+    tip: Name
+
+
+class DrapeCoefficient(Block):
+    """Shadow beyond the support over that of the flat sheet (BS 5058), seen along z.
+
+    Attributes
+    ----------
+    radius : float [m]
+        Of the flat sheet.
+    support : float [m]
+        Of the disc that carries it.
+    """
+
+    radius: Positive
+    support: NonNegative
+
+    @model_validator(mode="after")
+    def _hangs_over(self) -> Self:
+        if not self.support < self.radius:
+            raise problem(f"must be less than radius = {self.radius:g}, not {self.support:g}", "support")
+        return self
+
+
+class Quantity(Block):
+    """What can be measured: one of ``probe``, ``points``, ``overhang``, ``drape``, ``force``.
+
+    Attributes
+    ----------
+    probe : str or None
+        Mean position [m] of a probe of the scene.
+    points : str or None
+        Positions [m] of many vertices: a table with a column ``vertex`` (numbers from 0) or ``probe``
+        (names), some of x, y, z, and where they differ ``time`` and ``uncertainty``.
+    overhang : Overhang or None
+        Angle [°] at which the sheet hangs over.
+    drape : DrapeCoefficient or None
+        Drape coefficient, 0 to 1.
+    force : int or None
+        Force [N] of a handle, by its number from 0, on the sheet.
+    axes : tuple of "x", "y", "z" or None
+        Components of a probe or a force; without: all.
+    at : float [s] or None
+        When; in a static analysis a load factor. Without: at the end.
+    """
+
+    rules: ClassVar[tuple[Rule, ...]] = (
+        exactly_one("probe", "points", "overhang", "drape", "force"),
+        Rule(
+            when(given("axes"), one_of("probe", "force")),
+            "are of a probe or a force; leave axes out",
+            "axes",
+        ),
+    )
+
+    probe: Name | None = None
+    points: Table | None = None
+    overhang: Overhang | None = None
+    drape: DrapeCoefficient | None = None
+    force: Index | None = None
+    axes: Annotated[tuple[Direction, ...], BeforeValidator(_axes), JsonSchema(_AXES)] | None = None
+    at: Positive | None = None
+
+
+class Measurement(Quantity):
+    """What was measured, and how well.
+
+    Attributes
+    ----------
+    value : float or list of float or None
+        What was found, in the order of ``axes``; in the quantity's unit.
+    table : str or None
+        A table of values over time instead: columns ``time``, and x, y, z, ``degrees`` or ``coefficient``.
+    uncertainty : float or None
+        Standard deviation of each value, in its unit; a column of that name takes its place.
+    """
+
+    rules = (
+        *Quantity.rules,
+        Rule(
+            when(given("points"), absent("value", "table")),
+            "come with their values in the table; leave out value and table",
+            "points",
+        ),
+        Rule(when(absent("points"), one_of("value", "table")), "must have exactly one of value, table"),
+        Rule(when(given("table"), absent("at")), "has a column time; leave at out", "at"),
+        Rule(when(given("value"), given("uncertainty")), "missing (standard deviation)", "uncertainty"),
+    )
+
+    value: Annotated[tuple[float, ...], BeforeValidator(_numbers), JsonSchema(_NUMBERS)] | None = None
+    table: Table | None = None
+    uncertainty: Positive | None = None
+
+
+class Fit(Block):
+    """Numbers of the scene that are to be found from measurements, by ``fit``.
+
+    Attributes
+    ----------
+    parameters : dict of Parameter
+        By their keys in the scene, as in ``material.bending``.
+    measurements : list of Measurement
+        What was measured.
+    """
+
+    parameters: Annotated[dict[Name, Parameter], BeforeValidator(_known)]
+    measurements: Annotated[
+        list[Measurement], BeforeValidator(_some), Field(json_schema_extra={"minItems": 1})
+    ]

@@ -1,0 +1,256 @@
+"""Fits of small scenes: numbers and intervals, readings, resumption, ranks, what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import lyra_petsc
+from lyra_petsc.errors import InputError
+from lyra_petsc.experiments.fit.estimate import Trial, Unknown, conclude, search
+from lyra_petsc.experiments.fit.work import FIT, Observer, fit_scene
+
+TRUE = 4.2e-5
+
+STRIP: dict[str, Any] = {
+    "mesh": {"grid": {"width": 0.08, "height": 0.02, "nx": 8, "ny": 2, "pattern": "alternating"}},
+    "material": {
+        "density": 0.15,
+        "membrane": {"c11": 500.0, "c22": 500.0, "c12": 100.0, "c33": 100.0},
+        "bending": TRUE,
+    },
+    "gravity": [0.0, 0.0, -9.81],
+    "handles": [{"box": [[-1, -1, -1], [0.0101, 1, 1]]}],
+    "probes": {"edge": {"box": [[-1, -1, -1], [0.0001, 1, 1]]}, "tip": {"nodes": [8, 17, 26]}},
+    "time": {"analysis": "static"},
+    "petsc": {"snes_max_it": 50},
+}
+
+BENDING = {"material.bending": {"start": 2e-5, "bounds": [1e-6, 1e-3]}}
+
+
+def strip(*measurements: dict[str, Any], parameters: Any = BENDING, **more: Any) -> dict[str, Any]:
+    return STRIP | more | {"fit": {"parameters": parameters, "measurements": list(measurements)}}
+
+
+def hanging() -> tuple[np.ndarray, float, np.ndarray]:
+    """Of the true strip: tip, angle, force of the clamp."""
+    tip = lyra_petsc.gradient(STRIP, "tip", ["material.bending"])
+    angle = lyra_petsc.gradient(STRIP, {"overhang": {"edge": "edge", "tip": "tip"}}, ["material.bending"])
+    force = lyra_petsc.gradient(STRIP, {"force": 0}, ["material.bending", "material.density"])
+    return tip.value, float(angle.value[0]), force
+
+
+def test_values_and_gradients() -> None:
+    """The handle carries the weight whatever the stiffness; the angle is that of the tip."""
+    tip, angle, force = hanging()
+    assert angle == pytest.approx(np.degrees(np.arctan2(-tip[2], tip[0])), rel=1e-6)
+    weight = 0.15 * 0.08 * 0.02 * 9.81
+    assert force.value[2] == pytest.approx(weight, rel=1e-4)
+    assert force.derivatives["material.density"][2] * 0.15 == pytest.approx(force.value[2], rel=1e-5)
+    assert abs(force.derivatives["material.bending"][2]) * TRUE < 1e-6 * weight
+
+
+@pytest.mark.parametrize("kind", ["probe", "overhang", "points"])
+def test_finds_the_stiffness(kind: str, tmp_path: Path) -> None:
+    tip, angle, _ = hanging()
+    table = tmp_path / "points.csv"
+    table.write_text(f"probe,x,z,uncertainty\ntip,{tip[0]!r},{tip[2]!r},1e-4\n".replace("np.float64", ""))
+    measurement = {
+        "probe": {"probe": "tip", "axes": ["z"], "value": float(tip[2]), "uncertainty": 1e-4},
+        "overhang": {"overhang": {"edge": "edge", "tip": "tip"}, "value": angle, "uncertainty": 0.1},
+        "points": {"points": str(table)},
+    }[kind]
+    fitted = lyra_petsc.fit(strip(measurement))
+    (estimate,) = fitted.conclusion.estimates
+    assert estimate.value == pytest.approx(TRUE, rel=2e-3)
+    low, high = estimate.interval
+    assert low < TRUE < high
+    # the interval is what the gradient says
+    name = "overhang" if kind == "overhang" else "probe"
+    quantity = {k: v for k, v in measurement.items() if k in (name, "axes")} if kind != "points" else "tip"
+    slope = lyra_petsc.gradient(STRIP, quantity, ["material.bending"]).derivatives["material.bending"]
+    if kind != "points":
+        sigma = measurement["uncertainty"]
+        assert estimate.deviation == pytest.approx(sigma / abs(slope[0]), rel=0.02)
+
+
+def test_drape_is_the_area_of_the_shadow() -> None:
+    content = STRIP | {"gravity": None, "handles": [{"nodes": [0, 1, 9, 10]}]}
+    drape = {"drape": {"radius": 0.03, "support": 0.01}}
+    found = lyra_petsc.gradient(content, drape, ["material.bending"])
+    area, inner, outer = 0.08 * 0.02, np.pi * 1e-4, np.pi * 9e-4
+    assert found.value[0] == pytest.approx((area - inner) / (outer - inner), rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["brgn", "blmvm"])
+def test_search_and_conclusion(kind: str) -> None:
+    """A linear problem: the answer, its deviations and its correlation are those of the normal equations."""
+    from petsc4py import PETSc
+
+    rng = np.random.default_rng(3)
+    matrix, right = rng.standard_normal((12, 3)), rng.standard_normal(12)
+    unknowns = [Unknown(name, 0.5, -10.0, 10.0) for name in "abc"]
+    PETSc.Options().setValue("tao_type", kind)
+    try:
+        best, words = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
+    finally:
+        PETSc.Options().delValue("tao_type")
+    exact = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    deviation = np.sqrt(np.diag(covariance))
+    assert words.startswith("the search ended")
+    assert (np.abs(best.numbers - exact) < 0.3 * deviation).all()
+    found = conclude(unknowns, best)
+    assert [e.deviation for e in found.estimates] == pytest.approx(deviation)
+    assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / deviation[0] / deviation[1])
+
+
+def test_bound_and_what_is_not_told() -> None:
+    matrix = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
+    right = np.array([1.0, 2.0, 5.0, 10.0])
+    unknowns = [Unknown("a", 0.2, -10.0, 10.0), Unknown("b", 0.3, -10.0, 10.0), Unknown("c", 1.0, 0.0, 2.0)]
+    best, _ = search(unknowns, lambda p: Trial(p, matrix @ p - right, matrix))
+    found = conclude(unknowns, best)
+    told = " ".join(found.words)
+    assert "the data cannot tell a and b apart" in told
+    assert found.estimates[2].at_bound
+    assert found.estimates[2].value == pytest.approx(2.0)
+    assert "c is at its bound 2" in told
+
+
+def test_goes_on_without_repeating(tmp_path: Path) -> None:
+    scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
+
+    class Stops(Observer):
+        def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+            if number == 2:
+                raise KeyboardInterrupt
+
+    class Counts(Observer):
+        made = resumed = 0
+
+        def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
+            self.made, self.resumed = self.made + (not resumed), self.resumed + resumed
+
+    comm = MPI.COMM_SELF
+    with pytest.raises(KeyboardInterrupt):
+        fit_scene(comm, scene, folder=tmp_path, observer=Stops())
+    assert FIT.resumable(tmp_path)
+    counts = Counts()
+    resumed = fit_scene(comm, scene, folder=tmp_path, observer=counts)
+    assert counts.resumed == 2
+    again = fit_scene(comm, scene)
+    assert resumed.parameters == again.parameters
+    other = scene.changed({"material.density": 0.2})
+    with pytest.raises(InputError, match="another scene"):
+        fit_scene(comm, other, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fit": None}, "has no block fit"),
+        ({"parameters": {"material.bendig": {"start": 1, "bounds": [0, 2]}}}, "did you mean 'bending'"),
+        ({"parameters": {"time.end": {"start": 1, "bounds": [0.5, 2]}}}, "no number that can be varied"),
+        ({"parameters": {"material.bending": {"start": 1, "bounds": [2, 0]}}}, "lowest number first"),
+        ({"parameters": {"material.bending": {"start": 3, "bounds": [0, 2]}}}, "within the bounds"),
+        ({"parameters": {"material.bending": {"start": 1, "bounds": [-1, 2]}}}, "-1 cannot be taken"),
+        ({"parameters": {"material.damping": {"start": 0.1, "bounds": [0, 2]}}}, "no measurement depends"),
+        ({"measurements": [{"probe": "tap", "value": 1, "uncertainty": 1}]}, "did you mean 'tip'"),
+        ({"measurements": [{"force": 1, "value": 1, "uncertainty": 1}]}, "has 1 handles"),
+        ({"measurements": [{"probe": "tip", "value": 1, "uncertainty": 1}]}, "must hold 3 numbers"),
+        ({"measurements": [{"probe": "tip", "at": 2, "value": [0, 0, 0], "uncertainty": 1}]}, "ends at 1"),
+        ({"measurements": [{"length": 1}]}, "unknown key"),
+        ({"measurements": [{"points": "none.csv"}]}, "none.csv"),
+        ({"table": "vertx,x\n1,0\n"}, "neither a column 'vertex' nor 'probe'"),
+        ({"table": "vertex,u\n1,0\n"}, "none of the columns x, y, z"),
+        ({"table": "vertex,x\n1,0\n"}, "no column 'uncertainty'"),
+        ({"table": "vertex,x,uncertainty\n99,0,1\n"}, "vertices 0 to 26"),
+        ({"table": "vertex,x,uncertainty\n1,zero,1\n"}, "line 2: x must be a number"),
+        ({"table": "vertex,x,uncertainty\n1,0\n"}, "line 2 has 2 columns"),
+        ({"table": "vertex,x,uncertainty\n1,0,0\n"}, "uncertainty must be > 0"),
+    ],
+)
+def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
+    good = {"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}
+    content = strip(good)
+    if "fit" in change:
+        content = STRIP
+    elif "table" in change:
+        file = tmp_path / "points.csv"
+        file.write_text(change["table"])
+        content["fit"]["measurements"] = [{"points": str(file)}]
+    else:
+        content["fit"] |= change
+    with pytest.raises(InputError) as raised:
+        lyra_petsc.fit(content, tmp_path / "out")
+    assert words in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_refuses_a_key_without_a_number() -> None:
+    content = STRIP | {"material": {"cloth": "gray-interlock"}}
+    with pytest.raises(InputError, match="no number that the scene gives"):
+        lyra_petsc.gradient(content, "tip", ["material.bending"])
+
+
+@pytest.mark.parallel(2)
+def test_any_number_of_ranks() -> None:
+    scene = lyra_petsc.load(
+        strip({"force": 0, "axes": ["x"], "at": 0.5, "value": 0.0, "uncertainty": 1.0},
+              {"probe": "tip", "value": [0.035, 0.01, -0.06], "uncertainty": 1e-3})
+    )  # fmt: skip
+    fitted = fit_scene(MPI.COMM_WORLD, scene)
+    assert fitted.parameters["material.bending"] == pytest.approx(2.8765785e-05, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_contact_by_differences() -> None:
+    """With contact derivatives are differences of whole runs."""
+    content = STRIP | {
+        "contact": {"gap": 2e-3, "self": False},
+        "obstacles": {"floor": {"plane": {"point": [0, 0, -0.02], "normal": [0, 0, 1]}}},
+        "time": {"end": 0.04, "step": 0.02},
+    }
+    found = lyra_petsc.gradient(content, {"probe": "tip", "axes": ["z"]}, ["material.density"])
+    assert np.isfinite(found.derivatives["material.density"]).all()
+
+
+def test_report(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from lyra_petsc.experiments.fit.fit_report import Fit, outcome_of
+    from lyra_petsc.experiments.results import Results
+
+    scene = lyra_petsc.load(strip({"probe": "tip", "axes": ["z"], "value": -0.06, "uncertainty": 1e-3}))
+    comm = MPI.COMM_SELF
+    results: Any = Results(comm, tmp_path / "fit", Fit("A strip"), ranks=1, command=["fit"])
+    outcome = outcome_of(fit_scene(comm, scene))
+    results.run([outcome.case], lambda case: outcome)
+    told = json.loads((tmp_path / "fit" / "fit.json").read_text())["cases"][0]
+    assert told["parameters"][0]["key"] == "material.bending"
+    assert told["measurements"][0]["after"] == pytest.approx(-0.06, abs=2e-4)
+    page = (tmp_path / "fit" / "report.md").read_text()
+    assert "95 % interval" in page
+    assert "before and after the fit" in page
+    assert (tmp_path / "fit" / "plots" / "shape-after.png").exists()
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth() -> None:
+    """As scripts/fit_coverage.py says of 100 seeds; of 6, two misses of a number would be one in 30."""
+    import importlib.util
+
+    path = Path(__file__).resolve().parents[3] / "scripts" / "fit_coverage.py"
+    spec = importlib.util.spec_from_file_location("fit_coverage", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert min(module.count(6, MPI.COMM_SELF).values()) >= 5

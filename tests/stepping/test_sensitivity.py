@@ -1,0 +1,221 @@
+"""Derivatives by the tangent equations against differences of whole runs, for every integrator and term."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from physics import grid
+
+import lyra_petsc
+from lyra_petsc.errors import InputError
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.stepping.sensitivity import Number, Sensitivities
+from lyra_petsc.stepping.simulation import SteppedScene
+
+Array = NDArray[np.float64]
+
+TIGHT = {"force_tolerance": 1e-12, "step_tolerance": 1e-14}
+
+# pulled from the first step on, so that no strain crosses 0, where the damping's K⁺ has a kink
+PULLED: dict[str, Any] = {
+    "mesh": grid(0.5, 0.4, 4, 3, "alternating"),
+    "material": {
+        "density": 0.2,
+        "membrane": {"c11": 60.0, "c22": 40.0, "c12": 15.0, "c33": 12.0},
+        "bending": 1e-3,
+        "damping": 0.01,
+    },
+    "gravity": [0.0, 0.0, -9.81],
+    "wind": {"velocity": [1.0, 2.0, 3.0], "density": 1.2, "drag": 0.3},
+    "handles": [
+        {"nodes": [0, 5, 10, 15], "clamp": True},
+        {"nodes": [4, 9, 14, 19], "motion": "pull"},
+        {"nodes": [12], "stiffness": 3.0},
+        {"nodes": [7], "from": 0.03, "until": 0.05, "axes": ["z"]},
+    ],
+    "loads": [{"pressure": 2.0}, {"nodes": [6], "force": [0.0, 0.02, 0.03]}],
+    "motions": {"pull": [{"time": 0}, {"time": 0.08, "translate": [0.05, 0.0, 0.01]}]},
+    "time": {"end": 0.08, "step": 0.01},
+    "solver": TIGHT,
+    "petsc": {"ksp_rtol": 1e-13},
+}
+
+NUMBERS = {
+    "material.membrane.c11": 60.0,
+    "material.membrane.c22": 40.0,
+    "material.membrane.c12": 15.0,
+    "material.membrane.c33": 12.0,
+    "material.bending": 1e-3,
+    "material.damping": 0.01,
+    "material.density": 0.2,
+    "gravity[2]": -9.81,
+    "wind.density": 1.2,
+    "wind.drag": 0.3,
+    "wind.velocity[1]": 2.0,
+    "handles[2].stiffness": 3.0,
+    "loads[0].pressure": 2.0,
+    "loads[1].force[2]": 0.03,
+}
+
+SHELL = {"density": 0.4, "young": 2e6, "poisson": 0.3, "thickness": 5e-4, "damping": 0.01}
+OF_SHELL = {
+    "material.young": 2e6,
+    "material.poisson": 0.3,
+    "material.thickness": 5e-4,
+    "material.damping": 0.01,
+    "material.density": 0.4,
+    "loads[0].pressure": 2.0,
+    "handles[2].stiffness": 3.0,
+}
+
+PLATE = {
+    "density": 0.4,
+    "membrane": {"c11": 900.0, "c22": 700.0, "c12": 200.0, "c33": 200.0},
+    "bending": {"d11": 2e-2, "d22": 1e-2, "d12": 3e-3, "d33": 4e-3},
+    "damping": 0.01,
+}
+OF_PLATE = {f"material.bending.{key}": value for key, value in PLATE["bending"].items()}  # type: ignore[attr-defined]
+
+INTEGRATORS = ("semi-implicit", "beuler", "midpoint", "bdf2", "alpha2", "static")
+
+
+def scene(integrator: str, material: Mapping[str, Any] | None = None) -> Scene:
+    """The pulled sheet; an equilibrium has no wind but its pressure."""
+    content = PULLED | ({"material": dict(material)} if material else {})
+    if integrator != "static":
+        return lyra_petsc.load(content | {"time": content["time"] | {"integrator": integrator}})
+    still = content | {"time": {"analysis": "static"}, "handles": content["handles"][:3]}
+    still["motions"] = {"pull": [{"time": 0}, {"time": 1.0, "translate": [0.03, 0.0, 0.01]}]}
+    return lyra_petsc.load({key: value for key, value in still.items() if key != "wind"})
+
+
+def of_integrator(integrator: str, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Those numbers that there are."""
+    gone = ("wind", "material.damping") if integrator == "static" else ()
+    return {key: value for key, value in numbers.items() if not key.startswith(gone or "none")}
+
+
+def end(scene: Scene) -> Array:
+    """Positions [m] where a scene ends, of this rank's vertices."""
+    simulation = SteppedScene(MPI.COMM_WORLD, scene)
+    while not simulation.finished:
+        simulation.step()
+    points = simulation.problem.points
+    x: Array = simulation.problem.system.x[: points.n_vertices].copy()
+    order = np.argsort(points.original)
+    simulation.destroy()
+    return x[order]
+
+
+def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
+    """Derivatives of `end` times each number."""
+    simulation = SteppedScene(MPI.COMM_WORLD, scene)
+    chosen = [Number(key, value, abs(value)) for key, value in numbers.items()]
+    beside = Sensitivities(simulation, chosen, tolerance=1e-11)
+    while not simulation.finished:
+        beside.step()
+    points = simulation.problem.points
+    order = np.argsort(points.original)
+    found = {
+        number.key: number.value * tangent.x[: points.n_vertices][order]
+        for number, tangent in zip(chosen, beside.tangents, strict=True)
+    }
+    beside.destroy()
+    simulation.destroy()
+    return found
+
+
+def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Array:
+    """Derivative of `end` along relative changes of numbers, of fourth order."""
+
+    def at(factor: float) -> Array:
+        changes = {key: value * (1.0 + factor * step) for key, value in direction.items()}
+        return end(scene.changed(changes))
+
+    slope: Array = (8.0 * (at(1.0) - at(-1.0)) - (at(2.0) - at(-2.0))) / (12.0 * step)
+    return slope
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_all_numbers_at_once(integrator: str) -> None:
+    numbers = of_integrator(integrator, NUMBERS)
+    pulled = scene(integrator)
+    found = tangents(pulled, numbers)
+    expected = difference(pulled, numbers, 1e-3)
+    # what belongs to one number must not hide behind another: each is of some size
+    assert min(np.linalg.norm(each) for each in found.values()) > 1e-7
+    error = np.linalg.norm(sum(found.values()) - expected)
+    assert error < 1e-6 * np.sqrt(sum(np.sum(each**2) for each in found.values()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_each_number(integrator: str) -> None:
+    pulled, numbers = scene(integrator), of_integrator(integrator, NUMBERS)
+    found = tangents(pulled, numbers)
+    for key, value in numbers.items():
+        expected = difference(pulled, {key: value}, 1e-3)
+        assert np.linalg.norm(found[key] - expected) < 1e-6 * np.linalg.norm(expected), key
+
+
+@pytest.mark.parametrize("integrator", ["static", "beuler", "midpoint"])
+@pytest.mark.parametrize(("material", "numbers"), [(SHELL, OF_SHELL), (PLATE, OF_PLATE)])
+def test_directors(integrator: str, material: Mapping[str, Any], numbers: Mapping[str, float]) -> None:
+    numbers = of_integrator(integrator, numbers)
+    pulled = scene(integrator, material)
+    found = tangents(pulled, numbers)
+    expected = difference(pulled, numbers, 1e-3)
+    scale = np.sqrt(sum(np.sum(each**2) for each in found.values()))
+    assert np.linalg.norm(sum(found.values()) - expected) < 1e-6 * scale
+
+
+@pytest.mark.parallel
+def test_any_number_of_ranks() -> None:
+    pulled = scene("bdf2")
+    numbers = {key: NUMBERS[key] for key in ("material.bending", "material.density", "wind.density")}
+    simulation = SteppedScene(MPI.COMM_WORLD, pulled)
+    beside = Sensitivities(simulation, [Number(k, v, abs(v)) for k, v in numbers.items()], tolerance=1e-11)
+    while not simulation.finished:
+        beside.step()
+    points = simulation.problem.points
+    squares = [np.sum(tangent.x[: points.n_vertices] ** 2) for tangent in beside.tangents]
+    norms = np.sqrt(points.summed(*map(float, squares)))
+    beside.destroy()
+    simulation.destroy()
+    # of one rank
+    assert norms == pytest.approx([2.4258024, 0.12530627, 0.065196646], rel=1e-6)
+
+
+def test_number_at_its_least() -> None:
+    """Damping may not be less than 0: differences are taken to one side."""
+    material = PULLED["material"] | {"damping": 0.0}
+    found = tangents(scene("beuler", material), {"material.bending": 1e-3})
+    assert np.isfinite(found["material.bending"]).all()
+    pulled = scene("beuler", material)
+    simulation = SteppedScene(MPI.COMM_WORLD, pulled)
+    beside = Sensitivities(simulation, [Number("material.damping", 0.0, 0.01)], tolerance=1e-11)
+    while not simulation.finished:
+        beside.step()
+    points = simulation.problem.points
+    slope = beside.tangents[0].x[: points.n_vertices][np.argsort(points.original)]
+    beside.destroy()
+    simulation.destroy()
+
+    def at(damping: float) -> Array:
+        return end(pulled.changed({"material.damping": damping}))
+
+    step = 1e-5
+    expected = (-1.5 * at(0.0) + 2.0 * at(step) - 0.5 * at(2.0 * step)) / step
+    assert np.linalg.norm(slope - expected) < 1e-5 * np.linalg.norm(expected)
+
+
+def test_what_is_no_scene() -> None:
+    simulation = SteppedScene(MPI.COMM_WORLD, scene("beuler"))
+    with pytest.raises(InputError, match="bendig"):
+        Sensitivities(simulation, [Number("material.bendig", 1.0, 1.0)])
+    simulation.destroy()
