@@ -58,7 +58,7 @@ class ActiveTerms:
     def refreeze(self, found: Mapping[Term, Any]) -> None:
         """Let terms, and those that follow them, have frozen this."""
         following: dict[Term, Any] = {
-            term: found[term.follows] for term in self.elastic if term.follows and term.follows in found
+            term: found[term.partner] for term in self.elastic if term.partner and term.partner in found
         }
         self.frozen = {**self.frozen, **found, **following}
 

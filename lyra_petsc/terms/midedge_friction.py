@@ -69,14 +69,14 @@ class MidEdgeFriction(Elastic):
         self._frames: Frames | None = None
 
     def connect(self, terms: Iterable[Term]) -> None:
-        self.follows = sheet = next(term for term in terms if isinstance(term, MidEdge))
+        self.partner = sheet = next(term for term in terms if isinstance(term, MidEdge))
         assert self.edges is not None
         self._edges = np.searchsorted(sheet.of_edges.places, self.edges).astype(np.int32)
 
     @property
     def _sheet(self) -> MidEdge:
-        assert isinstance(self.follows, MidEdge)
-        return self.follows
+        assert isinstance(self.partner, MidEdge)
+        return self.partner
 
     def freeze(self, step: UpcomingStep) -> Frames:
         return self._sheet.freeze(step)

@@ -252,7 +252,7 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
-    follows: Elastic | None = None
+    partner: Elastic | None = None
     """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
 
     # -- terms whose stencils change ---------------------------------------------------------------

@@ -60,7 +60,9 @@ def cell(found: list[Record], quantity: str) -> str:
             words.append("–")
             continue
         scatter = "" if math.isnan(number.scatter) else f" ± {number.scatter:.2g}"
-        words.append(f"{number.value:.3g}{scatter}")
+        verdict = record.verdicts.get(quantity)
+        off = "" if verdict is None or verdict.passed else " \\*"
+        words.append(f"{number.value:.3g}{scatter}{off}")
     return " / ".join(words)
 
 
@@ -86,14 +88,15 @@ def picture(folder: Path) -> bool:
 def page(folder: Path) -> None:
     """Write the page."""
     columns = {head: of for head, of in COLUMNS.items() if any(records(folder, c, of[0]) for c in CLOTHS)}
+    drape = "drape with the standard deviation of five starts, " if "drape [%]" in columns else ""
     lines = [
         "# Fabrics",
         "",
         MADE,
         "",
-        "The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, drape with the",
-        "standard deviation of five starts, – where 500 gf/cm are not reached. The law of those that were",
-        "measured is `measured`; aluminium and paper were not.",
+        f"The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, {drape}– where",
+        "500 gf/cm are not reached. The law of those that were measured is `measured`; aluminium and paper",
+        "were not. \\* is not that of the material: with so stiff a membrane flat triangles of this size lock.",
         "",
         "| cloth | " + " | ".join(columns) + " |",
         "| --- " * (len(columns) + 1) + "|",
