@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import Frames, carried
+from lyra_petsc.terms.term import Term
 
 Array = NDArray[np.float64]
 
@@ -292,7 +294,7 @@ class Sensitivities:
     def _use_frames(self, system: StageEquations) -> None:
         """Let directors be measured from the frames that the simulation has in use."""
         pairs = zip(_edged(system), _edged(self._system), strict=True)
-        found = {mine: self._system.active.frozen[theirs] for mine, theirs in pairs}
+        found: dict[Term, Any] = {mine: self._system.active.frozen[theirs] for mine, theirs in pairs}
         if found:
             system.active.refreeze(found)
             system.forget_forces()

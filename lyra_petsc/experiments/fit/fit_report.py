@@ -49,7 +49,10 @@ class Fit(View[FitOutcome]):
     columns = ("parameter", "start", "lowest", "highest", "value", "deviation", "from", "to", "at_bound")
 
     def __init__(self, title: str) -> None:
-        self.title = title
+        self.title, self.ready = title, False  # nothing is told of a fit that was stopped
+
+    def ended(self, outcomes: Sequence[FitOutcome]) -> None:
+        self.ready = True
 
     def rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
         assert outcome.fitted is not None

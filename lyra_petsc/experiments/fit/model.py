@@ -31,7 +31,7 @@ ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
 """Blocks of a scene whose numbers can be found."""
 
 WHOLE_RUNS = 1e-3
-"""Change over the number's size of runs whose difference stands for a derivative, with contact or friction."""
+"""Change over the number's size of runs whose difference is a derivative, with contact or friction."""
 
 SAME_TIME = 1e-9
 """Part of the run by which a step may miss a measurement's time."""
