@@ -201,9 +201,13 @@ class EnergyGuard:
         """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
         the energy of springs at both ends."""
         system, rise, work, springs = self._system, 0.0, 0.0, [0.0, 0.0]
-        first = self._frozen(self._targets, system.t0, x0)
-        last = self._frozen(self._targets, system.t1, x1)
-        for term in self._targets:
+        for term in system.active.pushing:
+            for x, time in ((x0, system.t0), (x1, system.t1)):
+                work += 0.5 * term.work(x, time, system.t0, system.t1)
+        turning = [term for term in self._targets if term not in system.active.pushing]
+        first = self._frozen(turning, system.t0, x0)
+        last = self._frozen(turning, system.t1, x1)
+        for term in turning:
             at = [[float(term.energies(x, f[term]).sum()) for f in (first, last)] for x in (x0, x1)]
             rise += at[1][1] - at[0][0]
             work += 0.5 * (at[0][1] - at[0][0] + at[1][1] - at[1][0])
