@@ -272,7 +272,8 @@ class EnergyGuard:
         """Whether a step may stand; then it is remembered. The same on all ranks; collective."""
         new = self._with(step)
         over = self._system.integrator.judged_over
-        of_step = math.fsum(new.recent[-over:]) / min(over, len(new.recent))
+        # a step that makes none of it would make none either if it were shorter
+        of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self.gain = of_step, of_steps, new.scale
         good = of_step <= max(LARGEST_GAIN * new.scale, step.noise)

@@ -215,6 +215,9 @@ class StageEquations:
             follower.start_from(acceleration)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
+        if self.watches_impacts:
+            terms = self.active.limiting
+            self._stored = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
@@ -330,6 +333,11 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
+        if self.watches_impacts:
+            from lyra_petsc.stepping.impacts import surplus  # of no use elsewhere
+
+            given = self.integrator.surplus
+            self.integrator.surplus = surplus(self, self._stored, before, given)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
@@ -440,6 +448,11 @@ class StageEquations:
         before = self.active.moving_energy(self.x)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
+
+    @property
+    def watches_impacts(self) -> bool:
+        """Whether what contact adds to the energy is known and taken back; not so where obstacles move."""
+        return self.integrator.by_stage and bool(self.active.limiting) and not self.active.pushing
 
     @property
     def limits_steps(self) -> bool:

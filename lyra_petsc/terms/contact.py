@@ -447,6 +447,10 @@ class ContactBarrier(Elastic):
         met = contact_pairs.touching(x, places, *of, *others, least, *found)
         return tuple(part[:met] for part in found)
 
+    def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array]:
+        beta, normal, force, at = self.touching(x, frozen.now)
+        return self.points[at], beta, normal, force
+
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
         out = np.zeros(len(x))
