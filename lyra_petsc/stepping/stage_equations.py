@@ -336,8 +336,8 @@ class StageEquations:
         if self.watches_impacts:
             from lyra_petsc.stepping.impacts import surplus  # of no use elsewhere
 
-            given = self.integrator.surplus
-            self.integrator.surplus = surplus(self, self._stored, before, given)
+            left = self.integrator.surplus
+            self.integrator.surplus = surplus(self, self._stored, before, left)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
