@@ -102,7 +102,7 @@ def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) 
 
 
 def test_impacts_add_little_energy_under_the_midpoint_rule(comm: MPI.Comm) -> None:
-    """A sheet thrown at a ball; 6 % without what `impacts` takes back."""
+    """A sheet thrown at a ball; 2 % without what `impacts` takes back."""
     scene = BALL | {
         "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
         "initial": {"velocity": [0, 0, -5.0]},
@@ -113,7 +113,7 @@ def test_impacts_add_little_energy_under_the_midpoint_rule(comm: MPI.Comm) -> No
     while not simulation.finished:
         simulation.step()
         most = max(most, simulation.budget.total)
-    assert most < 1.02 * start
+    assert most < 1.01 * start
     assert simulation.budget.total > 0.5 * start
     simulation.destroy()
 
