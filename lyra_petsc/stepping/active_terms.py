@@ -26,10 +26,10 @@ class ActiveTerms:
     ----------
     elastic, viscous, loads : list of Term
         By kind.
-    sheet, constraints, moving, limiting, near, edged : list of Elastic
+    sheet, constraints, moving, pushing, limiting, near, edged : list of Elastic
         Those whose energy is the sheet's, those by which handles pull, and of these those whose targets move,
-        those that limit the length of Newton's steps, those whose stencils change, and those with unknowns on
-        edges.
+        those of them that work by forces, those that limit the length of Newton's steps, those whose stencils
+        change, and those with unknowns on edges.
     coarse : dict of Elastic → Elastic
         Terms with unknowns of edges, and what stands for them on coarse levels of multigrid.
     frozen : dict of Term
@@ -44,6 +44,7 @@ class ActiveTerms:
         self.constraints = [term for term in self.elastic if roles[term] is Role.CONSTRAINT]
         self.sheet = [term for term in self.elastic if roles[term] is Role.ELASTIC]
         self.moving = [term for term in self.sheet if term.moving]
+        self.pushing = [term for term in self.moving if term.pushes]
         self.limiting = [term for term in self.elastic if term.registration.limits_step]
         self.near = [term for term in self.elastic if term.registration.neighbours]
         self.edged = [term for term in self.elastic if term.registration.edge_state]
@@ -74,8 +75,9 @@ class ActiveTerms:
         return out[: layout.n_owned]
 
     def moving_energy(self, x: Array) -> float:
-        """Energy [J] of this rank's terms whose targets move with handles, which stand where they are now."""
-        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in self.moving)
+        """Energy [J] of this rank's terms whose targets work by it, which stand where they are now."""
+        turning = [term for term in self.moving if not term.pushes]
+        return sum(float(term.energies(x, self.frozen[term]).sum()) for term in turning)
 
     def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""

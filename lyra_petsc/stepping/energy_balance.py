@@ -119,7 +119,7 @@ class Ledger:
                 frozen = system.active.frozen[term]
                 energy = float(term.energies(system.x, frozen).sum()) - term.heat(system.x, frozen)
                 local[columns.index(entry.energy)] += energy
-                self._moving += energy if term.moving else 0.0
+                self._moving += energy if term.moving and not term.pushes else 0.0
         for load in system.active.loads:
             if load.registration.energy:
                 local[columns.index(load.registration.energy)] += load.potential(system.x)
@@ -144,7 +144,8 @@ class Ledger:
         if self._pull is not None:  # the way to an equilibrium has no stage in its middle
             external, self._pull = 0.5 * (external + self._pull), external
         # targets that move with a handle let it work on the sheet
-        turned = system.moving_energy_before - self._moving + system.turn_targets_to_end()
+        turned = system.moving_energy_before - self._moving + system.pushed()
+        turned += system.turn_targets_to_end()
         moved = system.x[: len(x_before)] - x_before
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         damping = np.zeros(len(self._at))

@@ -201,9 +201,13 @@ class EnergyGuard:
         """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
         the energy of springs at both ends."""
         system, rise, work, springs = self._system, 0.0, 0.0, [0.0, 0.0]
-        first = self._frozen(self._targets, system.t0, x0)
-        last = self._frozen(self._targets, system.t1, x1)
-        for term in self._targets:
+        for term in system.active.pushing:
+            for x, time in ((x0, system.t0), (x1, system.t1)):
+                work += 0.5 * term.work(x, time, system.t0, system.t1)
+        turning = [term for term in self._targets if term not in system.active.pushing]
+        first = self._frozen(turning, system.t0, x0)
+        last = self._frozen(turning, system.t1, x1)
+        for term in turning:
             at = [[float(term.energies(x, f[term]).sum()) for f in (first, last)] for x in (x0, x1)]
             rise += at[1][1] - at[0][0]
             work += 0.5 * (at[0][1] - at[0][0] + at[1][1] - at[1][0])
@@ -268,7 +272,8 @@ class EnergyGuard:
         """Whether a step may stand; then it is remembered. The same on all ranks; collective."""
         new = self._with(step)
         over = self._system.integrator.judged_over
-        of_step = math.fsum(new.recent[-over:]) / min(over, len(new.recent))
+        # a step that makes none of it would make none either if it were shorter
+        of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self.gain = of_step, of_steps, new.scale
         good = of_step <= max(LARGEST_GAIN * new.scale, step.noise)

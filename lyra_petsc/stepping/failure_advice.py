@@ -123,9 +123,12 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
 
 def more_room(meets: NearPair, scene: Scene) -> str:
     """What to change where two parts meet that may not."""
-    moves = bool(meets.obstacle) and bool((scene.obstacles or {})[meets.obstacle].motion)
-    who = f"obstacles.{meets.obstacle}.motion" if moves else "the motions of handles and obstacles"
-    return f"more room for the sheet: {who} must leave it some"
+    moving = [name for name, obstacle in (scene.obstacles or {}).items() if obstacle.motion]
+    named = [meets.obstacle] if meets.obstacle in moving else moving
+    who = [f"obstacles.{name}.motion" for name in named]
+    if meets.obstacle not in moving and (not who or any(handle.motion for handle in scene.handles)):
+        who.append("the motions of handles")
+    return f"more room for the sheet: {' and '.join(who)} must leave it some"
 
 
 def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:

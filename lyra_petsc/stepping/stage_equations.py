@@ -215,6 +215,9 @@ class StageEquations:
             follower.start_from(acceleration)
         n = self.points.n_owned
         self.stage = stage = self.integrator.stage(self.x[:n], self.v[:n], self.dt)
+        if self.watches_impacts:
+            terms = self.active.limiting
+            self._stored = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
         self.history = self.v[:n].copy() if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
@@ -330,6 +333,11 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
+        if self.watches_impacts:
+            from lyra_petsc.stepping.impacts import surplus  # of no use elsewhere
+
+            left = self.integrator.surplus
+            self.integrator.surplus = surplus(self, self._stored, before, left)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
@@ -428,6 +436,11 @@ class StageEquations:
         """Gradient (n_owned, 3) [N] of the energy of ``terms``, all without targets, at x (n_local, 3)."""
         return self._sum(terms, x) if self.active.moving else self._internal(x)
 
+    def pushed(self) -> float:
+        """Work [J] in the step of what pushes this rank's elements, by its forces at the stage."""
+        at = self.t0 + self.stage.after if self.integrator.moves else self.t1
+        return sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
+
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""
         if self.stage.after == self.dt or not (self.active.moving or self.active.constraints):
@@ -435,6 +448,11 @@ class StageEquations:
         before = self.active.moving_energy(self.x)
         self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t1, self.x, self.reference.at))
         return self.active.moving_energy(self.x) - before
+
+    @property
+    def watches_impacts(self) -> bool:
+        """Whether what contact adds to the energy is known and taken back; not so where obstacles move."""
+        return self.integrator.by_stage and bool(self.active.limiting) and not self.active.pushing
 
     @property
     def limits_steps(self) -> bool:
@@ -479,30 +497,58 @@ class StageEquations:
     def may_move(self) -> bool:
         """Whether the sheet can go where the step's solve may start, while obstacles go theirs; collective.
 
-        What is prescribed goes where it shall; all else stays, or goes on as it did.
+        What is prescribed goes where it shall; all else stays, or goes on as it did; at last also but for
+        what obstacles take along.
         """
         here = self.velocity_of_staying()
-        for v in [here] if self.integrator.lagged_loads else [here, self.v[: len(here)]]:
-            self.prescribe(there := v.copy())
+        lagged, refused = self.integrator.lagged_loads, None
+        ways = [here] if lagged else [here, self.v[: len(here)]]
+        tried = [(v, False) for v in ways]
+        if self.active.pushing and not lagged:
+            tried += [(v, True) for v in ways]
+        for v, carried in tried:
+            there = here + self._carried(here, v - here) if carried else v.copy()
+            self.prescribe(there)
             if self._may_go(here, there - here):
                 self.refused_way, self._may_begin = None, there
                 return True
+            refused = refused or self.refused_way  # of staying: then what moves is in the way
+        self.refused_way = refused
         return False
 
-    def _may_go(self, v: Array, way: Array) -> bool:
-        """Whether the sheet can go from velocities v by ``way`` (n_owned, 3) while obstacles go theirs."""
-        gone = 0.0
+    def _carried(self, v: Array, way: Array) -> Array:
+        """Ways (n_owned, 3) [m/s] from v like ``way``, but that obstacles take along what is in their way;
+        collective.
+        """
+        n = len(way)
+        for _ in range(SEARCHES):
+            x, ahead = self._ahead(v, way)
+            taken = ahead
+            for term in self.active.pushing:
+                taken = term.carried(x, taken, self.active.frozen[term])
+            change = taken[:n] != ahead[:n]
+            if not self.points.comm.allreduce(bool(change.any()), MPI.LOR):
+                break
+            way = np.where(change, taken[:n] / self.stage.reach, way)
+        return way
+
+    def _may_go(self, v: Array, way: Array, *, after: bool = False) -> bool:
+        """Whether the sheet can go from velocities v by ``way`` (n_owned, 3) while obstacles go theirs.
+
+        To the stage, or ``after`` it to the end of the step.
+        """
+        gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
             x, ahead = self._ahead(v + gone * way, (1.0 - gone) * way)
             seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
-            part = Part(gone, 1.0 if seen == 1.0 else gone + seen * (1.0 - gone))
+            part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
             free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
             if not self._least_of(float(all(free))):
                 break
             if seen == 1.0:
                 return True
-            gone = part.end
+            gone = part.end - begin
         self.refused_way = RefusedWay(x.copy(), ahead, part)
         return False
 
@@ -517,11 +563,7 @@ class StageEquations:
         if self.integrator.lagged_loads:  # one linear solve has found it
             v = self.velocity_of_staying()
         way = (end - self.evaluate_at(v)[0][:n]) / self.stage.reach
-        if self.largest_step(v, way) == 1.0:
-            return True
-        x, ahead = self._ahead(v, way)
-        self.refused_way = RefusedWay(x.copy(), ahead, Part(1.0, 1.0))
-        return False
+        return self._may_go(v, way, after=True)
 
     # -- what Newton asks for ----------------------------------------------------------------------
 

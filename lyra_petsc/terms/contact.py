@@ -11,7 +11,7 @@ moves points so far that pairs might meet which the last search did not see.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,8 +41,11 @@ KEPT = 0.2
 PARALLEL = 1e-3
 """Squared sine of the angle of two edges below which they count as nearly parallel."""
 
-HALFWAY = 6.386
-"""b″ / k in the middle of the gap: 2 ln 2 + 5."""
+BULGE = 0.1
+"""How far, over the gap, what turns near a sheet may leave the straight way that it is taken to go."""
+
+HALFWAY = 14.0
+"""b″ / k in the middle of the gap."""
 
 STRAIN = 0.01
 """Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
@@ -72,12 +75,16 @@ class Places(NamedTuple):
 
     Attributes
     ----------
-    before, now : (m, 3)
-        At the start of a step, and at its stage.
+    before, now, after : (m, 3)
+        At the start of a step, at its stage and at its end.
+    moved : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle up to the stage.
     """
 
     before: Array
     now: Array
+    after: Array
+    moved: list[tuple[Array, Array]]
 
 
 class Meeting(NamedTuple):
@@ -150,6 +157,20 @@ class Obstacles:
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
 
+    def bulges(self, start: float, end: float) -> Array:
+        """How far [m] points of each leave their straight ways between two times [s], (obstacles,)."""
+        times, found = np.linspace(start, end, 9), np.zeros(len(self.each))
+        for number, each in enumerate(self.each):
+            if each.motion is not None:
+                first, *between, last = (each.positions(time) for time in times)
+                way = last - first
+                square = np.maximum(np.sum(way * way, axis=1, keepdims=True), np.finfo(float).tiny)
+                for at in between:
+                    part = np.clip(np.sum((at - first) * way, axis=1, keepdims=True) / square, 0.0, 1.0)
+                    off = np.linalg.norm(at - first - part * way, axis=1).max(initial=0.0)
+                    found[number] = max(found[number], float(off))
+        return found
+
     def moved(self, start: float, end: float) -> list[tuple[Array, Array]]:
         """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
         found = []
@@ -177,7 +198,7 @@ class ContactBarrier(Elastic):
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
-        self._places = np.empty((2, 0, 3))
+        self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
         self._meeting = Remembered(self._meet)
 
@@ -190,7 +211,8 @@ class ContactBarrier(Elastic):
         self.skin = barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.unseen = barrier.gap + self.skin
-        self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 2)
+        self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
+        self._bulge = np.zeros(1)
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
@@ -204,9 +226,10 @@ class ContactBarrier(Elastic):
     # -- obstacles ---------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> Places:
-        places = Places(self.obstacles.at(step.start), self.obstacles.at(step.at))
-        self._swept = np.stack(places)
-        return places
+        before, now, after = (self.obstacles.at(time) for time in (step.start, step.at, step.end))
+        self._swept = np.stack([before, now, after])
+        self._bulge = self.obstacles.bulges(step.start, step.end) if self.moving else np.zeros(1)
+        return Places(before, now, after, self.obstacles.moved(step.start, step.at))
 
     @property
     def moving(self) -> bool:
@@ -236,10 +259,13 @@ class ContactBarrier(Elastic):
         """Rows of those pairs that may come within the search distance on their ways."""
         points, found = points.astype(np.int64), np.empty(len(points))
         kinds = np.full(len(points), kind)
-        reach = self.search_distance + self.obstacles.radius[obstacle]
-        theirs = self._places[1] - self._places[0]
+        reach = self.search_distance + self.obstacles.radius[obstacle] + self._bulge.max()
+        _, now, after = self._places - self._places[0]
+        farther = np.linalg.norm(after, axis=1) > np.linalg.norm(now, axis=1)
+        theirs = np.where(farther[:, None], after, now)
         contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
-        return np.column_stack([kinds, obstacle, points])[found < reach]
+        nearer: Ints = np.column_stack([kinds, obstacle, points])[found < reach]
+        return nearer
 
     def _at_obstacles(self, x: Array, way: Array) -> list[Ints]:
         """Pairs with obstacles, wherever on their way in the step these are near."""
@@ -250,7 +276,7 @@ class ContactBarrier(Elastic):
             if not len(others):
                 return
             places = self._places[:, others[:, :size]]
-            reach = (self.search_distance + of.radius[others[:, 3]])[:, None]
+            reach = (self.search_distance + of.radius[others[:, 3]] + self._bulge.max())[:, None]
             boxes = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
             corners = sheet.of(np.unique(near(patches, boxes)[:, 0]))
             pairs = near(swept_boxes(x, way, corners), boxes)
@@ -272,7 +298,7 @@ class ContactBarrier(Elastic):
                     for places in self._places:
                         distance = np.empty(len(points))
                         contact_pairs.distances(at, places, rows[:, 0], rows[:, 2:], distance)
-                        close |= distance - of.radius[obstacle] < self.search_distance
+                        close |= distance - of.radius[obstacle] < self.search_distance + self._bulge.max()
                 found.append(rows[close])
         return found
 
@@ -342,6 +368,9 @@ class ContactBarrier(Elastic):
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
     def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
+        bent = np.flatnonzero(self._bulge > BULGE * self.barrier.gap)
+        if len(bent) and np.isin(self.obstacle, bent).any():
+            return False
         pairs = self.kind, self.points, self.offset
         return bool(contact_pairs.free_way(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
 
@@ -367,16 +396,48 @@ class ContactBarrier(Elastic):
         name = self.obstacles.each[number].name if number >= 0 else ""
         return Pair(tuple(part for part in parts if min(part) >= 0), name, self.barrier.thickness)
 
-    def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
-        out, met = np.zeros((count, 6)), self.meeting(x, frozen.now)
+    def _pushed(self, x: Array, places: Array) -> Iterator[tuple[int, Array]]:
+        """Obstacles, and the forces (n_local, 3) [N] of the sheets on each by the counted pairs."""
+        met = self.meeting(x, places)
         number = self.obstacle[met.at]
         for obstacle in np.unique(number[number >= 0]):
             of = np.flatnonzero((number == obstacle) & (met.counted > 0.0))
-            gradient, pull = np.zeros_like(x), np.zeros_like(frozen.now)
-            pairs = self.pairs(met, of)
-            contact_pairs.add_gradient(x, frozen.now, *pairs, met.counted[of], gradient, pull)
-            out[obstacle] = *gradient.sum(axis=0), *np.cross(x, gradient).sum(axis=0)
+            gradient, pull = np.zeros_like(x), np.zeros_like(places)
+            contact_pairs.add_gradient(x, places, *self.pairs(met, of), met.counted[of], gradient, pull)
+            yield int(obstacle), gradient
+
+    def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
+        out = np.zeros((count, 6))
+        for obstacle, force in self._pushed(x, frozen.now):
+            out[obstacle] = *force.sum(axis=0), *np.cross(x, force).sum(axis=0)
         return out
+
+    pushes = True
+
+    def work(self, x: Array, at: float, start: float, end: float) -> float:
+        back, on, done = self.obstacles.moved(at, start), self.obstacles.moved(at, end), 0.0
+        for obstacle, force in self._pushed(x, self.obstacles.at(at)):
+            (turn, way), (further, there) = back[obstacle], on[obstacle]
+            done -= float(np.vdot(force, x @ (further - turn).T + there - way))
+        return done
+
+    def carried(self, x: Array, way: Array, frozen: Places) -> Array:
+        if not self.moving:
+            return way
+        pairs, free = (self.kind, self.points, self.offset), np.empty(self.n_elements)
+        contact_pairs.free_ways(x, *_during(frozen, Part(0.0, 1.0), way), *pairs, KEPT, free)
+        taken = way.copy()
+        for number, (turn, there) in enumerate(frozen.moved):
+            with_it = x @ turn.T + there - x
+            points = self.points[(free < 1.0) & (self.obstacle == number)]
+            points = np.unique(points[points >= 0])
+            taken[points] = with_it[points]
+        blocked = (free < 1.0) & (self.obstacle < 0)
+        for points in self.points[blocked]:  # sheets push each other
+            pushed = (taken[points] != way[points]).any(axis=1)
+            if pushed.any():
+                taken[points[~pushed]] = taken[points[pushed]][0]
+        return taken
 
     def touching(self, x: Array, places: Array) -> tuple[NDArray[Any], ...]:
         """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of all pairs that touch."""
@@ -385,6 +446,10 @@ class ContactBarrier(Elastic):
         of, least = (self.kind, self.points, self.offset, gap), self.meeting(x, places).least
         met = contact_pairs.touching(x, places, *of, *others, least, *found)
         return tuple(part[:met] for part in found)
+
+    def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array]:
+        beta, normal, force, at = self.touching(x, frozen.now)
+        return self.points[at], beta, normal, force
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
@@ -403,7 +468,11 @@ class ContactBarrier(Elastic):
 
 def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array]:
     """Where obstacles' points stand at the start of a part of the step, the sheets' way, and theirs in it."""
-    (begin, end), moved = part, frozen.now - frozen.before
+    begin, end = part
+    if begin >= 1.0:
+        moved = frozen.after - frozen.now
+        return frozen.now + (begin - 1.0) * moved, way, (end - begin) * moved
+    moved = frozen.now - frozen.before
     return frozen.before + begin * moved, way, (end - begin) * moved
 
 

@@ -8,10 +8,11 @@ s = ½ |g|² are, as s is least over the t_k::
     ∂s/∂p_i = β_i g
     ∂²s/∂p_i∂p_j = β_i β_j I − Σ_kl A⁻¹_kl (β_i e_k + γ_ki g)(β_j e_l + γ_lj g)ᵀ
 
-Barrier, of δ = |g| − offset (Li, Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang & Kaufman, Incremental
-potential contact, ACM Trans. Graph. 39 (2020) 49)::
+Barrier, of δ = |g| − offset (as in Li, Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang & Kaufman,
+Incremental potential contact, ACM Trans. Graph. 39 (2020) 49, but for their logarithm, which grows so slowly
+that what is fast comes to rest only where no distance is left)::
 
-    b(δ) = −k (δ − gap)² ln(δ / gap)  for 0 < δ < gap, 0 beyond, infinite at δ ≤ 0
+    b(δ) = k (gap − δ)³ / δ  for 0 < δ < gap, 0 beyond, infinite at δ ≤ 0
 
 The nearest points of parallel edges are not unique. Energies of pairs of edges u and v at an angle θ have the
 factor m = c (2 − c), c = sin² θ / parallel up to 1, with which forces stay continuous; where they lie side by
@@ -39,6 +40,9 @@ from a segment p1 p2, and their distance is minus |g|. p3 counts for nothing the
 
 CLOSE = 0.1
 """Part of the way to the least distance that continuous collision detection may leave."""
+
+ADVANCES = 1000
+"""Of it in one way, at most: where ways are long and go past each other, each advance is short."""
 
 PARALLEL = 1e-12
 """Squared sine of the angle of two edges, or sides of a triangle, below which they count as parallel."""
@@ -253,9 +257,8 @@ def _load(x, others, points, e, p):  # type: ignore[no-untyped-def]
 @kernel(inline="always")
 def barrier(delta, gap):  # type: ignore[no-untyped-def]
     """b / k of 0 < δ < gap and its first two derivatives."""
-    less, log = delta - gap, math.log(delta / gap)
-    ratio = less / delta
-    return -less * less * log, -less * (2.0 * log + ratio), -2.0 * log - 4.0 * ratio + ratio * ratio
+    left, part = gap - delta, gap / delta
+    return left**3 / delta, left * left * (-2.0 - part) / delta, 2.0 * (part**3 - 1.0)
 
 
 @kernel(inline="always")
@@ -638,7 +641,9 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, mo
             return 0.0
         least, enough, t = keep * left, (1.0 - keep) * CLOSE * left, 0.0
         # each advance is shorter than what is left of the way to the least distance
-        while left - least > enough:
+        advances = 0
+        while left - least > enough and advances < ADVANCES:
+            advances += 1
             t += (left - least) / pace
             if t >= most:
                 break

@@ -85,7 +85,9 @@ class UpcomingStep:
 
 
 class Part(NamedTuple):
-    """A part of the time up to a step's stage, as fractions of it; both 1: obstacles stand there."""
+    """A part of a step, as fractions of the time up to its stage, and from 1 to 2 of that to its end; both 1:
+    obstacles stand at the stage.
+    """
 
     begin: float
     end: float
@@ -197,6 +199,9 @@ class Elastic(Term):
     surface: NDArray[np.int32] | None = None
     """Triangles (F, 3), in local rows, among which ``neighbours`` looks; None where points do."""
 
+    pushes: bool = False
+    """Whether what moves works by its forces (`work`), as its motion alone may make the energy infinite."""
+
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
 
@@ -307,6 +312,24 @@ class Elastic(Term):
         elements, (count, 6); None of a term that knows none.
         """
         return None
+
+    def work(self, x: Array, at: float, start: float, end: float) -> float:
+        """Work [J] that what moves does on this rank's elements on its way from one time [s] to another.
+
+        By the forces at positions x (n_local, 3) where it stands at time ``at``; of a term that ``pushes``.
+        """
+        raise NotImplementedError
+
+    def touching_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array]:
+        """What touches at positions x (n_local, 3): points (m, 4), below 0 those of obstacles, their
+        barycentric coordinates β (m, 4), unit normals (m, 3) towards the first, and normal forces (m,) [N].
+        """
+        nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
+        return *nothing, np.empty(0)
+
+    def carried(self, x: Array, way: Array, frozen: Any) -> Array:
+        """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""
+        return way
 
     def begin(self, x: Array) -> None:
         """The run begins at positions x (n_local, 3); for terms that have a state."""

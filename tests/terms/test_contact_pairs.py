@@ -330,6 +330,14 @@ def test_a_common_motion_of_both_is_free() -> None:
         assert pairs.free_way(way, others_way) == 1.0
 
 
+def test_long_ways_past_each_other_are_judged_at_once() -> None:
+    pairs = among_sheets(VERTEX_TRIANGLE, 50)
+    pairs = pairs.part(pairs.distances() > pairs.offset)
+    way = np.zeros_like(pairs.x)
+    way[:, 0] = 1e12 * (1.0 + np.arange(len(way)) % 2)
+    assert 0.0 <= pairs.free_way(way, np.zeros_like(pairs.others)) < 1.0
+
+
 def test_planes_that_turn() -> None:
     """The normal at a fraction of the way is that of straight ways of both its ends."""
     pairs = planes(200)

@@ -105,6 +105,10 @@ class Integrator(Forgetful, ABC):
     judged_over : int
         Steps over which its gain of energy is averaged before it is judged: a scheme of several steps gives
         back in the next ones what it has taken in one.
+    by_stage : bool
+        Kinetic energy changes by just the work of the stage's forces, so that it is known what contact adds.
+    surplus : float
+        Energy [J] that it has added and not yet lost again, where that is known.
     given : bool
         Prescribed coordinates take part in the stage with their exact position and velocity at its
         time; else with the velocity that the integrator gives them for their position at the end.
@@ -117,6 +121,8 @@ class Integrator(Forgetful, ABC):
     moves: ClassVar[bool] = True
     centred: ClassVar[bool] = False
     judged_over: ClassVar[int] = 1
+    by_stage: ClassVar[bool] = False
+    surplus: float = 0.0
     given: bool = False
 
     @property

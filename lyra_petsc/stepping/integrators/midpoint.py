@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
+from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
 
 Array = NDArray[np.float64]
 
@@ -19,6 +21,10 @@ class Midpoint(Integrator):
     ts_type = "theta"
     centred = True
     given = True
+    by_stage = True
+
+    def __init__(self) -> None:
+        self.surplus = 0.0
 
     def stage_after(self, dt: float) -> float:
         return 0.5 * dt
@@ -28,3 +34,9 @@ class Midpoint(Integrator):
 
     def end(self, x: Array, v: Array, stage_velocity: Array, dt: float) -> tuple[Array, Array]:
         return x + dt * stage_velocity, 2.0 * stage_velocity - v
+
+    def memory(self) -> tuple[Arrays, dict[str, float]]:
+        return {}, {"surplus": self.surplus}
+
+    def restore(self, arrays: Mapping[str, Array], numbers: Mapping[str, float]) -> None:
+        self.surplus = numbers.get("surplus", 0.0)
