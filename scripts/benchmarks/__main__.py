@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import itertools
 import json
 import signal
 import sys
@@ -12,13 +13,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import measures
+from cases import BENDING_MESHES
 from peers import parse
 from processes import Failed, Limits
 from tables import document
 
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.cli.arguments import split
-from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.errors import InputError, OutputError, nearest
 from lyra_petsc.output.atomic import replace_text
 
 DEFAULT = {"vertices": [1024, 10201, 50176], "weak": 25_000, "output": 200_000}
@@ -49,7 +51,7 @@ def numbers(text: str) -> list[int]:
 
 def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     parser = Parser(prog="scripts/bench", description=__doc__, allow_abbrev=False)
-    add = parser.add_argument
+    add, meshes = parser.add_argument, " ".join(BENDING_MESHES)
     add("--quick", action="store_true", help="smaller and shorter, within two minutes")
     add("--out", type=Path, default=Path("bench"), metavar="DIR", help="where the two files go (bench)")
     add("--vertices", type=numbers, nargs="+", metavar="N", help="sizes of the rows (1024,10201,50176)")
@@ -61,6 +63,7 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--growth", type=numbers, nargs="*", metavar="N", help=f"further sizes to fit growth ({GROWTH})")
     add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
     add("--contact", action="store_true", help="also sheets in contact, for a second and more")
+    add("--bending", nargs="*", metavar="MESH", help=f"also directors on edges beside hinges, on {meshes}")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
     add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
@@ -79,6 +82,11 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     )
     if asked.limits.steps < 1 or min(asked.limits.seconds, asked.limits.process) <= 0.0 or asked.weak < 0:
         raise InputError("--steps must be at least 1, --seconds and --limit above 0, --weak at least 0")
+    if asked.bending is not None:
+        for kind in asked.bending:
+            if kind not in BENDING_MESHES:
+                raise InputError(f"unknown mesh {kind!r}, {nearest(kind, BENDING_MESHES)}", key="--bending")
+        asked.bending = asked.bending or list(BENDING_MESHES)
     if asked.presets is not None:
         asked.presets = measures.preset_names(asked.presets)
     return asked
@@ -157,6 +165,8 @@ class Bench:
         self._growth()
         if asked.presets is not None:
             self._presets()
+        if asked.bending is not None:
+            self._bending()
         if asked.contact:
             self._contact()
         if not asked.only_rows:
@@ -210,6 +220,15 @@ class Bench:
                     ),
                 ),
             )
+
+    def _bending(self) -> None:
+        asked = self._asked
+        for kind, method, ranks, vertices in itertools.product(
+            asked.bending, measures.METHODS, asked.ranks, asked.vertices
+        ):
+            what = f"{vertices} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
+            row = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits
+            self._add("bending", self._attempt(what, lambda row=row: measures.bending(*row)))
 
     def _contact(self) -> None:
         asked = self._asked

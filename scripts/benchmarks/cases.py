@@ -60,6 +60,9 @@ GRADED_MESH = "gmsh 1:20"
 MESHES = ("diagonal", "alternating", "criss-cross", "gmsh", GRADED_MESH, "diagonal, midedge", "gmsh, midedge")
 """Kinds of triangles that the square is cut into, the first that of all other measurements; bending model."""
 
+BENDING_MESHES = ("diagonal", "alternating", "gmsh")
+BENDING_MODELS = ("hinge", "midedge")
+
 GRADED = 20.0
 """Largest over smallest edge of graded meshes."""
 

@@ -13,7 +13,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from cases import MESHES, METHODS, STEP, hanging_square, in_contact, on_mesh, small_sheet, square_number
+from cases import (
+    BENDING_MODELS,
+    MESHES,
+    METHODS,
+    STEP,
+    hanging_square,
+    in_contact,
+    on_mesh,
+    small_sheet,
+    square_number,
+)
 from peers import measure_peer
 from processes import Limits, measure, run
 from tables import growth
@@ -88,6 +98,23 @@ def meshes(vertices: int, ranks: int, petsc: Sequence[str], folder: Path, limits
     with _scratch(folder) as scratch:
         scenes = {kind: on_mesh(kind, vertices, scratch) for kind in MESHES}
         return measure("meshes", ranks, petsc, len(MESHES) * limits.process, scenes=scenes, **few)
+
+
+def bending(
+    kind: str, vertices: int, method: str, ranks: int, petsc: Sequence[str], folder: Path, limits: Limits
+) -> Result:
+    """Steps of the square on a kind of mesh with either bending model, by turns; memory of each alone."""
+    few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": 2.0 * limits.seconds}
+    with _scratch(folder) as scratch:
+        scenes = {model: on_mesh(f"{kind}, {model}", vertices, scratch) for model in BENDING_MODELS}
+        for scene in scenes.values():
+            scene["time"]["integrator"] = method
+        found = measure("meshes", ranks, petsc, 2.0 * limits.process, scenes=scenes, **few)
+        few = {"warm_up": 1, "steps": 1, "seconds": 1.0}
+        for model, scene in scenes.items():
+            alone = measure("steps", ranks, petsc, limits.process, scene=scene, **few)
+            found["meshes"][model]["peak_bytes"] = sum(alone["peak_bytes"])
+    return found | {"mesh": kind, "who": method, "ranks": ranks}
 
 
 def contact(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from cases import METHODS
+from cases import BENDING_MODELS, METHODS
 
 Result = dict[str, Any]
 
@@ -189,6 +189,50 @@ def meshes_table(results: Sequence[Result]) -> list[str]:
     return [*table(head, rows), "", f"Worst: {where}, {number(ratio)} times the time a vertex of {first}."]
 
 
+def bending_table(results: Sequence[Result]) -> list[str]:
+    """Directors on edges over hinges, in time and memory; CG iterations of a step, and their growth."""
+    rows: list[list[str]] = []
+    least: dict[tuple[str, str, int], float] = {}
+    for result in results:
+        hinge, midedge = (result["meshes"][model] for model in BENDING_MODELS)
+        pairs = list(zip(hinge["steps"], midedge["steps"], strict=True))
+        cg = [statistics.mean(step["cg"] for step in found["steps"]) for found in (hinge, midedge)]
+        first = least.setdefault((result["mesh"], result["who"], result["ranks"]), cg[1])
+        rows.append(
+            [
+                str(midedge["vertices"]),
+                result["mesh"],
+                result["who"],
+                str(result["ranks"]),
+                spread([1e3 * step["cpu"] for step in midedge["steps"]]),
+                *(
+                    number(statistics.median(two[key] / one[key] for one, two in pairs))
+                    for key in ("cpu", "seconds")
+                ),
+                ", ".join(number(each) for each in cg),
+                number(cg[1] / first),
+                ", ".join(number(median_of(found, "newton")) for found in (hinge, midedge)),
+                number(midedge["peak_bytes"] / hinge["peak_bytes"]),
+                f"{hinge['preset']}, {midedge['preset']}",
+            ]
+        )
+    head = (
+        "vertices",
+        "mesh",
+        "who",
+        "ranks",
+        "CPU ms a step, midedge",
+        "CPU, times hinge",
+        "wall, times hinge",
+        "CG iterations of both",
+        "growth",
+        "Newton iterations of both",
+        "memory, times hinge",
+        "presets",
+    )
+    return table(head, rows)
+
+
 def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
     """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
     x = np.log([row["vertices"] for row in rows])
@@ -317,6 +361,8 @@ def document(results: Result) -> str:
         lines += [*main_table(results["rows"]), ""]
     if results.get("meshes"):
         lines += ["## Other meshes, and directors on edges", "", *meshes_table(results["meshes"]), ""]
+    if results.get("bending"):
+        lines += ["## Directors on edges beside hinges", "", *bending_table(results["bending"]), ""]
     if results.get("contact"):
         lines += ["## Contact", "", *contact_table(results["contact"]), ""]
     if "growth" in results:

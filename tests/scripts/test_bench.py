@@ -12,7 +12,7 @@ import pytest
 from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
 from peers import write_files, write_scene
 from processes import Failed, run
-from tables import COLUMNS, document, exponent, growth, meshes_table, number, spread
+from tables import COLUMNS, bending_table, document, exponent, growth, meshes_table, number, spread
 
 from lyra_petsc.api.mpirun import environment
 from lyra_petsc.mesh.build import build_mesh
@@ -232,6 +232,29 @@ def test_the_worst_mesh_is_named():
     large = {"meshes": {"diagonal": found(1000, 10.0), "gmsh": found(1000, 11.0)}}
     lines = meshes_table([small, large])
     assert lines[-1] == "Worst: gmsh, 110 vertices, 1.20 times the time a vertex of diagonal."
+
+
+def test_directors_are_shown_beside_hinges():
+    def found(vertices: int, cpu: float, cg: int, peak: int) -> dict:
+        steps = [{"cpu": cpu, "seconds": 2.0 * cpu, "cg": cg, "newton": 1}] * 3
+        return {"vertices": vertices, "preset": "multigrid", "peak_bytes": peak, "steps": steps}
+
+    results = [
+        {
+            "mesh": "gmsh",
+            "who": "beuler",
+            "ranks": 1,
+            "meshes": {"hinge": found(n, 0.1, 7, 100), "midedge": found(n, 0.18, cg, 150)},
+        }
+        for n, cg in ((2500, 5), (50176, 6))
+    ]
+    head, _, first, last = bending_table(results)
+    cells = dict(zip(head.split("|"), last.split("|"), strict=True))
+    found_cells = {name.strip(): cell.strip() for name, cell in cells.items()}
+    assert found_cells["CPU, times hinge"] == found_cells["wall, times hinge"] == "1.80"
+    assert (found_cells["growth"], found_cells["memory, times hinge"]) == ("1.20", "1.50")
+    assert found_cells["CG iterations of both"] == "7.00, 6.00"
+    assert "1.00" in first
 
 
 def row(vertices: int, seconds: float) -> dict:
