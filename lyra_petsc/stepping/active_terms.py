@@ -56,7 +56,7 @@ class ActiveTerms:
         self.frozen = {}  # there is no room for both
         self.frozen = {term: term.freeze(step) for term in (*self.elastic, *self.viscous)}
 
-    def refreeze(self, found: Mapping[Term, Any]) -> None:
+    def refreeze(self, found: Mapping[Any, Any]) -> None:
         """Let terms, and those that follow them, have frozen this."""
         following: dict[Term, Any] = {
             term: found[term.partner] for term in self.elastic if term.partner and term.partner in found

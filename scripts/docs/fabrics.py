@@ -96,7 +96,7 @@ def page(folder: Path) -> None:
         "",
         f"The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, {drape}– where",
         "500 gf/cm are not reached. The law of those that were measured is `measured`; aluminium and paper",
-        "were not. \\* is not that of the material: with so stiff a membrane flat triangles of this size lock.",
+        "were not. \\* is not that of the material: so stiff a membrane locks in flat triangles of this size.",
         "",
         "| cloth | " + " | ".join(columns) + " |",
         "| --- " * (len(columns) + 1) + "|",
