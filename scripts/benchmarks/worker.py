@@ -192,14 +192,14 @@ def meshes(comm: Comm, job: Result) -> Result:
     first, last = now(comm), job["warm_up"] - 1 + job["steps"]
     for number in range(1, last + 1):
         for name, simulation in simulations.items():
-            comm.Barrier()
-            began = time.process_time()
+            first_of, began = now(comm), time.process_time()
             report = simulation.step()
             cpu = comm.allreduce(time.process_time() - began)
+            seconds = now(comm) - first_of
             found[name]["all_cpu"] = found[name].get("all_cpu", 0.0) + cpu
             if number >= job["warm_up"]:
                 iterations = {"cg": report.linear_iterations, "newton": report.newton_iterations}
-                found[name]["steps"].append({"cpu": cpu, **iterations})
+                found[name]["steps"].append({"cpu": cpu, "seconds": seconds, **iterations})
         enough = number >= job["warm_up"] - 1 + FEWEST
         if comm.bcast(time.perf_counter() - first > job["seconds"] and enough):
             break
