@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+TELLING = 6
+"""Of the numbers that go with an element, how many tell it from others with its stencil."""
+
 FEW = 0.1
 """Blocks that are of no use any longer, over all of fixed stencils, up to which they are kept."""
 
@@ -71,6 +74,11 @@ def _free_part(x, way, origin, reach):  # type: ignore[no-untyped-def]
     return least
 
 
+def _marked(triangles: Ints, term: Elastic) -> Ints:
+    """Triangles (F, 3), with a column of what goes with each if a term has that."""
+    return triangles if term.surface_marks is None else np.column_stack([triangles, term.surface_marks])
+
+
 class Discretisation:
     """Local rows and block rows of a scene on a rank.
 
@@ -107,7 +115,7 @@ class Discretisation:
         self._located = False  # whether the pattern has the offsets of the present stencils
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
-        self._found: dict[Elastic, tuple[Ints, Ints]] = {}
+        self._found: dict[Elastic, tuple[Ints, Ints | Array]] = {}
         self._extra = np.empty(0, dtype=np.int64)  # keys of the blocks that ``fixed`` has not
 
     @property
@@ -133,7 +141,7 @@ class Discretisation:
         way = np.zeros_like(x) if ahead is None else ahead
         for term in asked:
             searches = term.search_distance > 0.0
-            self._found[term] = self._search(term, x, way) if searches else term.known()
+            self._found[term] = self._search(term, x, way) if searches else self._sent(*term.known())
         end = layout.start + layout.n_owned
         beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil, _ in self._found.values()]
         more = np.setdiff1d(np.concatenate(beyond), self._fixed_layout.ghosts)
@@ -215,20 +223,23 @@ class Discretisation:
             numbers, moves = self._with_near(own, moves[:n, None], term.search_distance, own >= 0)
             moves = moves[:, 0]
         elif layout.comm.size == 1:
-            numbers, moves, triangles = own, moves[:n], term.surface.astype(np.int64)
+            numbers, moves, triangles = own, moves[:n], _marked(term.surface.astype(np.int64), term)
         else:
-            corners, places = layout.global_number[term.surface], moves[term.surface]
+            corners, places = _marked(layout.global_number[term.surface], term), moves[term.surface]
             mine = term.surface[:, 0] < layout.n_owned  # each triangle is sent once
             # who meets a triangle that reaches out to a ghost counts for its owned vertices, too
             corners, places = self._with_near(corners, places, term.search_distance, mine)
-            _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
+            _, first = np.unique(np.sort(corners[:, :3], axis=1), axis=0, return_index=True)
             corners, places = corners[np.sort(first)], places[np.sort(first)]
+            corners, marks = corners[:, :3], corners[:, 3:]
             others, first = np.unique(corners, return_index=True)
             more = ~np.isin(others, own)
             numbers = np.concatenate([own, others[more]])
             moves = np.concatenate([moves[:n], places.reshape(-1, 2, 3)[first[more]]])
             order = np.argsort(numbers)
-            triangles = order[np.searchsorted(numbers, corners, sorter=order)]
+            triangles = np.concatenate(
+                [order[np.searchsorted(numbers, corners, sorter=order)], marks], axis=1
+            )
         points, ways = np.ascontiguousarray(moves[:, 0]), np.ascontiguousarray(moves[:, 1])
         stencil, what = term.neighbours(points, ways, numbers, triangles)
         touching = (stencil < n).any(axis=1)
@@ -265,7 +276,21 @@ class Discretisation:
             np.concatenate([moves, *(part[1] for part in received)]),
         )
 
-    def _elements(self, stencil: Ints, what: Ints) -> Elements:
+    def _sent(self, stencil: Ints, what: Ints | Array) -> tuple[Ints, Ints | Array]:
+        """Elements by global numbers (E, n) that this rank knows, and what others know of its vertices;
+        collective.
+        """
+        comm, bounds = self.layout.comm, self.layout.bounds
+        if comm.size == 1:
+            return stencil, what
+        owners = np.searchsorted(bounds, stencil, side="right") - 1
+        parts = [(owners == rank).any(axis=1) for rank in range(comm.size)]
+        sent = [None if rank == comm.rank else (stencil[at], what[at]) for rank, at in enumerate(parts)]
+        received = [part for part in comm.alltoall(sent) if part is not None]
+        stencils, whats = zip((stencil, what), *received, strict=True)
+        return np.concatenate(stencils), np.concatenate(whats)
+
+    def _elements(self, stencil: Ints, what: Ints | Array) -> Elements:
         """Elements of rows given by global numbers (E, n), and what goes with them (E, m), in local numbers;
         counted ones come first.
         """
@@ -273,7 +298,7 @@ class Discretisation:
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
         # one order of the elements on any search, so that the same elements are the same stencil
-        order = np.lexsort((*what.T[::-1], *stencil.T[::-1], ~counted))
+        order = np.lexsort((*what.T[:TELLING][::-1], *stencil.T[::-1], ~counted))
         local = layout.local(stencil[order].ravel()).reshape(stencil.shape).astype(np.int32)
         return Elements(
             local,

@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 FARTHEST_TURN = 0.5
 """Angle [rad] by which a Newton iteration of a static analysis may turn a director."""
 
-SEARCHES = 16
+SEARCHES = 40
 """For what is near, at most, on the way of a Newton iteration or of handles in a step."""
 
 LEAST = 1e-10

@@ -23,7 +23,7 @@ from lyra_petsc.mesh.measures import edge_lengths
 from lyra_petsc.mesh.near import near, swept_boxes
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms import contact_pairs
+from lyra_petsc.terms import contact_pairs, surface_shares
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.contact_search import SheetSearch, Simplices
 from lyra_petsc.terms.remembered import Remembered
@@ -46,6 +46,14 @@ BULGE = 0.1
 
 HALFWAY = 14.0
 """b″ / k in the middle of the gap."""
+
+EDGES = 0.3
+"""Part of the gap below which two edges of sheets feel each other. Sheets that lie on each other are held by
+pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to what these do not.
+"""
+
+SKIN = 0.5
+"""Over the gap, how far points may come nearer to each other between two searches."""
 
 STRAIN = 0.01
 """Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
@@ -94,7 +102,7 @@ class Meeting(NamedTuple):
     ----------
     least : (E,)
         What the distance of each pair less its offset [m] is not below.
-    at, weight, counted, beta, energy : (m,), (m, 4) of β
+    at, weight, counted, beta, energy, felt : (m, …)
         Of those found, as `contact_pairs.meeting` gives them.
     """
 
@@ -104,6 +112,7 @@ class Meeting(NamedTuple):
     counted: Array
     beta: Array
     energy: Array
+    felt: Array
 
 
 class Obstacles:
@@ -111,8 +120,9 @@ class Obstacles:
 
     Attributes
     ----------
-    triangles, edges, points, planes, segments : (n, 4)
-        Numbers of the points, the last column that of the obstacle. Planes are a point and a normal.
+    triangles, edges, points, planes, segments : (n, 5)
+        Numbers of the points, that of the obstacle, what is around a triangle (`surface_shares.rings`).
+        Planes are a point and a normal.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
     """
@@ -128,7 +138,8 @@ class Obstacles:
 
             def rows(of: Ints, number: int = number, first: int = first) -> Ints:
                 filled = np.concatenate([of, np.repeat(of[:, :1], 3 - of.shape[1], axis=1)], axis=1)
-                return np.column_stack([filled + first, np.full(len(of), number)])
+                rings = surface_shares.rings(of) if of.shape[1] == 3 else np.zeros(len(of), dtype=np.int64)
+                return np.column_stack([filled + first, np.full(len(of), number), rings])
 
             if isinstance(obstacle, Solid):
                 radius[number] = obstacle.radius
@@ -142,7 +153,7 @@ class Obstacles:
                 radius[number] = -obstacle.radius
                 parts["segments"].append(rows(np.array([[0, n - 1]])))
             first += n
-        empty = np.empty((0, 4), dtype=np.int64)
+        empty = np.empty((0, 5), dtype=np.int64)
         self.triangles, self.edges, self.points, self.planes, self.segments = (
             np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
         )
@@ -190,14 +201,18 @@ class ContactBarrier(Elastic):
         Triangles of this rank, in local rows.
     uv : (F, 3, 2)
         Material coordinates [m] of their corners.
+    rings : (F,)
+        What is around them, as `surface_shares.rings` has it.
     """
 
-    def __init__(self, surface: NDArray[np.int32], uv: Array) -> None:
-        empty = {"what": np.empty((0, 6)), "number": np.empty((0, 4))}
+    def __init__(self, surface: NDArray[np.int32], uv: Array, rings: Ints) -> None:
+        empty = {"what": np.empty((0, 7)), "number": np.empty((0, 4))}
         self.obstacles, self.itself = Obstacles([]), True
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
+        self.surface_marks = rings
+        self._room = 0
         self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
         self._meeting = Remembered(self._meet)
@@ -208,19 +223,22 @@ class ContactBarrier(Elastic):
         ``itself`` says whether sheets meet sheets.
         """
         self.barrier, self.obstacles, self.itself = barrier, Obstacles(obstacles), itself
-        self.skin = barrier.gap
+        self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
-        self.unseen = barrier.gap + self.skin
+        self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
         self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
         self._bulge = np.zeros(1)
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
-        what = elements.data["what"].astype(np.int64)
+        what = elements.data["what"].reshape(-1, 7).astype(np.int64)
         self.number = elements.data["number"].astype(np.int64)
         self.kind, self.obstacle = np.ascontiguousarray(what[:, 0]), what[:, 1]
-        self.points = np.where(what[:, 2:] < 0, what[:, 2:], self.stencil)
+        self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
+        self.shares = surface_shares.shares(what[:, 6])
+        between = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
+        self.gap = np.where(between, EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
 
     # -- obstacles ---------------------------------------------------------------------------------
@@ -244,18 +262,20 @@ class ContactBarrier(Elastic):
 
     def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
         self._places = self._swept
-        self._sheets.take(x, numbers, triangles)
-        found = [np.empty((0, 6), dtype=np.int64), *self._at_obstacles(x, way)]
+        self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
+        found = [np.empty((0, 7), dtype=np.int64), *self._at_obstacles(x, way)]
         if self.itself:
-            found.append(self._sheets.pairs(x, way, numbers, self.search_distance))
+            reach = self.search_distance
+            edges = reach - (1.0 - EDGES) * self.barrier.gap
+            found.append(self._sheets.pairs(x, way, numbers, reach, edges))
         every = np.concatenate(found)
-        kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:]
+        kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
-        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points)])
+        what = np.column_stack([kind, obstacle, np.where(sheet, 0, points), every[:, 6]])
         return np.where(sheet, points, first[:, None]), what
 
-    def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints) -> Ints:
+    def _nearer(self, x: Array, way: Array, kind: int, obstacle: Ints, points: Ints, rings: Ints) -> Ints:
         """Rows of those pairs that may come within the search distance on their ways."""
         points, found = points.astype(np.int64), np.empty(len(points))
         kinds = np.full(len(points), kind)
@@ -264,7 +284,7 @@ class ContactBarrier(Elastic):
         farther = np.linalg.norm(after, axis=1) > np.linalg.norm(now, axis=1)
         theirs = np.where(farther[:, None], after, now)
         contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
-        nearer: Ints = np.column_stack([kinds, obstacle, points])[found < reach]
+        nearer: Ints = np.column_stack([kinds, obstacle, points, rings])[found < reach]
         return nearer
 
     def _at_obstacles(self, x: Array, way: Array) -> list[Ints]:
@@ -282,7 +302,8 @@ class ContactBarrier(Elastic):
             pairs = near(swept_boxes(x, way, corners), boxes)
             mine, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
-            found.append(self._nearer(x, way, kind, others[pairs[:, 1], 3], points))
+            rings = others[pairs[:, 1], 4] if sheet_first else np.zeros(len(points), dtype=np.int64)
+            found.append(self._nearer(x, way, kind, others[pairs[:, 1], 3], points, rings))
 
         meet(VERTEX_TRIANGLE, sheets.vertices, of.triangles, 3, sheet_first=True)
         meet(VERTEX_TRIANGLE, sheets.triangles, of.points, 1, sheet_first=False)
@@ -292,12 +313,13 @@ class ContactBarrier(Elastic):
             for one in others:
                 points = np.column_stack([single, np.tile(~one[:3], (len(single), 1))])
                 obstacle = np.full(len(points), one[3])
-                rows = np.column_stack([np.full(len(points), kind), obstacle, points])
+                kinds = np.full(len(points), kind)
+                rows = np.column_stack([kinds, obstacle, points, np.zeros(len(points), dtype=np.int64)])
                 close = np.zeros(len(points), dtype=bool)
                 for at in (x, x + way):  # along straight ways these distances are least at an end
                     for places in self._places:
                         distance = np.empty(len(points))
-                        contact_pairs.distances(at, places, rows[:, 0], rows[:, 2:], distance)
+                        contact_pairs.distances(at, places, rows[:, 0], rows[:, 2:6], distance)
                         close |= distance - of.radius[obstacle] < self.search_distance + self._bulge.max()
                 found.append(rows[close])
         return found
@@ -310,27 +332,33 @@ class ContactBarrier(Elastic):
 
     def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
         x, places = np.split(points, [len(points) - self.obstacles.n_points])
-        n, (gap, _, *others) = self.n_elements, self.barrier
-        least, weight, counted, energy = np.empty((4, n))
-        found = np.empty(n, dtype=np.int64), weight, counted, np.empty((n, 4)), energy
-        of = self.kind, self.points, self.offset, gap, *others, self.n_owned
-        met = contact_pairs.meeting(x, places, *of, least, found)
-        return least, *(part[:met].copy() for part in found)
+        least = np.empty(self.n_elements)
+        of = *self._of_pairs, self.shares, self.n_owned
+        while True:
+            room = self._room
+            numbers = np.empty(room, dtype=np.int64), *np.empty((2, room))
+            found = *numbers, np.empty((room, 4)), np.empty(room), np.empty((room, 5))
+            met = contact_pairs.meeting(x, places, *of, least, found)
+            if met <= room:
+                return least, *(part[:met].copy() for part in found)
+            self._room = met + met // 4
 
-    def pairs(self, met: Meeting, of: Ints | slice = slice(None)) -> tuple[Any, ...]:
-        """Kinds, points, offsets, β and constants of the barrier of some of those that meet."""
-        at, (gap, _, *others) = met.at[of], self.barrier
-        return self.kind[at], self.points[at], self.offset[at], met.beta[of], gap, *others
+    @property
+    def _of_pairs(self) -> tuple[Any, ...]:
+        """Kinds, points, offsets, gaps, and constants of the barrier."""
+        return self.kind, self.points, self.offset, self.gap, self.barrier.stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: Places) -> Array:
-        met, out = self.meeting(x, frozen.now), np.zeros(self.n_owned)
-        counts = met.counted > 0.0  # these are among the owned pairs, as they come first
-        out[met.at[counts]] = (met.counted * met.energy)[counts]
+        met = self.meeting(x, frozen.now)
+        counts = met.counted != 0.0  # these are among the owned pairs, as they come first
+        energies = (met.counted * met.energy)[counts]
+        out: Array = np.bincount(met.at[counts], energies, minlength=self.n_owned).astype(np.float64)
         return out
 
     def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
         met, pull = self.meeting(x, frozen.now), np.zeros_like(frozen.now)
-        contact_pairs.add_gradient(x, frozen.now, *self.pairs(met), met.weight, out, pull)
+        given = met.at, met.weight, met.beta, met.felt
+        contact_pairs.add_gradient(x, frozen.now, *self._of_pairs, given, out, pull)
 
     def acting(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
         out = np.zeros(self.n_elements, dtype=np.bool_)
@@ -347,15 +375,9 @@ class ContactBarrier(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        met = self.meeting(x, frozen.now)
-        pairs = self.pairs(met)
-
-        def fill(lo: int, hi: int, out: Array) -> None:
-            contact_pairs.hessians(x, frozen.now, *pairs, lo, blend, out)
-
-        weight = weight.copy()
-        weight[met.at] *= met.weight
-        self._scatter(fill, weight, offsets, values, met.at)
+        met, at = self.meeting(x, frozen.now), offsets[self.name]
+        given = met.at, weight[met.at] * met.weight, met.beta, met.felt
+        contact_pairs.add_hessians(x, frozen.now, *self._of_pairs, given, blend, at, values)
 
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
@@ -401,9 +423,10 @@ class ContactBarrier(Elastic):
         met = self.meeting(x, places)
         number = self.obstacle[met.at]
         for obstacle in np.unique(number[number >= 0]):
-            of = np.flatnonzero((number == obstacle) & (met.counted > 0.0))
+            of = np.flatnonzero((number == obstacle) & (met.counted != 0.0))
             gradient, pull = np.zeros_like(x), np.zeros_like(places)
-            contact_pairs.add_gradient(x, places, *self.pairs(met, of), met.counted[of], gradient, pull)
+            given = met.at[of], met.counted[of], met.beta[of], met.felt[of]
+            contact_pairs.add_gradient(x, places, *self._of_pairs, given, gradient, pull)
             yield int(obstacle), gradient
 
     def obstacle_forces(self, x: Array, frozen: Places, count: int) -> Array:
@@ -439,30 +462,48 @@ class ContactBarrier(Elastic):
                 taken[points[~pushed]] = taken[points[pushed]][0]
         return taken
 
-    def touching(self, x: Array, places: Array) -> tuple[NDArray[Any], ...]:
-        """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of all pairs that touch."""
-        n, (gap, _, *others) = self.n_elements, self.barrier
-        found = np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, dtype=np.int64)
-        of, least = (self.kind, self.points, self.offset, gap), self.meeting(x, places).least
-        met = contact_pairs.touching(x, places, *of, *others, least, *found)
-        return tuple(part[:met] for part in found)
+    def touching(self, x: Array, places: Array, counted: int) -> tuple[NDArray[Any], ...]:
+        """β (m, 4), unit normals (m, 3), normal forces (m,) [N] and numbers (m,) of what touches among the
+        first ``counted`` pairs; none that is as near as another, of a vertex of a sheet, and of others all.
+        """
+        met = self.meeting(x, places)
+        room = len(met.at) + counted
+        found = np.empty((room, 4)), np.empty((room, 3)), np.empty(room), np.empty(room, dtype=np.int64)
+        given = met.at, met.weight, met.beta, met.felt
+        n = contact_pairs.touching(x, places, *self._of_pairs, met.least, given, counted, found)
+        beta, normal, force, at = (part[:n] for part in found)
+        vertex = self.points[at, 0]
+        if (force < 0.0).any():  # where a surface is hollow: less of what else the vertex feels
+            of_sheets = vertex >= 0
+            shared = vertex[of_sheets & (self.kind[at] == VERTEX_TRIANGLE)]
+            mine = np.flatnonzero(of_sheets & (self.kind[at] == VERTEX_TRIANGLE))
+            whole = np.bincount(shared, force[mine], minlength=len(x))
+            positive = np.bincount(shared, np.maximum(force[mine], 0.0), minlength=len(x))
+            part = np.divide(whole, positive, out=np.zeros(len(x)), where=positive > 0.0)
+            force[mine] *= np.clip(part[shared], 0.0, 1.0)
+        keeps = force > 0.0
+        return beta[keeps], normal[keeps], force[keeps], at[keeps]
 
     def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array]:
-        beta, normal, force, at = self.touching(x, frozen.now)
+        beta, normal, force, at = self.touching(x, frozen.now, self.n_elements)
         return self.points[at], beta, normal, force
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
         out = np.zeros(len(x))
-        beta, _, force, at = self.touching(x, frozen.now)
+        beta, _, force, at = self.touching(x, frozen.now, self.n_elements)
         contact_pairs.add_normal_forces(self.points[at], beta, force, out)
         return out
 
     def history(self, x: Array, frozen: Places) -> Mapping[str, float]:
-        met = self.meeting(x, frozen.now)
-        smallest = met.least[: self.n_owned].min(initial=np.inf)
-        if smallest >= self.barrier.gap:  # it may be more
-            smallest = self.gaps(x, frozen).min(initial=np.inf)
+        met, n = self.meeting(x, frozen.now), self.n_owned
+        exact = met.least[:n] < self.gap[:n]
+        smallest = met.least[:n][exact].min(initial=np.inf)
+        may = np.flatnonzero(~exact & (met.least[:n] < smallest))  # it may be more
+        if len(may):
+            left = np.empty(len(may))
+            contact_pairs.distances(x, frozen.now, self.kind[may], self.points[may], left)
+            smallest = min(smallest, (left - self.offset[may]).min())
         return {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
 
 
@@ -478,7 +519,9 @@ def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array
 
 def elements(rest: RestShape) -> Elements:
     """The triangles of the sheets."""
-    return Elements(rest.mesh.triangles, {"uv": rest.mesh.triangle_uv.reshape(-1, 6)})
+    triangles = rest.mesh.triangles
+    rings = surface_shares.rings(triangles.astype(np.int64)).astype(np.float64)
+    return Elements(triangles, {"uv": rest.mesh.triangle_uv.reshape(-1, 6), "rings": rings})
 
 
 def barrier(rest: RestShape) -> Barrier:
@@ -508,4 +551,5 @@ def barrier(rest: RestShape) -> Barrier:
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:
     """The term on one rank; `ContactBarrier.set_up` must follow."""
-    return ContactBarrier(elements.stencil.astype(np.int32), elements.data["uv"].reshape(-1, 3, 2))
+    uv, rings = elements.data["uv"].reshape(-1, 3, 2), elements.data["rings"].astype(np.int64)
+    return ContactBarrier(elements.stencil.astype(np.int32), uv, rings)

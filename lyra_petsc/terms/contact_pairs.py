@@ -22,6 +22,12 @@ Points of obstacles have numbers below 0: ~number among the obstacles' points.
 
 Pairs whose nearest points are the same vertices, or a vertex and the same point of an edge, have the same
 energy: each is evaluated once, and `meeting` tells how many there are of it.
+
+A vertex of a sheet before a surface feels it once, however many triangles are near: what the triangles give,
+less what the edges between them give, plus what the vertices within do (inclusion and exclusion, as Li,
+Ferguson, Schneider, Langlois, Zorin, Panozzo, Jiang & Kaufman, Convergent incremental potential contact,
+arXiv:2307.15908). Before a flat one, where nearest points of neighbours are the same, one pair is left. A
+triangle has a share in each of its sides and corners (`surface_shares`).
 """
 
 from __future__ import annotations
@@ -32,11 +38,18 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.scatter import add_element
 from lyra_petsc.terms.hinge import cross, dot, minus
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
 """Kinds of pairs. A plane is a point p1 and a unit normal p2; a vertex inside keeps no more than a radius
 from a segment p1 p2, and their distance is minus |g|. p3 counts for nothing there."""
+
+NONE = 1e-6
+"""How often a pair counts, at most, that does not count at all."""
+
+TOGETHER = 256
+"""Nearest points of a vertex that are compared with each other."""
 
 CLOSE = 0.1
 """Part of the way to the least distance that continuous collision detection may leave."""
@@ -75,7 +88,7 @@ def _to_side(p, a, b):  # type: ignore[no-untyped-def]
     return t, dot(g, g)
 
 
-@kernel()
+@kernel(forceinline=True)
 def _in_triangle(p, a, b, c):  # type: ignore[no-untyped-def]
     """Barycentric coordinates of the nearest point of a triangle to p: the second and the third.
 
@@ -315,33 +328,181 @@ def _ends(kind, points, e, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     return points[e, 0], lo, hi
 
 
+@kernel(inline="always")
+def _note(number, ends, at, count, apart, beta, e, one, other, share, delta, b1, b2, b3):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Count a nearest point on an edge, or twice a vertex, ``share`` times; how many there are."""
+    both, place = (min(one, other) << 32) | max(one, other), 0
+    while place < number and ends[place] != both:
+        place += 1
+    if place < number:
+        count[place] += share
+        return number
+    ends[number], at[number], count[number], apart[number] = both, e, share, delta
+    beta[number, 0], beta[number, 1], beta[number, 2] = b1, b2, b3
+    return number + 1
+
+
+@kernel(forceinline=True)
+def _around(p, points, e, offset, gap, shares, number, ends, at, count, apart, beta):  # type: ignore[no-untyped-def]
+    """Note what is nearest to a vertex in triangle e, on its sides and at its corners; δ and how many."""
+    a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
+    c, d = (p[2, 0], p[2, 1], p[2, 2]), (p[3, 0], p[3, 1], p[3, 2])
+    i, j, k = points[e, 1], points[e, 2], points[e, 3]
+    v, w = _in_triangle(a, b, c, d)
+    b1, b2, b3 = v + w - 1.0, -v, -w
+    delta = _length(p, 1.0, b1, b2, b3) - offset
+    if not delta < gap:
+        return delta, number
+    # without a corner it is on the side before that, and there nearest of the side, too
+    if b1 != 0.0 and b2 != 0.0 and b3 != 0.0:
+        number = _note(number, ends, at, count, apart, beta, e, -1 - e, 0, 1.0, delta, b1, b2, b3)
+    else:
+        one = i if b1 != 0.0 else (j if b2 != 0.0 else k)
+        other = k if b3 != 0.0 else (j if b2 != 0.0 else i)
+        often = 1.0 + (shares[e, 0] if b3 == 0.0 else 0.0) + (shares[e, 1] if b1 == 0.0 else 0.0)
+        often += shares[e, 2] if b2 == 0.0 else 0.0
+        if one == other:
+            often += shares[e, 3] if b1 != 0.0 else (shares[e, 4] if b2 != 0.0 else shares[e, 5])
+        number = _note(number, ends, at, count, apart, beta, e, one, other, often, delta, b1, b2, b3)
+    limit = (gap + offset) ** 2
+    if b3 != 0.0 and shares[e, 0] != 0.0:
+        t, square = _to_side(a, b, c)
+        if square < limit:
+            one, other, near = i if t < 1.0 else j, j if t > 0.0 else i, math.sqrt(square) - offset
+            number = _note(
+                number, ends, at, count, apart, beta, e, one, other, shares[e, 0], near, t - 1.0, -t, 0.0
+            )
+    if b1 != 0.0 and shares[e, 1] != 0.0:
+        t, square = _to_side(a, c, d)
+        if square < limit:
+            one, other, near = j if t < 1.0 else k, k if t > 0.0 else j, math.sqrt(square) - offset
+            number = _note(
+                number, ends, at, count, apart, beta, e, one, other, shares[e, 1], near, 0.0, t - 1.0, -t
+            )
+    if b2 != 0.0 and shares[e, 2] != 0.0:
+        t, square = _to_side(a, d, b)
+        if square < limit:
+            one, other, near = k if t < 1.0 else i, i if t > 0.0 else k, math.sqrt(square) - offset
+            number = _note(
+                number, ends, at, count, apart, beta, e, one, other, shares[e, 2], near, -t, 0.0, t - 1.0
+            )
+    corner = minus(a, b)
+    square = dot(corner, corner)
+    if square < limit and shares[e, 3] != 0.0 and (b2 != 0.0 or b3 != 0.0):
+        near = math.sqrt(square) - offset
+        number = _note(number, ends, at, count, apart, beta, e, i, i, shares[e, 3], near, -1.0, 0.0, 0.0)
+    corner = minus(a, c)
+    square = dot(corner, corner)
+    if square < limit and shares[e, 4] != 0.0 and (b1 != 0.0 or b3 != 0.0):
+        near = math.sqrt(square) - offset
+        number = _note(number, ends, at, count, apart, beta, e, j, j, shares[e, 4], near, 0.0, -1.0, 0.0)
+    corner = minus(a, d)
+    square = dot(corner, corner)
+    if square < limit and shares[e, 5] != 0.0 and (b1 != 0.0 or b2 != 0.0):
+        near = math.sqrt(square) - offset
+        number = _note(number, ends, at, count, apart, beta, e, k, k, shares[e, 5], near, 0.0, 0.0, -1.0)
+    return delta, number
+
+
+@kernel(inline="always")
+def _write(  # type: ignore[no-untyped-def]
+    n, at, often, ours, share, energies, felt,
+    e, weight, counted, b0, b1, b2, b3, p, delta, d, gap, stiffness, part,
+):  # fmt: skip
+    """Write a pair into row n of what is found, if there is one; how many rows there are then."""
+    if n < len(at):
+        energy = slope = second = 0.0
+        if delta > 0.0:
+            energy, slope, second = barrier(delta, gap)
+        elif weight > 0.0:
+            energy = slope = np.inf  # or no number
+        at[n], often[n], ours[n], energies[n] = e, weight, counted, part * stiffness * energy
+        share[n, 0], share[n, 1], share[n, 2], share[n, 3] = b0, b1, b2, b3
+        for k in range(3):
+            felt[n, k] = b0 * p[0, k] + b1 * p[1, k] + b2 * p[2, k] + b3 * p[3, k]
+        felt[n, 3], felt[n, 4] = stiffness * slope / d, stiffness * second / (d * d)
+    return n + 1
+
+
 @kernel()
-def meeting(x, others, kind, points, offset, gap, stiffness, parallel, n_counted, least, found):  # type: ignore[no-untyped-def]
+def _write_near(  # type: ignore[no-untyped-def]
+    x, others, points, number, at, count, apart, beta, n_counted, offset, gap, stiffness, n, found, p
+):
+    """Write the nearest points of a vertex that count; how many rows of ``found`` there are then."""
+    numbers, often, counted, share, energies, felt = found
+    for m in range(number):
+        if abs(count[m]) <= NONE:
+            continue
+        e, delta = at[m], apart[m]
+        _load(x, others, points, e, p)
+        ours, d = count[m] if e < n_counted else 0.0, delta + offset[e]
+        b1, b2, b3 = beta[m, 0], beta[m, 1], beta[m, 2]
+        n = _write(
+            n, numbers, often, counted, share, energies, felt,
+            e, count[m], ours, 1.0, b1, b2, b3, p, delta, d, gap[e], stiffness, 1.0,
+        )  # fmt: skip
+    return n
+
+
+@kernel()
+def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n_counted, least, found):  # type: ignore[no-untyped-def]  # fmt: skip
     """Find the pairs nearer than the gap, one of all those whose nearest points are on the same vertices.
 
     Parameters
     ----------
+    gap : (E,)
+        Below which distances less the offset [m] pairs feel each other.
+    shares : (E, 6)
+        Of a triangle before a vertex of a sheet: how often its sides, from each corner to the next, and its
+        corners count. Pairs of a vertex next to each other are looked at together.
     n_counted : int
         The first pairs, which this rank counts.
     least : (E,)
         What the distance less the offset [m] is not below; exactly that where it is below the gap.
-    found : tuple of (E,), (E,), (E,), (E, 4), (E,)
-        Numbers of the pairs, ascending; of how many each is one, and how many of these are counted;
-        β and the energy [J] of one pair.
+    found : tuple of (room,), (room,), (room,), (room, 4), (room,), (room, 5)
+        Numbers of the pairs, of which one may be there several times; how often each counts, and how often
+        for this rank; β and the energy [J] of one pair; g, b′ / d and b″ / d² where it does not fade.
 
     Returns
     -------
     n : int
-        How many there are: the first rows of ``found``.
+        How many there are: the first rows of ``found``, as many as have room.
     """
-    at, weight, counted, beta, energy = found
-    p, slope, n = np.empty((4, 3)), np.zeros(12), 0
-    first, following = np.full(len(x), -1), np.empty(len(kind), dtype=np.int64)  # lists, by a vertex
-    alike = np.empty((len(kind), 3), dtype=np.int64)  # nearest vertex and edge, or a second vertex twice
+    numbers, often, for_us, share, energies, felt = found
+    p, q, slope, n = np.empty((4, 3)), np.empty((4, 3)), np.zeros(12), 0
+    first, following = np.full(len(x), -1), np.full(0, -1)  # lists, by a vertex
+    alike = np.empty((0, 3), dtype=np.int64)  # nearest vertex and edge, or a second vertex twice
+    ends, at, count = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(TOGETHER)
+    apart, beta, number, vertex = np.empty(TOGETHER), np.empty((TOGETHER, 3)), 0, -1
     for e in range(len(kind)):
         _load(x, others, points, e, p)
+        if kind[e] == VERTEX_TRIANGLE and points[e, 0] >= 0:
+            if points[e, 0] != vertex or number > TOGETHER - 7:
+                n = _write_near(
+                    x,
+                    others,
+                    points,
+                    number,
+                    at,
+                    count,
+                    apart,
+                    beta,
+                    n_counted,
+                    offset,
+                    gap,
+                    stiffness,
+                    n,
+                    found,
+                    q,
+                )
+                number, vertex = 0, points[e, 0]
+            delta, number = _around(
+                p, points, e, offset[e], gap[e], shares, number, ends, at, count, apart, beta
+            )
+            least[e] = delta
+            continue
         least[e] = at_least(p, kind[e]) - offset[e]
-        if least[e] >= gap:
+        if least[e] >= gap[e]:
             continue
         behind = kind[e] == VERTEX_INSIDE
         if kind[e] == VERTEX_PLANE:
@@ -349,7 +510,7 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, n_counted
         b0, b1, b2, b3 = _weights(kind[e], p)
         d = _length(p, b0, b1, b2, b3)
         delta = least[e] = (-d if behind else d) - offset[e]
-        if delta >= gap:
+        if delta >= gap[e]:
             continue
         ours, part = 1.0 if e < n_counted else 0.0, 1.0
         if kind[e] == EDGE_EDGE:
@@ -366,16 +527,30 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, n_counted
             while other >= 0 and (alike[other, 0] != v or alike[other, 1] != lo or alike[other, 2] != hi):
                 other = following[other]
             if other >= 0:
-                weight[other] += 1.0
-                counted[other] += ours
+                if other < len(numbers):
+                    often[other] += 1.0
+                    for_us[other] += ours
                 continue
+            if n >= len(alike):
+                alike, following = _longer(alike, following, n)
             alike[n, 0], alike[n, 1], alike[n, 2] = v, lo, hi
             following[n], first[row] = first[row], n
-        at[n], weight[n], counted[n] = e, 1.0, ours
-        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = b0, b1, b2, b3
-        energy[n] = part * stiffness * barrier(delta, gap)[0] if delta > 0.0 else np.inf  # or no number
-        n += 1
-    return n
+        d = -d if behind else d
+        n = _write(
+            n, numbers, often, for_us, share, energies, felt,
+            e, 1.0, ours, b0, b1, b2, b3, p, delta, d, gap[e], stiffness, part,
+        )  # fmt: skip
+    return _write_near(
+        x, others, points, number, at, count, apart, beta, n_counted, offset, gap, stiffness, n, found, q
+    )
+
+
+@kernel()
+def _longer(alike, following, n):  # type: ignore[no-untyped-def]
+    """Copies with room for a row n and as many more."""
+    more, after = np.empty((2 * n + 64, 3), dtype=np.int64), np.full(2 * n + 64, -1)
+    more[: len(alike)], after[: len(following)] = alike, following
+    return more, after
 
 
 @kernel(inline="always")
@@ -393,27 +568,29 @@ def _between(x, others, kind, points, beta, e, n, p, g):  # type: ignore[no-unty
 
 
 @kernel()
-def add_gradient(x, others, kind, points, offset, beta, gap, stiffness, parallel, weight, out, pull):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Add weight (E,) times the gradient [N] of pairs nearer than the gap to rows of out (n_local, 3).
+def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, met, out, pull):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add the gradient [N] of what `meeting` found to rows of out (n_local, 3), of obstacles' points to pull.
 
-    That of obstacles' points to pull (m, 3).
+    ``met`` are numbers of pairs, how often each counts, β, and what is felt there.
     """
-    p, g, more = np.empty((4, 3)), np.empty(3), np.zeros(12)
-    for e in range(len(kind)):
-        d = _between(x, others, kind, points, beta, e, e, p, g)
-        delta = d - offset[e]
-        slope = turn = 0.0
-        if delta > 0.0:
-            energy, slope, _ = barrier(delta, gap)
-            slope *= weight[e] * stiffness / d
-            if kind[e] == EDGE_EDGE:
-                part, first, _ = _mollifier(p, parallel, more)
-                slope, turn = part * slope, weight[e] * stiffness * energy * first
-        else:
-            slope = np.nan
+    p, more = np.empty((4, 3)), np.zeros(12)
+    at, weight, beta, felt = met
+    for m in range(len(at)):
+        e = at[m]
+        slope, turn = weight[m] * felt[m, 3], 0.0
+        if kind[e] == EDGE_EDGE:
+            _load(x, others, points, e, p)
+            part, first, _ = _mollifier(p, parallel, more)
+            if part < 1.0:
+                d = _length(p, beta[m, 0], beta[m, 1], beta[m, 2], beta[m, 3])
+                delta = d - offset[e]
+                slope *= part
+                turn = weight[m] * stiffness * barrier(delta, gap[e])[0] * first if delta > 0.0 else np.nan
         for i in range(4):
+            if beta[m, i] == 0.0 and turn == 0.0:
+                continue
             for k in range(3):
-                force = slope * beta[e, i] * g[k]
+                force = slope * beta[m, i] * felt[m, k]
                 if turn != 0.0:
                     force += turn * more[3 * i + k]
                 if points[e, i] >= 0:
@@ -468,25 +645,29 @@ def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def hessians(x, others, kind, points, offset, beta, gap, stiffness, parallel, lo, blend, out):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Hessians [N/m] of pairs lo, lo + 1, … nearer than the gap into out (n, 4, 4, 3, 3).
+def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, values):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add the Hessians [N/m] of what `meeting` found to block rows values (n_blocks, 3, 3).
 
-    0 for points of obstacles. ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
+    ``met`` as of `add_gradient`; ``offsets`` (E, 10) as of `kernels.scatter`. No rows for obstacles.
+    ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
     """
-    p, g, gamma = np.empty((4, 3)), np.empty(3), np.empty((2, 4))
+    p, gamma, h = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3))
     e, c, a_c = np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3))
-    for n in range(len(out)):
-        pair = lo + n
-        out[n] = 0.0
-        d = _between(x, others, kind, points, beta, pair, pair, p, g)
-        delta, b = d - offset[pair], beta[pair]
-        if not delta > 0.0:
+    at, weight, beta, felt = met
+    for n in range(len(at)):
+        pair, b, g = at[n], beta[n], felt[n]
+        factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
+        if factor == 0.0 or not abs(g[3]) < np.inf:
             continue
-        _, force, second = barrier(delta, gap)
-        force, second = stiffness * force / d, stiffness * second / (d * d)
-        first = (1.0 - blend) * force
-        along = second - first / (d * d)
+        square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
+        first, second = (1.0 - blend) * g[3], g[4]
+        along = second - first / square
         free = _free(kind[pair], b, gamma) if first != 0.0 else 0
+        edges = kind[pair] == EDGE_EDGE
+        if free > 0 or edges:
+            _load(x, others, points, pair, p)
+        if free > 0 and kind[pair] == VERTEX_PLANE:
+            _around_foot(p)
         for f in range(free):
             for k in range(3):
                 e[f, k] = 0.0
@@ -510,9 +691,15 @@ def hessians(x, others, kind, points, offset, beta, gap, stiffness, parallel, lo
                         c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
                     a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
                     a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
+        fades = edges and _fades(p, parallel)
+        if fades:
+            h[:] = 0.0
         for i in range(4):
             for j in range(i, 4):
                 if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
+                    continue
+                to = offsets[pair, (7 - i) * i // 2 + j]
+                if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
                     continue
                 both = b[i] * b[j]
                 for k in range(3):
@@ -522,12 +709,26 @@ def hessians(x, others, kind, points, offset, beta, gap, stiffness, parallel, lo
                             value += first * both
                         if free > 0:
                             value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
-                        out[n, i, j, k, m] = out[n, j, i, m, k] = value
-        if kind[pair] == EDGE_EDGE:
-            _add_fading(p, b, g, gap, delta, stiffness, force, blend, parallel, out[n])
-        for i in range(4):
-            if points[pair, i] < 0:
-                out[n, i], out[n, :, i] = 0.0, 0.0
+                        if fades:
+                            h[i, j, k, m] = h[j, i, m, k] = value
+                        elif to & 1:
+                            values[to >> 1, m, k] += factor * value
+                        else:
+                            values[to >> 1, k, m] += factor * value
+        if fades:
+            delta, force = math.sqrt(square) - offset[pair], g[3]
+            _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, h)
+            for i in range(4):
+                if points[pair, i] < 0:
+                    h[i], h[:, i] = 0.0, 0.0
+            add_element(factor, h, offsets[pair], values)
+
+
+@kernel(inline="always")
+def _fades(p, parallel):  # type: ignore[no-untyped-def]
+    """Whether the energy of two edges does."""
+    uu, uv, vv = _of_edges(p)
+    return not uu * vv - uv * uv >= uu * vv * parallel
 
 
 @kernel()
@@ -666,24 +867,42 @@ def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-
     return force * _mollifier(p, parallel, slope)[0] if kind == EDGE_EDGE else force
 
 
-@kernel()
-def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, beta, normal, force, at):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Find what touches: pairs whose distance less the offset is not below ``least`` (E,) [m].
+@kernel(inline="always")
+def alone(kind, points, e):  # type: ignore[no-untyped-def]
+    """Whether what touches is told pair by pair: not of a vertex of a sheet before something."""
+    return kind[e] == EDGE_EDGE or points[e, 0] < 0
 
-    β, unit normals towards the first simplex, normal forces [N] and numbers of pairs go to the first rows of
-    beta (E, 4), normal (E, 3), force and at (E,), as many as are returned.
+
+@kernel()
+def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Find which of the first ``n_counted`` pairs touch.
+
+    Of vertices of sheets those that `meeting` found, ``met`` being their numbers, how often each counts, and
+    β; of others each whose distance less the offset is not below ``least`` (E,) [m]. β, unit normals towards
+    the first simplex, normal forces [N], which may be negative, and numbers of pairs go to the first rows of
+    ``found``, (m, 4), (m, 3), (m,) and (m,), as many as are returned.
     """
     p, g, slope, n = np.empty((4, 3)), np.empty(3), np.zeros(12), 0
-    for e in range(len(kind)):
-        if least[e] >= gap:
+    beta, normal, force, at = found
+    numbers, weight, given, felt = met
+    for m in range(len(numbers) + n_counted):
+        e = numbers[m] if m < len(numbers) else m - len(numbers)
+        if e >= n_counted or least[e] >= gap[e] or alone(kind, points, e) != (m >= len(numbers)):
             continue
-        _load(x, others, points, e, p)
-        if kind[e] == VERTEX_PLANE:
-            _around_foot(p)
-        beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = _weights(kind[e], p)
-        d = _between(x, others, kind, points, beta, e, n, p, g)
-        force[n] = _force(p, kind[e], d - offset[e], gap, stiffness, parallel, slope)
-        if not force[n] > 0.0:
+        if m < len(numbers):
+            for k in range(3):
+                g[k] = felt[m, k]
+            d = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+            d = -d if kind[e] == VERTEX_INSIDE else d
+            for i in range(4):
+                beta[n, i] = given[m, i]
+            force[n] = -weight[m] * felt[m, 3] * d
+        else:
+            _load(x, others, points, e, p)
+            beta[n, 0], beta[n, 1], beta[n, 2], beta[n, 3] = _weights(kind[e], p)
+            d = _between(x, others, kind, points, beta, e, n, p, g)
+            force[n] = _force(p, kind[e], d - offset[e], gap[e], stiffness, parallel, slope)
+        if force[n] == 0.0:
             continue
         for k in range(3):
             normal[n, k] = g[k] / d

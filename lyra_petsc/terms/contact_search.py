@@ -20,7 +20,7 @@ class Simplices:
 
     def __init__(self, corners: Ints, patch: Ints, n_patches: int) -> None:
         order: Ints = np.argsort(patch, kind="stable")
-        self.corners = np.ascontiguousarray(corners[order])
+        self.order, self.corners = order, np.ascontiguousarray(corners[order])
         self.first = np.searchsorted(patch[order], np.arange(n_patches + 1))
 
     def of(self, chosen: Ints) -> Ints:
@@ -55,10 +55,11 @@ class SheetSearch:
         self._given: Ints | None = None
         self._room = 1024
 
-    def take(self, x: Array, numbers: Ints, triangles: Ints) -> None:
+    def take(self, x: Array, numbers: Ints, triangles: Ints, rings: Ints | None = None) -> None:
         """Let the simplices be those of triangles (F, 3), of which this rank's come first.
 
-        x (N, 3) [m] and numbers (N,) are positions and global numbers of all points.
+        x (N, 3) [m] and numbers (N,) are positions and global numbers of all points, rings (F,) what is
+        around the triangles, as `surface_shares.rings` has it; 0 where that does not matter.
         """
         if self._given is not None and np.array_equal(triangles, self._given):
             return
@@ -67,6 +68,9 @@ class SheetSearch:
         patch = np.concatenate([self._patch, self._n + more])
         n = self._n + int(more.max(initial=-1)) + 1
         self.triangles = Simplices(triangles, patch, n)
+        self._rings = (
+            np.zeros(len(triangles), dtype=np.int64) if rings is None else rings[self.triangles.order]
+        )
         first = np.full(len(x), n)
         np.minimum.at(first, triangles.ravel(), np.repeat(patch, 3))
         used = np.flatnonzero(first < n)
@@ -84,8 +88,12 @@ class SheetSearch:
         _boxes(x, way, self.triangles.corners, self.triangles.first, low, high)
         return low, high
 
-    def pairs(self, x: Array, way: Array, numbers: Ints, reach: float) -> Ints:
-        """Rows (m, 6) of pairs that may come within ``reach`` [m] on their ways: kind, −1, vertices."""
+    def pairs(self, x: Array, way: Array, numbers: Ints, reach: float, edges: float | None = None) -> Ints:
+        """Rows (m, 7) of pairs that may come within ``reach`` [m] on their ways: kind, −1, vertices, and what
+        is around the triangle.
+
+        Two edges within ``edges`` [m], not more than ``reach``.
+        """
         way = way - way.mean(axis=0)  # what all of them go together brings none nearer
         met = near(self.boxes(x, way), reach=reach)
         every = np.repeat(np.arange(len(self.triangles.first) - 1)[:, None], 2, axis=1)
@@ -93,8 +101,9 @@ class SheetSearch:
         met = met[~self.apart(x, way, met, reach)]
         given = tuple((of.corners, of.first) for of in (self.vertices, self.edges, self.triangles))
         while True:
-            out = np.empty((self._room, 6), dtype=np.int64)
-            found = _pairs(x, way, met, *given, numbers, reach, 3 * patches.SIZE, out)
+            out = np.empty((self._room, 7), dtype=np.int64)
+            reaches = reach, reach if edges is None else edges
+            found = _pairs(x, way, met, *given, numbers, *reaches, 3 * patches.SIZE, self._rings, out)
             if found <= self._room:
                 return out[:found]
             self._room = found + found // 4
@@ -144,12 +153,12 @@ def _far(one, other, square):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, most, out):  # type: ignore[no-untyped-def]
+def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out):  # type: ignore[no-untyped-def]  # fmt: skip
     """Rows of the near simplices of pairs of patches, as many as fit; how many there are.
 
     No patch has more than ``most`` vertices, edges or triangles.
     """
-    found, square = 0, reach * reach
+    found = 0
     one, other, whole = np.empty((most, 2, 3)), np.empty((most, 2, 3)), np.empty((2, 3))
     p, w, points = np.empty((4, 3)), np.empty((4, 3)), np.empty(4, np.int64)
     for n in range(len(met)):
@@ -160,6 +169,8 @@ def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, most, out): 
                 if i == j:
                     continue
             kind, size = (EDGE_EDGE, 2) if part == 2 else (VERTEX_TRIANGLE, 1)
+            within = edges_reach if part == 2 else reach
+            square = within * within
             mine, first = edges if part == 2 else vertices
             theirs, begin = edges if part == 2 else triangles
             _each_box(x, way, mine, first[i], first[i + 1], one)
@@ -188,12 +199,13 @@ def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, most, out): 
                     for m in range(4):
                         for k in range(3):
                             p[m, k], w[m, k] = x[points[m], k], way[points[m], k]
-                    left = reach + speed(kind, w)
+                    left = within + speed(kind, w)
                     if at_least(p, kind) >= left or distance(kind, p) >= left:
                         continue
                     if found < len(out):
                         turned = part == 2 and numbers[points[0]] > numbers[points[2]]
                         out[found, 0], out[found, 1] = kind, -1
+                        out[found, 6] = 0 if part == 2 else rings[begin[j] + b]
                         for m in range(4):
                             out[found, 2 + m] = points[(m + 2) % 4 if turned else m]
                     found += 1

@@ -1,7 +1,8 @@
 """Coulomb friction of all pairs in contact; its potential in a step is that of ``friction_pairs``.
 
 Pairs, their normals and normal forces are those of the last accepted state; a pair that goes on keeps the
-elastic part of its way, so that what sticks does not creep.
+elastic part of its way, so that what sticks does not creep, and so does a vertex that goes on over what it
+touches. The owner of a pair's first vertex knows it, and tells the owners of the others.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
 
@@ -29,41 +30,25 @@ ELASTIC = 0.01
 
 
 class Pairs(NamedTuple):
-    """Pairs in contact at an accepted state.
+    """Pairs in contact at an accepted state, those that this rank counts.
 
     Attributes
     ----------
-    key : (E, 11)
-        Whether others count it, numbers of the vertices, kind, obstacle, its points: what tells a pair from
-        others; ascending.
-    beta : (E, 4)
-        0 for obstacles' points.
-    normal, start, slip, foot : (E, 3)
-        Unit normals, Σ β_i x_i, elastic part of the way so far, where an obstacle is touched [m].
-    force : (E,)
-        Normal force [N].
+    key : (E, 10)
+        Numbers of the vertices, kind, obstacle, its points (0 for vertices): what tells a pair from others.
+    slip : (E, 3)
+        Elastic part of the way so far [m].
     slid : (E,)
         Whether it slid in the last step.
+    geometry : (E, 14)
+        β (0 for obstacles' points), unit normals, Σ β_i x_i [m], where an obstacle is touched [m], normal
+        force [N].
     """
 
     key: Ints
-    beta: Array
-    normal: Array
-    start: Array
     slip: Array
-    foot: Array
-    force: Array
     slid: Mask
-
-    @property
-    def vertices(self) -> Ints:
-        """Global numbers (E, 4)."""
-        return self.key[:, 1:5]
-
-    @property
-    def obstacle(self) -> Ints:
-        """(E,), −1 of sheets."""
-        return self.key[:, 6]
+    geometry: Array
 
 
 class ObstacleMoves(NamedTuple):
@@ -83,9 +68,9 @@ class ObstacleMoves(NamedTuple):
 
 
 def _no_pairs() -> Pairs:
-    three = np.empty((0, 3))
-    nothing = np.empty((0, 11), dtype=np.int64), np.empty((0, 4)), three, three, three, three
-    return Pairs(*nothing, np.empty(0), np.empty(0, dtype=np.bool_))
+    return Pairs(
+        np.empty((0, 10), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.bool_), np.empty((0, 14))
+    )
 
 
 class CoulombFriction(Elastic):
@@ -104,7 +89,7 @@ class CoulombFriction(Elastic):
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = _no_pairs()
         self.stale = False
-        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 1))}))
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 24))}))
 
     def set_up(self, contact: ContactBarrier) -> None:
         """Know the contact whose pairs rub."""
@@ -116,48 +101,53 @@ class CoulombFriction(Elastic):
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
-        self._number = number = elements.data["what"][:, 0].astype(np.int64)
-        self._taken = p = self._pairs  # the next ones are known before their elements are
-        if not len(number):
-            number = np.empty(0, dtype=np.int64)
-            self._limit = self._spring = np.empty(0)
-        else:
-            static, kinetic = self._coefficients[p.obstacle[number]].T
-            self._limit = np.where(p.slid[number], kinetic, static) * p.force[number]
+        columns = np.split(elements.data["what"].reshape(-1, 24), [6, 9, 10, 14, 17, 20, 23], axis=1)
+        what, slip, slid, *geometry = (np.ascontiguousarray(part) for part in columns)
+        self._beta, self._normal, self._still, self._foot, force = geometry
+        self._start = self._still
+        self._slip, self._obstacle = slip, what[:, 1].astype(np.int64)
+        numbers = elements.data.get("number", np.empty((0, 4)))
+        self._key = np.column_stack([numbers, what]).astype(np.int64)
+        self._limit = self._spring = force[:, 0]
+        if len(force):
+            static, kinetic = self._coefficients[self._obstacle].T
+            self._limit = np.where(slid[:, 0] > 0.5, kinetic, static) * force[:, 0]
             self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
-        self._beta, self._normal = p.beta[number], p.normal[number]
-        self._slip = p.slip[number]
         self._moved: list[tuple[Array, Array]] | None = None  # what the starts are of
-        self._start = p.start[number]
 
     # -- pairs -------------------------------------------------------------------------------------
 
-    def known(self) -> tuple[Ints, Ints]:
-        self.stale = False
-        vertices = self._pairs.vertices
-        return vertices, np.arange(len(vertices))[:, None]
+    def known(self) -> tuple[Ints, Array]:
+        self.stale, p = False, self._pairs
+        return p.key[:, :4], np.column_stack([p.key[:, 4:], p.slip, p.slid, p.geometry])
 
     def _renew(self, x: Array, places: Array) -> None:
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points."""
         contact, old = self._contact, self._pairs
-        beta, normal, force, met = contact.touching(x, places)
-        points, stencil = contact.points[met], contact.stencil[met]
+        beta, normal, force, met = contact.touching(x, places, contact.n_owned)
+        points, number, kind = contact.points[met], contact.number[met].copy(), contact.kind[met]
         sheet = points >= 0
-        # in this order contact's pairs are sorted
-        order = [met >= contact.n_owned, contact.number[met], contact.kind[met], contact.obstacle[met]]
-        key = np.column_stack([*order, np.where(sheet, 0, points)])
+        start = np.einsum("ei,eik->ek", np.where(sheet, beta, 0.0), x[contact.stencil[met]])
+        points = np.where(sheet, 0, points)
+        # before a vertex of a sheet only what is nearest tells a triangle
+        vertex = np.flatnonzero((kind == VERTEX_TRIANGLE) & sheet[:, 0])
+        nearest = beta[vertex, 1:] != 0.0
+        first = 1 + nearest.argmax(axis=1)[:, None]
+        for of in (number, points):
+            given = of[vertex]
+            of[vertex, 1:] = np.where(nearest, given[:, 1:], np.take_along_axis(given, first, axis=1))
         beta = np.where(sheet, beta, 0.0)
-        start = np.einsum("ei,eik->ek", beta, x[stencil])
+        key = np.column_stack([number, kind, contact.obstacle[met], points])
         side = beta.sum(axis=1)[:, None]  # 1 or −1 where the other side is an obstacle
         foot = np.where(np.abs(side) > 0.5, start * side, 0.0)
         slip, slid = np.zeros((len(met), 3)), np.zeros(len(met), dtype=np.bool_)
         if len(old.key) and len(met):
             same = np.empty(len(met), dtype=np.int64)
-            friction_pairs.find(key, old.key, same)
+            friction_pairs.find(key, old.key, old.slip, same)
             went = same >= 0
             slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
             slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-        self._pairs = Pairs(key, beta, normal, start, slip, foot, force, slid)
+        self._pairs = Pairs(key, slip, slid, np.column_stack([beta, normal, start, foot, force]))
         self.stale = True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
@@ -166,9 +156,7 @@ class CoulombFriction(Elastic):
     def element_state(self) -> tuple[Ints, Array]:
         """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
         p = self._pairs
-        counted = p.key[:, 0] == 0
-        values = np.column_stack([p.key[:, 5:], p.slip, p.slid]).astype(np.float64)
-        return p.vertices[counted], values[counted]
+        return p.key[:, :4], np.column_stack([p.key[:, 4:], p.slip, p.slid]).astype(np.float64)
 
     def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
         vertices, what = vertices.copy(), values[:, :6].astype(np.int64)
@@ -180,11 +168,9 @@ class CoulombFriction(Elastic):
         vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
         swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
-        elsewhere = (vertices[:, 0] < own.start) | (vertices[:, 0] >= own.stop)
-        key = np.column_stack([elsewhere, vertices, what])
-        order = np.lexsort(key.T[::-1])
         # `take_pairs` finds the rest
-        self._pairs = _no_pairs()._replace(key=key[order], slip=slip[order], slid=values[order, 9] > 0.5)
+        key = np.column_stack([vertices, what])
+        self._pairs = Pairs(key, slip, values[:, 9] > 0.5, np.empty((len(key), 14)))
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -196,12 +182,14 @@ class CoulombFriction(Elastic):
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
         if self._moved is not moved:
-            p, number = self._taken, self._number
-            start, side = p.start[number], self._beta.sum(axis=1)
+            start = self._still
             for obstacle, (rotation, translation) in enumerate(moved):
-                mine = p.obstacle[number] == obstacle
-                foot = p.foot[number][mine]
-                start[mine] += side[mine, None] * (foot @ rotation.T + translation - foot)
+                if not translation.any() and (rotation == np.eye(3)).all():
+                    continue
+                mine, foot = self._obstacle == obstacle, self._foot
+                start = start.copy() if start is self._still else start
+                side, foot = self._beta[mine].sum(axis=1), foot[mine]
+                start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
             self._moved, self._start = moved, start
         return self.stencil, self._beta, self._normal, self._start, self._slip, self._spring, self._limit
 
@@ -226,12 +214,13 @@ class CoulombFriction(Elastic):
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
-        self._taken.slip[self._number], self._taken.slid[self._number] = self._slip, slides
+        mine = slice(self.n_owned)
+        self._pairs = self._pairs._replace(key=self._key[mine], slip=self._slip[mine], slid=slides[mine])
         self._renew(x, frozen.places)
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
-        number = self._taken.obstacle[self._number][: self.n_owned]
+        number = self._obstacle[: self.n_owned]
         out = np.zeros((len(self._contact.obstacles.each), 6))
         for obstacle in np.unique(number[number >= 0]):
             of, pull = np.flatnonzero(number == obstacle), np.zeros_like(x)

@@ -22,6 +22,7 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
+from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
 
 @kernel()
@@ -106,20 +107,57 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
             slip[e, k] = u[k]
 
 
-@kernel()
-def find(keys, among, place):  # type: ignore[no-untyped-def]
-    """Which row of ``among`` (M, n) each row of keys (N, n) is, −1 where none is; both are ascending."""
-    b = 0
-    for a in range(len(keys)):
-        place[a] = -1
-        while b < len(among):
-            order = 0
-            for k in range(keys.shape[1]):
-                if keys[a, k] != among[b, k]:
-                    order = 1 if keys[a, k] > among[b, k] else -1
-                    break
-            if order == 0:
-                place[a] = b
-            if order <= 0:
+@kernel(inline="always")
+def _alike(one, other):  # type: ignore[no-untyped-def]
+    """How alike two pairs with these keys (10,) and the same first vertex are; −1: one does not go on in the
+    other. Between a vertex of a sheet and triangles it does if these have a nearest vertex in common.
+    """
+    if one[4] != other[4] or one[5] != other[5]:
+        return -1
+    if one[4] != VERTEX_TRIANGLE or one[6] != 0:
+        for k in range(10):
+            if one[k] != other[k]:
+                return -1
+        return 20
+    begins, common, size, others = 7 if one[5] >= 0 else 1, 0, 0, 0
+    for i in range(begins, begins + 3):
+        size += (
+            1 if i == begins or (one[i] != one[begins] and (i == begins + 1 or one[i] != one[i - 1])) else 0
+        )
+        new = i == begins or (other[i] != other[begins] and (i == begins + 1 or other[i] != other[i - 1]))
+        if not new:
+            continue
+        others += 1
+        for j in range(begins, begins + 3):
+            if one[j] == other[i]:
+                common += 1
                 break
-            b += 1
+    if one[5] < 0 and common == 0:
+        return -1
+    return 10 + 2 * common - size - others
+
+
+@kernel()
+def find(keys, among, slip, place):  # type: ignore[no-untyped-def]
+    """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does.
+
+    Of several that are as much alike the one with the longer ``slip`` (M, 3).
+    """
+    room = 1
+    while room < 2 * len(among):
+        room *= 2
+    first, following = np.full(room, -1), np.empty(len(among), dtype=np.int64)
+    for b in range(len(among)):
+        row = Index(among[b, 0] & (room - 1))
+        following[b], first[row] = first[row], b
+    for a in range(len(keys)):
+        place[a], best, longest = -1, -1, -1.0
+        b = first[Index(keys[a, 0] & (room - 1))]
+        while b >= 0:
+            if among[b, 0] == keys[a, 0]:
+                fits, length = _alike(keys[a], among[b]), 0.0
+                for k in range(3):
+                    length += slip[b, k] * slip[b, k]
+                if fits >= 0 and (fits > best or (fits == best and length > longest)):
+                    place[a], best, longest = b, fits, length
+            b = following[b]

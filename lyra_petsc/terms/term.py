@@ -166,8 +166,10 @@ class Term(ABC):
         values: Array,
         rows: Ints | slice = slice(None),
     ) -> None:
-        """Add weight × Hessians of elements ``rows`` to block rows; ``fill`` computes the lo-th to hi-th."""
-        at, stencil, weight = offsets[self.name][rows], self.stencil[rows], weight[rows]
+        """Add weight × Hessians of elements ``rows``, each with its own, to block rows; ``fill`` computes the
+        lo-th to hi-th.
+        """
+        at, stencil = offsets[self.name][rows], self.stencil[rows]
         n = stencil.shape[1]
         m = 0 if self.edges is None else self.edges.shape[1]
         shape = (n, n, 3, 3) if self.edges is None else (3 * n + m, 3 * n + m)
@@ -201,6 +203,9 @@ class Elastic(Term):
 
     pushes: bool = False
     """Whether what moves works by its forces (`work`), as its motion alone may make the energy infinite."""
+
+    surface_marks: Ints | None = None
+    """A number (F,) that goes with each of them, if any: the last column of what ``neighbours`` gets."""
 
     skin: float = 0.0
     """Part of it [m] by which points may come nearer to each other until ``neighbours`` is asked again."""
@@ -266,14 +271,16 @@ class Elastic(Term):
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
 
         And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
-        the points' global numbers, ``triangles`` (F, 3) those of ``surface`` that are near. Where ``unseen``
+        the points' global numbers, ``triangles`` (F, 3 or 4) near ones of ``surface``. Where ``unseen``
         is given, also those that come so near on their straight ways (N, 3) [m]. Ranks that see the same
         points must name them in the same order within an element; the owner of the first counts it.
         """
         raise NotImplementedError
 
-    def known(self) -> tuple[Ints, Ints]:
-        """The same by global numbers, of a term without a ``search_distance``, whenever it is ``stale``."""
+    def known(self) -> tuple[Ints, Ints | Array]:
+        """The same by global numbers, of a term without a ``search_distance``, whenever it is ``stale``: of
+        those whose first vertex this rank owns.
+        """
         raise NotImplementedError
 
     def acting(self, x: Array, frozen: Any) -> NDArray[np.bool_]:

@@ -64,6 +64,14 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
     add("--contact", action="store_true", help="also sheets in contact, for a second and more")
     add("--bending", nargs="*", metavar="MESH", help=f"also directors on edges beside hinges, on {meshes}")
+    add(
+        "--settle",
+        type=float,
+        default=1.0,
+        metavar="S",
+        help="of simulated time before those are measured (1)",
+    )
+    add("--scenes", nargs="+", default=[], metavar="WORD", help="those of contact with a word in their names")
     add("--only-rows", action="store_true", help="the first table and what was asked for, nothing else")
     add("--plain", action="store_true", help="each row once more with plain numba instead of LLVM's language")
     add("--peer", action="append", default=[], type=str, metavar="NAME='COMMAND {obj} {json} {steps}'")
@@ -239,7 +247,7 @@ class Bench:
                     self._attempt(
                         f"{vertices} vertices in contact, {ranks} rank(s)",
                         lambda vertices=vertices, ranks=ranks: measures.contact(
-                            vertices, ranks, self._petsc, asked.limits
+                            vertices, ranks, self._petsc, asked.limits, asked.settle, asked.scenes
                         ),
                     ),
                 )

@@ -116,8 +116,9 @@ SHEETS = 5
 
 
 def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
-    """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then one that
-    falls over a ball, and a stack that lies on a plane and, before it, as many sheets that swing.
+    """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then the same
+    with contact and nothing near, and one that falls over a ball; sheets that swing, and as many in a stack
+    on a plane, of the cloth as it is and a thousand times stiffer.
     """
 
     def sheets(number: int, apart: float) -> list[dict[str, Any]]:
@@ -135,12 +136,16 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     floor = {"obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}}
     gap = 0.2 / cells_of(vertices // SHEETS)
     one, several = sheets(1, 0.0), sheets(SHEETS, gap)
-    return {
+    far = {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}}
+    scenes = {
         "swings": common | held | {"mesh": one},
+        "swings, nothing near": common | held | {"mesh": one, "contact": {"friction": 0.4}, "obstacles": far},
         "over a ball": common | free | ball | {"mesh": one, "contact": {"friction": 0.4}},
-        f"{SHEETS} swing": common | held | {"mesh": several},
-        f"{SHEETS} in a stack": common
-        | free
-        | floor
-        | {"mesh": several, "contact": {"gap": gap, "friction": 0.4}},
     }
+    for factor in (1.0, 1000.0):
+        stiffer = common | {"material": common["material"] | {"stretching_scale": factor}, "mesh": several}
+        words = "" if factor == 1.0 else f", ×{factor:g}"
+        scenes[f"{SHEETS} swing{words}"] = stiffer | held
+        touching = {"contact": {"gap": gap, "friction": 0.4}}
+        scenes[f"{SHEETS} in a stack{words}"] = stiffer | free | floor | touching
+    return scenes

@@ -117,10 +117,16 @@ def bending(
     return found | {"mesh": kind, "who": method, "ranks": ranks}
 
 
-def contact(vertices: int, ranks: int, petsc: Sequence[str], limits: Limits) -> Result:
-    """Steps of sheets in contact by turns with sheets that swing, after those of a second."""
-    few = {"warm_up": round(1.0 / STEP), "steps": limits.steps, "seconds": math.inf}
-    found = measure("meshes", ranks, petsc, 100 * limits.process, scenes=in_contact(vertices), **few)
+def contact(
+    vertices: int, ranks: int, petsc: Sequence[str], limits: Limits, settle: float, only: Sequence[str]
+) -> Result:
+    """Steps of sheets in contact by turns with sheets that swing, after those of ``settle`` seconds; of all
+    scenes, or of those that have one of some words in their names.
+    """
+    few = {"warm_up": max(WARM_UP, round(settle / STEP)), "steps": limits.steps, "seconds": math.inf}
+    scenes = in_contact(vertices)
+    scenes = {name: scenes[name] for name in scenes if not only or any(word in name for word in only)}
+    found = measure("meshes", ranks, petsc, 100 * limits.process, scenes=scenes, **few)
     return found | {"ranks": ranks}
 
 

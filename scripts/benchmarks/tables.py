@@ -120,23 +120,31 @@ def of_vertex(found: Result) -> float:
 
 
 def contact_table(results: Sequence[Result]) -> list[str]:
-    """Steps in contact beside those of the sheets that swing, named before them."""
+    """Steps in contact beside those of the sheets that swing, named before them; how both grow with the
+    vertices, and what further ranks bring.
+    """
     rows = []
     for result in results:
         base: Result = {}
         for name, found in result["meshes"].items():
-            base = found if "swing" in name else base
-            cpu = [step["cpu"] for step in found["steps"]]
+            base = found if "swing" in name and "near" not in name else base
+            cells = ["", "", ""]
+            if base and base["all_cpu"] > 0.0:
+                ratios = [a["cpu"] / b["cpu"] for a, b in zip(found["steps"], base["steps"], strict=False)]
+                cells = [spread(ratios), number(found["all_cpu"] / base["all_cpu"])]
+                cells.append(number(median_of(found, "cg") / max(1.0, median_of(base, "cg"))))
             rows.append(
                 [
                     str(found["vertices"]),
                     str(result["ranks"]),
                     name,
-                    spread(cpu, 1e3),
-                    number(median_of(found, "cpu") / median_of(base, "cpu")),
-                    number(found["all_cpu"] / base["all_cpu"]),
+                    spread([step["cpu"] for step in found["steps"]], 1e3),
+                    spread([step["seconds"] for step in found["steps"]], 1e3),
+                    cells[0],
+                    cells[1],
                     number(median_of(found, "newton")),
                     number(median_of(found, "cg")),
+                    cells[2],
                     found["preset"],
                 ]
             )
@@ -145,13 +153,37 @@ def contact_table(results: Sequence[Result]) -> list[str]:
         "ranks",
         "sheets",
         "CPU ms a step",
-        "times those that swing",
+        "wall ms a step",
+        "CPU, times those that swing",
         "the whole run",
         "Newton iterations",
         "CG iterations",
+        "times those that swing",
         "preset",
     )
-    return table(head, rows)
+    return [*table(head, rows), *_growth_of_contact(results)]
+
+
+def _growth_of_contact(results: Sequence[Result]) -> list[str]:
+    """Exponents of the cost of a step on one rank, and the wall time of one rank over that of several."""
+    lines: list[str] = []
+    for name in dict.fromkeys(name for result in results for name in result["meshes"]):
+        of = {
+            (result["ranks"], result["meshes"][name]["vertices"]): result["meshes"][name]
+            for result in results
+            if name in result["meshes"]
+        }
+        alone = sorted(vertices for ranks, vertices in of if ranks == 1)
+        if len(alone) > 1:
+            low, high = alone[0], alone[-1]
+            cost = median_of(of[1, high], "cpu") / median_of(of[1, low], "cpu")
+            exponent = math.log(cost) / math.log(high / low)
+            lines += ["", f"{name}: cost grows as vertices^{exponent:.2f} from {low} to {high} vertices."]
+        for ranks, vertices in sorted(of):
+            if ranks > 1 and (1, vertices) in of:
+                gain = median_of(of[1, vertices], "seconds") / median_of(of[ranks, vertices], "seconds")
+                lines += ["", f"{name}: {ranks} ranks are {gain:.2f} times as fast at {vertices} vertices."]
+    return lines
 
 
 def meshes_table(results: Sequence[Result]) -> list[str]:

@@ -71,7 +71,9 @@ def test_it_stands(comm: MPI.Comm) -> None:
 
 
 def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> None:
-    """Two sheets lie crosswise on a slope and stick; on one rank edges are named in another order."""
+    """Two sheets lie crosswise on a slope and stick, so heavy that their edges touch; on one rank edges are
+    named in another order.
+    """
     place = [0.9 * GAP * component for component in NORMAL]
     above = [1.85 * GAP * component for component in NORMAL]
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
@@ -81,7 +83,7 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> No
     scene = scene_of(
         {
             "mesh": [lower, upper],
-            "material": CLOTH | {"bending": 1e-4, "damping": 0.01},
+            "material": CLOTH | {"bending": 1e-4, "damping": 0.01, "density": 200.0},
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE)},
             "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.terms import contact_pairs
+from lyra_petsc.terms import contact_pairs, surface_shares
 from lyra_petsc.terms.contact_pairs import CLOSE, EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Pairs:
     def meeting(self, x: Array, parallel: float) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which of them are nearer than the gap; β and the energy of all, 0 of others."""
         n = len(self)
-        numbers = self.offset, GAP, STIFFNESS, parallel
+        numbers = self.offset, np.full(n, GAP), STIFFNESS, parallel, np.zeros((n, 6))
         found = met_of(x, self.others, self.kind, self.points, *numbers, counted=n)
         assert (found["weight"] == 1.0).all()
         near, beta, energy = np.zeros(n, dtype=np.bool_), np.zeros((n, 4)), np.zeros(n)
@@ -66,22 +66,24 @@ class Pairs:
     def energies(self, x: Array, parallel: float = NOWHERE) -> Array:
         return self.meeting(x, parallel)[2]
 
+    def _met(self, x: Array, parallel: float) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """What the kernels take of pairs and of what is met."""
+        n = len(self)
+        of = self.kind, self.points, self.offset, np.full(n, GAP), STIFFNESS, parallel
+        found = met_of(x, self.others, *of, np.zeros((n, 6)), counted=n)
+        return of, tuple(found[name] for name in MET)
+
     def gradient(self, x: Array, parallel: float = NOWHERE) -> tuple[Array, Array]:
         out, pull = np.zeros_like(x), np.zeros_like(self.others)
-        near, beta, _ = self.meeting(x, parallel)
-        of = self.part(near)
-        numbers = of.offset, beta[near], GAP, STIFFNESS, parallel, np.ones(len(of))
-        contact_pairs.add_gradient(x, self.others, of.kind, of.points, *numbers, out, pull)
+        of, met = self._met(x, parallel)
+        contact_pairs.add_gradient(x, self.others, *of, met, out, pull)
         return out, pull
 
     def hessians(self, parallel: float = NOWHERE, blend: float = 0.0) -> Array:
         """(n, 12, 12)"""
-        near, beta, _ = self.meeting(self.x, parallel)
-        of, out = self.part(near), np.zeros((len(self), 4, 4, 3, 3))
-        numbers, each = (of.offset, beta[near], GAP, STIFFNESS, parallel), np.empty((len(of), 4, 4, 3, 3))
-        contact_pairs.hessians(self.x, self.others, of.kind, of.points, *numbers, 0, blend, each)
-        out[near] = each
-        return out.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
+        of, met = self._met(self.x, parallel)
+        each = blocks_of(self.x, self.others, of, met, blend)
+        return each.transpose(0, 1, 3, 2, 4).reshape(-1, 12, 12)
 
     def free_way(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
@@ -89,11 +91,30 @@ class Pairs:
         return float(contact_pairs.free_way(self.x, self.others, way, others_way, *pairs, KEPT, most))
 
 
+MET = ["at", "weight", "beta", "felt"]
+"""What the kernels take of what `met_of` gives."""
+
+
+def blocks_of(x: Array, others: Array, of: tuple[Any, ...], met: tuple[Any, ...], blend: float) -> Array:
+    """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other one turned."""
+    n, (one, other) = len(of[0]), np.triu_indices(4)
+    turned = np.arange(10 * n).reshape(n, 10) % 2
+    values, out = np.zeros((10 * n, 3, 3)), np.empty((n, 4, 4, 3, 3))
+    contact_pairs.add_hessians(
+        x, others, *of, met, blend, 2 * np.arange(10 * n).reshape(n, 10) + turned, values
+    )
+    values = values.reshape(n, 10, 3, 3)
+    values = np.where(turned[:, :, None, None] == 1, values.transpose(0, 1, 3, 2), values)
+    out[:, one, other], out[:, other, one] = values, values.transpose(0, 1, 3, 2)
+    return out
+
+
 def met_of(*given: Any, counted: int) -> dict[str, NDArray[Any]]:
     """What `contact_pairs.meeting` finds, by name."""
     n = len(given[2])
     least, found = np.empty(n), {"at": np.empty(n, dtype=np.int64), "weight": np.empty(n)}
     found |= {"counted": np.empty(n), "beta": np.empty((n, 4)), "energy": np.empty(n)}
+    found["felt"] = np.empty((n, 5))
     met = contact_pairs.meeting(*given, counted, least, tuple(found.values()))
     return {name: part[:met] for name, part in found.items()}
 
@@ -377,35 +398,101 @@ def two_layers(noise: float) -> Pairs:
 def test_pairs_that_are_alike_count_as_often_as_there_are(noise: float, parallel: float) -> None:
     pairs, gap = two_layers(noise), 0.8
     n = len(pairs)
-    numbers = pairs.offset, gap, STIFFNESS, parallel
 
-    def summed(found: dict[str, NDArray[Any]], of: Pairs) -> tuple[float, Array, Array]:
-        constants = of.offset, found["beta"], *numbers[1:]
+    def summed(of: Pairs, counted: int, shares: Array) -> tuple[dict[str, NDArray[Any]], list[Any]]:
+        constants = of.kind, of.points, of.offset, np.full(len(of), gap), STIFFNESS, parallel
+        found = met_of(of.x, of.others, *constants, shares, counted=counted)
+        met = tuple(found[name] for name in MET)
         out, hessian = np.zeros_like(of.x), np.zeros((len(of.x), len(of.x), 3, 3))
-        each = np.empty((len(of), 4, 4, 3, 3))
-        contact_pairs.add_gradient(of.x, of.others, of.kind, of.points, *constants, found["weight"], out, out)
-        contact_pairs.hessians(of.x, of.others, of.kind, of.points, *constants, 0, 0.0, each)
-        at = of.points[:, :, None], of.points[:, None, :]
-        np.add.at(hessian, at, found["weight"][:, None, None, None, None] * each)
-        return float(found["weight"] @ found["energy"]), out, hessian
+        contact_pairs.add_gradient(of.x, of.others, *constants, met, out, out)
+        each = blocks_of(of.x, of.others, constants, met, 0.0)
+        np.add.at(hessian, (of.points[:, :, None], of.points[:, None, :]), each)
+        return found, [float(found["weight"] @ found["energy"]), out, hessian]
 
-    def meeting(of: Pairs, counted: int) -> tuple[dict[str, NDArray[Any]], Pairs]:
-        constants = of.offset, *numbers[1:]
-        found = met_of(of.x, of.others, of.kind, of.points, *constants, counted=counted)
-        at = found["at"]
-        return found, replace(of, kind=of.kind[at], points=of.points[at], offset=of.offset[at])
-
-    merged, few = meeting(pairs, n // 2)
-    energy, gradient, hessian = summed(merged, few)
-    singles = [meeting(pairs.part(slice(e, e + 1)), 1) for e in range(n)]
-    singles = [(found, of) for found, of in singles if len(of)]
-    parts = [summed(found, of) for found, of in singles]
-    assert energy == pytest.approx(sum(part[0] for part in parts), rel=1e-12)
-    for mine, theirs in ((gradient, 1), (hessian, 2)):
-        expected = np.sum([part[theirs] for part in parts], axis=0)
-        np.testing.assert_allclose(mine, expected, atol=1e-11 * np.abs(expected).max())
-    assert merged["weight"].sum() == len(singles)
-    first_half = sum(len(meeting(pairs.part(slice(e, e + 1)), 1)[1]) for e in range(n // 2))
-    assert merged["counted"].sum() == first_half
+    none = np.zeros((n, 6))
+    merged, total = summed(pairs, n // 2, none)
+    singles = [summed(pairs.part(slice(e, e + 1)), int(e < n // 2), none[:1]) for e in range(n)]
+    assert total[0] == pytest.approx(sum(of[0] for _, of in singles), rel=1e-12)
+    for which in (1, 2):
+        expected = np.sum([of[which] for _, of in singles], axis=0)
+        np.testing.assert_allclose(total[which], expected, atol=1e-11 * np.abs(expected).max())
+    for name in ("weight", "counted"):
+        assert merged[name].sum() == sum(found[name].sum() for found, _ in singles)
     if noise < 0.01:
-        assert len(few) < (0.5 if parallel == NOWHERE else 0.9) * len(singles)
+        assert len(merged["at"]) < (0.7 if parallel == NOWHERE else 0.95) * merged["weight"].sum()
+
+
+def before_a_surface(bent: float) -> tuple[Ints, Array, Ints, Array]:
+    """Points of 4 × 4 cells and, after them, of five vertices before them; triangles and shares."""
+    rng = np.random.default_rng(5)
+    n = 5
+    flat = np.array([(i, j, 0.0) for j in range(n) for i in range(n)])
+    flat[:, 2] = bent * rng.normal(size=len(flat))
+    over = np.column_stack([rng.uniform(0.8, 3.2, size=(5, 2)), rng.uniform(0.1, 0.3, size=5)])
+    over[0, :2], over[1, :2] = (2.0, 2.0), (1.5, 2.0)
+    first = [i + n * j for j in range(n - 1) for i in range(n - 1)]
+    triangles = np.array([(v, v + 1, v + n + 1) for v in first] + [(v, v + n + 1, v + n) for v in first])
+    shares = surface_shares.shares(surface_shares.rings(triangles))
+    pairs = np.array([[25 + v, *each] for v in range(5) for each in triangles])
+    return pairs, np.concatenate([flat, over]), triangles, np.tile(shares, (5, 1))
+
+
+def felt_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray[Any]], Array, Array]:
+    """What is met, its gradient, and its Hessian."""
+    n, none = len(pairs), np.empty((0, 3))
+    of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), STIFFNESS, NOWHERE
+    sized = {"least": np.empty(n)} | {name: np.empty(shape) for name, shape in ROOM.items()}
+    found = {name: array for name, array in sized.items() if name != "least"} | {
+        "at": np.empty(999, np.int64)
+    }
+    given = tuple(found[name] for name in ("at", "weight", "counted", "beta", "energy", "felt"))
+    met = contact_pairs.meeting(x, none, *of, shares, n, sized["least"], given)
+    found = {name: part[:met] for name, part in found.items()}
+    out, hessian = np.zeros_like(x), np.zeros((len(x), len(x), 3, 3))
+    taken = tuple(found[name] for name in MET)
+    contact_pairs.add_gradient(x, none, *of, taken, out, none)
+    np.add.at(hessian, (pairs[:, :, None], pairs[:, None, :]), blocks_of(x, none, of, taken, 0.0))
+    return found, out, hessian
+
+
+ROOM = {"weight": (999,), "counted": (999,), "beta": (999, 4), "energy": (999,), "felt": (999, 5)}
+
+
+def test_a_vertex_feels_a_flat_surface_once() -> None:
+    """Also over an edge, and over a vertex."""
+    pairs, x, _, shares = before_a_surface(0.0)
+    found, gradient, _ = felt_before(x, pairs, shares)
+    height = x[25:, 2]
+    expected = STIFFNESS * (0.5 - height) ** 3 / height
+    of = pairs[found["at"], 0] - 25
+    energies = np.bincount(of, found["weight"] * found["energy"], minlength=5)
+    np.testing.assert_allclose(energies, expected, rtol=1e-12)
+    assert len(found["at"]) == 5
+    np.testing.assert_allclose(gradient[25:, :2], 0.0, atol=1e-14)
+
+
+def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
+    pairs, x, _, shares = before_a_surface(0.04)
+    rng = np.random.default_rng(3)
+    found, gradient, hessian = felt_before(x, pairs, shares)
+    assert (found["weight"] < 0.0).any()  # somewhere it is hollow
+    h, way = 1e-6, rng.normal(size=x.shape)
+
+    def energy(at: Array) -> float:
+        met = felt_before(at, pairs, shares)[0]
+        return float(met["weight"] @ met["energy"])
+
+    slope = (energy(x + h * way) - energy(x - h * way)) / (2 * h)
+    assert np.vdot(gradient, way) == pytest.approx(slope, rel=1e-6)
+    change = (felt_before(x + h * way, pairs, shares)[1] - felt_before(x - h * way, pairs, shares)[1]) / (
+        2 * h
+    )
+    np.testing.assert_allclose(
+        np.einsum("abij,bj->ai", hessian, way), change, atol=1e-5 * np.abs(change).max()
+    )
+    # along a way over vertices and edges it does not jump
+    ahead = np.zeros_like(x)
+    ahead[25:, :2] = rng.uniform(-0.7, 0.7, size=(5, 2))
+    along = np.array([energy(x + t * ahead) for t in np.linspace(0.0, 1.0, 2001)])
+    assert np.abs(np.diff(along)).max() < 20.0 * np.abs(np.diff(along)).mean()
+    assert np.abs(np.diff(along, 2)).max() < 0.1 * np.abs(np.diff(along)).max()

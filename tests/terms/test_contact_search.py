@@ -113,7 +113,7 @@ def test_no_pair_that_comes_near_is_missed(which: str, how: str) -> None:
         every, near = brute(x, way, triangles)
         search.take(x, numbers, triangles)
         rows = search.pairs(x, way, numbers, REACH)
-        found = [name(row[0], row[2:]) for row in rows.tolist()]
+        found = [name(row[0], row[2:6]) for row in rows.tolist()]
         assert len(found) == len(set(found)), "pairs are named once"
         assert near <= set(found) <= every
         assert (rows[:, 1] == -1).all()
@@ -127,7 +127,7 @@ def test_triangles_of_other_ranks_are_compared_one_by_one() -> None:
     search.take(x, numbers, triangles)
     rows = search.pairs(x, np.zeros_like(x), numbers, REACH)
     _, near = brute(x, np.zeros_like(x), triangles)
-    assert near <= {name(row[0], row[2:]) for row in rows.tolist()}
+    assert near <= {name(row[0], row[2:6]) for row in rows.tolist()}
 
 
 def test_a_rank_without_triangles_finds_nothing() -> None:
