@@ -15,10 +15,10 @@ from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
 
-TOUCHING = 1e-9
+TOUCHING = 2e-9
 """Gap over the skin of a search up to which there is none."""
 
-TIGHT = 1e-2
+TIGHT = 2e-2
 """The same, up to which next to nothing is left."""
 
 
