@@ -52,7 +52,7 @@ class _Carried:
 
     def displacement(self, time: float) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] that lead from t = 0 to a time [s]."""
-        if self.motion is None:
+        if self.motion is None or time == 0.0:  # where rounding would move it
             return np.eye(3), np.zeros(3)
         (start, from_), (turn, to) = self.motion.transform(0.0), self.motion.transform(time)
         rotation = turn @ start.T
