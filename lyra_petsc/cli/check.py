@@ -74,7 +74,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
     outline = problem.outline
     blocks = int(ranks[:, 2].sum())
     time = scene.time
-    if time.analysis == "static":
+    if time.static:
         plan_of_steps = f"load factor to {control.end:g}, first increment {control.step:g}; a state at each"
     else:
         steps = _count(control.end / control.step)

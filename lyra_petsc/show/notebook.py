@@ -197,7 +197,7 @@ def run(
         bar = None
         if in_notebook() if progress is None else progress:
             scene = load(scene)
-            bar = NotebookProgress(scene.time.end if scene.time.analysis != "static" else 1.0)
+            bar = NotebookProgress(1.0 if scene.time.static else scene.time.end)
 
         def step(report: StepReport) -> None:
             if bar is not None:

@@ -371,11 +371,8 @@ def _short_title(quantity: Quantity) -> str:
 def _error_cell(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
         return f"< {short(SAFETY * row.own[name])}"
-    return _told(row.errors.get(name, math.nan))
-
-
-def _told(value: float, digits: int = 3) -> str:
-    return short(value, digits) if math.isfinite(value) else ""
+    error = row.errors.get(name, math.nan)
+    return short(error) if math.isfinite(error) else ""
 
 
 def _orders(report: Report, orders: Sequence[Order]) -> None:

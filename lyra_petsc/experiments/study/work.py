@@ -208,6 +208,9 @@ SAFETY = 2.0
 LARGEST_SAFETY = 1.25
 """Factor on the estimates of largest errors."""
 
+REFINED = 2.0
+"""Factor between neighbours of a chain."""
+
 SLOWEST = 0.5
 """Order of convergence below which an estimate is not trusted to follow it."""
 
@@ -361,7 +364,7 @@ def joined(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
     return found
 
 
-def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -> dict[str, Estimate]:
+def of_chain(differences: Sequence[History], chain: Chain) -> dict[str, Estimate]:
     """Own error of a chain's finest run, by quantity.
 
     A largest error wanders over the sheet and in time, so that the differences of the largest ones tell
@@ -383,11 +386,11 @@ def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -
         if len(differences) == 1:
             found[name] = Estimate(first, math.nan, True)
             continue
-        found[name] = whole = richardson(first, sums[1][name], ratio, chain.order)
+        found[name] = whole = richardson(first, sums[1][name], REFINED, chain.order)
         if name != MEAN_SQUARE and not math.isnan(whole.error):
             pairs = zip(differences[0][name], differences[1][name], strict=True)
             each = [
-                richardson(float(fine), float(coarse), ratio, chain.order).error for fine, coarse in pairs
+                richardson(float(fine), float(coarse), REFINED, chain.order).error for fine, coarse in pairs
             ]
             found[name] = replace(whole, error=LARGEST_SAFETY * max(whole.error, *each))
     return found

@@ -146,7 +146,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     """
     run = StoredRun(options.run)
     scene = scene_shown(run, options.settings)
-    static = scene.time.analysis == "static"
+    static = scene.time.static
     size = _size(options.size)
     limits = _range(options)
     _check_speeds(options)

@@ -152,7 +152,7 @@ class SceneDrawing:
             plotter.add_mesh(arrows, color=WIND_COLOR, ambient=0.35, reset_camera=False)
         self._time = self._add_text(" ", (18 * self._scale, 14 * self._scale), font="arial")
         digits = f"{{:.{decimals(plan.run.times)}f}}"
-        static = plan.scene.time.analysis == "static"
+        static = plan.scene.time.static
         self._label = f"load = {digits}" if static else f"t = {digits} s"
         self._first = True
 

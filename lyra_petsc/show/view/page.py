@@ -144,7 +144,7 @@ class Page:
         self._held: HeldVertices | None = None
         self._obstacles: list[ObstacleSurface] | None = None
         self._find_handles()
-        self._unit = "" if run.scene.time.analysis == "static" else "s"
+        self._unit = "" if run.scene.time.static else "s"
         self._figures: dict[str, dict[str, Any]] = {}
         self._fill()
         self._look_at_all()
