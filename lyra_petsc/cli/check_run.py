@@ -74,7 +74,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
 
 
 class _Found(NamedTuple):
-    """What is told of a state: the numbers of its row, and what is named."""
+    """The crossings in one state: the counts of its row, and the names to print."""
 
     counts: tuple[int, ...]
     first: str

@@ -45,7 +45,7 @@ class MakesMotion(Protocol):
 
 
 class _Carried:
-    """What a rigid motion T carries from where it is at t = 0: by T(t) T(0)⁻¹."""
+    """A body that a rigid motion T moves from its place at t = 0: by T(t) T(0)⁻¹."""
 
     points: Array
     motion: RigidMotion | None

@@ -111,7 +111,7 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 
 def _contact_pressure(problem: Problem) -> Array:
-    """Of the normal forces on both sides together."""
+    """From the normal forces on both sides together."""
     contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
     forces = contact.normal_forces(system.x, system.active.frozen[contact])
     return _per_area(problem, np.arange(len(forces), dtype=np.int32), forces)

@@ -1,4 +1,4 @@
-"""What crosses in the states that a run has written: triangles each other, and sheets the obstacles."""
+"""Crossings in the stored states of a run: of triangles with each other, and of sheets with obstacles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 
 
 class StateCrossings(NamedTuple):
-    """What crosses in one state.
+    """The crossings in one state.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class StateCrossings(NamedTuple):
 
 
 class RunCrossings:
-    """Looks at the states of a run, of which one at a time is in memory.
+    """Finds the crossings in the states of a run, one state in memory at a time.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class RunCrossings:
         self._boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
 
     def of(self, state: int) -> StateCrossings:
-        """What crosses in a state."""
+        """The crossings in a state."""
         run, x, time = self._run, self._run.positions[state], float(self._run.times[state])
         pairs = self_crossings(x, run.triangles)
         at_corner = have_common_vertex(run.triangles, pairs)

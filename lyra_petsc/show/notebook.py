@@ -66,7 +66,7 @@ class Media:
 
 
 class Run(StoredRun):
-    """The results of a run; reads what was asked for and keeps no file open.
+    """The results of a run; reads files only when asked for their content, and keeps none open.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ class Estimate:
 
 @dataclass
 class Reference:
-    """The reference of one physical scene, as chosen and as it came out.
+    """The reference of one physical scene: how it was chosen, and its results.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
 
 
 def _differences(plan: Plan, folder: Path) -> Sequence[str]:
-    """What the scene of a run has that the study's has not, beside how it was solved."""
+    """How the scene of a run differs physically from the study's, in words."""
     try:
         other = load_scene(folder / "scene.yaml")
     except InputError:
@@ -401,7 +401,7 @@ ROUND_OFF = 1e-13
 
 
 class Observer(Protocol):
-    """Who wants to know how far a study is, and may end it."""
+    """Receives the progress of a study, and may end it."""
 
     def case(self, label: str, *, resumed: bool) -> None:
         """A case begins, or was found finished."""
@@ -410,12 +410,12 @@ class Observer(Protocol):
         """Work done and in all, in the same unit; called after every step on all ranks, may raise."""
 
     def note(self, text: str) -> None:
-        """Something the user should know."""
+        """A message for the user."""
 
 
 @dataclass
 class StudyRow(Outcome[Combination]):
-    """What came of a combination.
+    """The result of a combination.
 
     Attributes
     ----------
@@ -469,7 +469,7 @@ class StudyRow(Outcome[Combination]):
 
     @property
     def line(self) -> str:
-        """What its line in a diagram is called: its integrator."""
+        """The name of its line in a diagram: its integrator."""
         return self.result.integrator or str(self.case.settings.get("integrator", ""))
 
 

@@ -120,7 +120,7 @@ class ColourQuantity:
         return colour_limits(float(low), float(high))
 
     def on_vertices(self, run: StoredRun) -> ColourQuantity:
-        """The same with values on vertices: the means of their triangles', weighted by rest area.
+        """The same with values on vertices: means over their triangles, weighted by rest area.
 
         Constant strain triangles alternate from one to the next around the field that they stand for; the
         means follow it. Ranks are no such field.

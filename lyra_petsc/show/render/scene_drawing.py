@@ -235,7 +235,7 @@ class SceneDrawing:
             self._add_bar(quantity)
 
     def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
-        """Its mesh, in the right place only once a state is drawn."""
+        """Its mesh, which is moved into place when a state is drawn."""
         points = obstacle.positions(0.0)
         mesh = self._pyvista.PolyData.from_regular_faces(points, obstacle.triangles)
         look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.round else "flat"}

@@ -111,7 +111,7 @@ def _pressed(setting: Setting, bench: Bench) -> Content:
 
 
 def _crossings(trial: Trial) -> int:
-    """How many pairs of triangles cross now, and parts are inside of obstacles."""
+    """Number of pairs of triangles that cross now, plus parts that lie inside obstacles."""
     simulation, x = trial.simulation, trial.x
     mesh = simulation.problem.mesh  # on rank 0
     term: Any = simulation.problem.terms["contact"]
