@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,10 +9,8 @@ from unittest.mock import MagicMock
 
 import pytest
 from launch import SCENE, lyra, start, write_scene
-from mpi4py import MPI
 from written_run import Writer, written
 
-from lyra_petsc.cli.progress import FrameProgress
 from lyra_petsc.errors import InputError
 from lyra_petsc.show.render.paraview_script import SCRIPT, write_script
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
@@ -132,23 +129,6 @@ def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
     assert plan.states == [0, 1, 2]
     writer.write()
     assert make_plan(RenderOptions(tmp_path / "run")).states == [0, 1, 2, 3]
-
-
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    for stream, expected in (
-        (Terminal(), "50 of 100 states drawn"),
-        (io.StringIO(), "50 of 100 states drawn"),
-    ):
-        with FrameProgress(MPI.COMM_SELF, stream=stream) as progress:
-            progress.LINE_SECONDS = 0.0
-            progress.update(0, 100)
-            progress.update(50, 100)
-        assert expected in stream.getvalue()
-        assert ("━" in stream.getvalue()) == stream.isatty()
 
 
 def test_nothing_optional_is_imported_unless_something_is_drawn(tmp_path):
