@@ -47,6 +47,9 @@ output: {every: 0.02}
 
 DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
 
+PICTURES = ("matplotlib", "jinja2")
+"""Packages without which reports have no pictures."""
+
 
 @dataclass
 class Left:
@@ -228,24 +231,14 @@ def lyra(
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 
-def without_pictures(arguments: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run the program on one rank as if matplotlib and Jinja were not installed."""
+def without(packages: Sequence[str], arguments: Sequence[object], folder: Path) -> Left:
+    """Run the program on one rank as if these packages were not installed."""
     program = (
-        "import sys;"
-        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
-        "import importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
+        f"import sys; sys.modules.update(dict.fromkeys({list(packages)!r}));"
         "from lyra_petsc.cli.app import run_command_line;"
-        f"sys.exit(run_command_line({['lyra-petsc', *arguments]!r}))"
+        "sys.exit(run_command_line(['lyra-petsc', *sys.argv[1:]]))"
     )
-    return subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=folder,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    return lyra(arguments, folder, program=("-c", program))
 
 
 def done(

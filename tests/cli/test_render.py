@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from launch import SCENE, lyra, start, write_scene
+from launch import SCENE, lyra, start, without, write_scene
 from written_run import Writer, written
 
 from lyra_petsc.errors import InputError
@@ -107,13 +107,7 @@ def test_a_signal_ends_a_film_without_a_trace(tmp_path):
 
 def test_a_missing_package_is_one_line(tmp_path):
     written(tmp_path / "run")
-    program = (
-        "import sys, importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name == 'pyvista' else real(name, *rest);"
-        "from lyra_petsc.cli.app import run_command_line;"
-        "sys.exit(run_command_line(['lyra-petsc', 'render', 'run']))"
-    )
-    left = lyra([], tmp_path, program=("-c", program))
+    left = without(["pyvista"], ["render", "run"], tmp_path)
     assert left.code == 2
     assert (
         left.err

@@ -10,7 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, write_scene
+from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, without, write_scene
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -280,11 +280,7 @@ def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
 
 def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
-    program = (
-        "import lyra_petsc.extras as extras; extras.missing = lambda packages=(): ['matplotlib']; "
-        "from lyra_petsc.__main__ import main; main()"
-    )
-    left = lyra(["study", "scene.yaml"], tmp_path, program=("-c", program))
+    left = without(["matplotlib"], ["study", "scene.yaml"], tmp_path)
     assert left.code == 2
     assert left.ours == [
         "lyra-petsc: study: matplotlib is not installed; get the extra: pip install 'lyra-petsc[study]'"

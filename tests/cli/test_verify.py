@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from launch import finish, lyra, read_csv, read_json, start, wait_until, without_pictures
+from launch import PICTURES, finish, lyra, read_csv, read_json, start, wait_until, without
 
 from lyra_petsc.experiments.verification.cases import CASES
 
@@ -52,10 +52,10 @@ def test_the_page_holds_its_plots_and_unused_petsc_options_are_told(tmp_path: Pa
 
 
 def test_tables_without_the_packages_for_plots(tmp_path: Path) -> None:
-    left = without_pictures(["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
-    assert left.returncode == 0, left.stderr
-    assert "1 of 1 cases passed" in left.stdout
-    assert "pip install 'lyra-petsc[study]'" in left.stdout
+    left = without(PICTURES, ["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
+    assert left.code == 0, left.err
+    assert "1 of 1 cases passed" in left.out
+    assert "pip install 'lyra-petsc[study]'" in left.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "report.md",
         "verify.csv",

@@ -20,7 +20,7 @@ pytest.importorskip("jinja2")
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
 
-from launch import SCENE, done, finish, lyra, read_json, start, wait_until, without_pictures, write_scene
+from launch import PICTURES, SCENE, done, finish, lyra, read_json, start, wait_until, without, write_scene
 
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
@@ -157,9 +157,9 @@ def test_the_page_can_go_elsewhere_and_mistakes_are_one_line(finished: Path, tmp
 
 
 def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
-    left = without_pictures(["report", str(finished)], finished)
-    assert left.returncode == 2
-    assert "pip install 'lyra-petsc[study]'" in left.stderr
+    left = without(PICTURES, ["report", str(finished)], finished)
+    assert left.code == 2
+    assert "pip install 'lyra-petsc[study]'" in left.err
 
 
 # -- advice ------------------------------------------------------------------------------------------
