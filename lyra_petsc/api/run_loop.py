@@ -35,7 +35,7 @@ class ProgressCallbacks:
         """The initial state, or that of the checkpoint, is on disk in ``folder``."""
 
     def note(self, text: str) -> None:
-        """There is something that the user should know."""
+        """A message for the user."""
 
     def step(self, simulation: SteppedScene, report: StepReport) -> None:
         """A step was accepted and recorded."""
@@ -122,7 +122,7 @@ class _RunLoop:
             self._resumed = [*earlier.get("resumed", []), start | {"changes": changes}]
 
     def _earlier(self) -> dict[str, Any]:
-        """The summary of the run that goes on; nothing in it is needed for that."""
+        """The summary of the run that is resumed; resuming does not depend on it."""
         try:
             return on_root(self._comm, lambda: read_summary(self._folder / "summary.json")) or {}
         except InputError as error:

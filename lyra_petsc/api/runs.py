@@ -34,7 +34,7 @@ def run(
     on_step: OnStep | None = None,
     comm: MPI.Comm | None = None,
 ) -> StoredRun:
-    """What `lyra_petsc.run` does beside showing progress, with its parameters and errors; collective."""
+    """`lyra_petsc.run` without showing progress; same parameters and errors; collective."""
     comm = MPI.COMM_WORLD if comm is None else comm
     loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
     refuse_mixed_options(loaded)

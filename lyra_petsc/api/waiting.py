@@ -1,4 +1,4 @@
-"""Whether ranks wait for processors, and for how many ranks there are processors."""
+"""Detects ranks that wait for a processor, and how many ranks the processors suffice for."""
 
 from __future__ import annotations
 

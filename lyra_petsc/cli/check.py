@@ -74,7 +74,7 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
     outline = problem.outline
     blocks = int(ranks[:, 2].sum())
     time = scene.time
-    if time.analysis == "static":
+    if time.static:
         plan_of_steps = f"load factor to {control.end:g}, first increment {control.step:g}; a state at each"
     else:
         steps = _count(control.end / control.step)
@@ -120,14 +120,14 @@ def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
 
 
 def _fences(scene: Scene) -> list[tuple[str, str]]:
-    """What stands around gmsh, where the scene has scripts for it."""
+    """How gmsh is sandboxed; only for scenes with gmsh scripts."""
     if not scene.has_scripts:
         return []
     return [("gmsh's fences", in_words(standing(), trusted=scene.trusts_meshes))]
 
 
 def _contact(scene: Scene) -> list[tuple[str, str]]:
-    """What sheets meet, and how, where they meet anything."""
+    """What the sheets are in contact with, and the parameters; nothing without contact."""
     contact = scene.contact
     if contact is None:
         return []

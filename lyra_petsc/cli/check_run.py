@@ -51,7 +51,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     scene = on_root(comm, lambda: run.scene)
     look = on_each(comm, lambda: RunCrossings(run))
     row = PAIRS + (INSIDE if scene.obstacles else "")
-    time = "load factor" if scene.time.analysis == "static" else "time [s]"
+    time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
     _say(comm, f"{folder}: {len(run)} states; pairs of triangles that cross, with")
     _say(comm, row.format("state", time, *heads) + "first")
@@ -74,7 +74,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
 
 
 class _Found(NamedTuple):
-    """What is told of a state: the numbers of its row, and what is named."""
+    """The crossings in one state: the counts of its row, and the names to print."""
 
     counts: tuple[int, ...]
     first: str

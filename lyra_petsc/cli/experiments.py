@@ -37,7 +37,7 @@ WIDTH = 150
 
 
 def watched(comm: MPI.Comm, kept: Callable[[], str] = str) -> Callable[[], None]:
-    """What is to be called before every step; raises `Interrupted` on all ranks when a signal has come.
+    """A function to call before every step; it raises `Interrupted` on all ranks after a signal.
 
     ``kept`` gives the words after the signal's name: what has been done, and how to go on.
     """
@@ -63,7 +63,7 @@ def command(comm: MPI.Comm, verb: str, words: Sequence[str]) -> list[str]:
 
 
 def words_of(options: Mapping[str, Any]) -> list[str]:
-    """Options as they are written: those of many values again and again, those without a value not at all."""
+    """Options as typed: repeated for each of several values, left out where they have no value."""
     words = []
     for name, given in options.items():
         for value in given if isinstance(given, tuple | list) else [given]:

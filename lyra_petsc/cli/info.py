@@ -1,4 +1,4 @@
-"""``info``: versions and configuration of what the program runs on, what does not fit together, remedies."""
+"""``info``: versions and configuration of the installation, parts that do not fit together, and remedies."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class ProgressBar:
                 print(text, file=self._stream, flush=True)
 
     def _draw(self, fraction: float, state: str) -> None:
-        """Move the bar, which is seen some times a second and at the end."""
+        """Move the bar, which is redrawn a few times a second and at the end."""
         if self._bar is None:
             return
         with suppress(OSError):
@@ -79,7 +79,7 @@ class ProgressBar:
                 self._bar.refresh()
 
     def _left(self, done: float, whole: float = 1.0) -> float:
-        """Seconds that the rest will take, as long as what was done since the first call; NaN at that."""
+        """Estimated seconds left, at the mean speed since the first call; NaN at the first call."""
         began, before = self._first = self._first or (self._clock(), done)
         if done <= before:
             return 0.0 if done >= whole else math.nan

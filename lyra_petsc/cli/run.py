@@ -74,7 +74,7 @@ def run(
 
 
 def say(text: str) -> None:
-    """Print a line for whoever waits; a run goes on if nobody reads it."""
+    """Print a line for the user; a closed pipe does not end the run."""
     with suppress(OSError):
         print(text, file=sys.stderr, flush=True)
 
@@ -113,7 +113,7 @@ class TerminalProgress(ProgressCallbacks):
             self._progress.say(text)
 
     def _tell_of_compilation(self) -> None:
-        """Say why nothing moves, before the bar stands or above it."""
+        """Tell the user that kernels are being compiled, above the bar once there is one."""
         text = "compiling kernels, once, about 15 s"
         if not COMPILATION.kept:
             self._told_of_place = True

@@ -70,7 +70,7 @@ def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said
 
 
 def _words(plan: Plan) -> list[str]:
-    """What repeats the study from the beginning."""
+    """The arguments that repeat the study from the beginning."""
     request, varied = plan.request, []
     for axis in plan.axes:
         values = ",".join(f"{value!r}" if isinstance(value, float) else value for value in axis.values)
@@ -82,7 +82,7 @@ def _words(plan: Plan) -> list[str]:
 
 
 def _close(comm: MPI.Comm, view: Study, folder: Path) -> None:
-    """Words at the end, and the ways in which a study fails as a whole."""
+    """Print the outcome; raises if the study failed as a whole."""
     rows = view.work.rows
     done = sum(row.passed for row in rows)
     if comm.rank == 0:

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.mesh.build import mesh_of
-from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import active
 from lyra_petsc.terms.rest import RestShape
@@ -98,8 +97,6 @@ class Body:
     Parameters
     ----------
     scene : Scene
-    mesh : Mesh, optional
-        Built from the scene unless given.
 
     Raises
     ------
@@ -107,9 +104,8 @@ class Body:
         Whatever in the meshes cannot be simulated.
     """
 
-    def __init__(self, scene: Scene, mesh: Mesh | None = None) -> None:
-        self.scene = scene
-        self.mesh = mesh_of(scene) if mesh is None else mesh
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.mesh = scene, mesh_of(scene)
         self.rest = RestShape(scene, self.mesh)
 
     @cached_property

@@ -33,7 +33,7 @@ def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
 def _surface(
     source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None
 ) -> tuple[TriangleSurface, list[str]]:
-    """An obstacle at t = 0 without points in no triangle, and what the reader says of its file."""
+    """The surface of an obstacle at t = 0, without unused points, and the notes of the reader of its file."""
     try:
         sheet = _read(source, trust_scripts, tell)
         used, numbers = np.unique(sheet.triangles, return_inverse=True)

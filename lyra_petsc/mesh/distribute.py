@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Whole:
-    """What there is to distribute, on rank 0.
+    """The whole mesh with its elements, on rank 0.
 
     Attributes
     ----------

@@ -115,7 +115,7 @@ def _run_gmsh(
     meshed: BinaryIO,
     tell: Callable[[str], None] | None,
 ) -> None:
-    """Have the script meshed into ``meshed`` by another process; its failures are ours."""
+    """Mesh the script in another process, which writes ``meshed``; its errors are raised here."""
     memory = available_memory()
     job = {
         "script": str(script),
@@ -158,7 +158,7 @@ def _run_gmsh(
 
 
 def _wait(process: subprocess.Popen[bytes], told: BinaryIO, tell: Callable[[str], None]) -> bytes:
-    """Wait for gmsh's process, with a word now and then; what it wrote to stderr."""
+    """Wait for gmsh's process, telling the user now and then; returns what it wrote to stderr."""
     began = time.monotonic()
     pause = FIRST_WORD
     while time.monotonic() - began < _WAIT * (SCRIPT_SECONDS + MESH_SECONDS):

@@ -115,8 +115,7 @@ class _Script:
         return end if within and end <= last else last
 
 
-@dataclass(frozen=True)
-class CheckedScript:
+class ScriptFiles:
     """A script and the files it includes, as gmsh may see them.
 
     Attributes
@@ -125,10 +124,17 @@ class CheckedScript:
         What was read, the script first.
     contents : dict of str to bytes
         By their place relative to the script's folder; the first is the script.
+    scripts : list
+        Those of the files that are scripts.
     """
 
-    files: list[Path]
-    contents: dict[str, bytes]
+    def __init__(self, path: Path) -> None:
+        self._root = path.resolve().parent
+        self.files: list[Path] = []
+        self.contents: dict[str, bytes] = {}
+        self.scripts: list[_Script] = []
+        self._places: set[str] = set()
+        self._read_script(path, path.name)
 
     def write(self, folder: Path) -> Path:
         """Write them below ``folder``; where the script is."""
@@ -140,45 +146,11 @@ class CheckedScript:
             (folder / place).write_bytes(content)
         return folder / next(iter(self.contents))
 
-
-def check_script(path: Path) -> CheckedScript:
-    """Read a script and what it includes, and refuse all that does not describe geometry and mesh size.
-
-    ``Include`` and ``Merge`` may name files in or below the script's folder, relative to the script that
-    includes. Meshes and CAD files are recognised by content and ending; all other files are scripts, as is
-    the .opt that gmsh reads beside any file, and are checked alike.
-
-    Raises
-    ------
-    InputError
-        A statement that is not on the list, with line and word; text that gmsh would read otherwise than it
-        looks; a file outside the folder.
-    """
-    reading = _Reading(path)
-    reading.script(path, path.name)
-    names = set().union(*(script.names for script in reading.scripts))
-    for script in reading.scripts:
-        for number, token in enumerate(script.tokens):
-            if token.kind == "word":
-                _check_word(script, number, names)
-    return CheckedScript(reading.files, reading.contents)
-
-
-class _Reading:
-    """The files of a script, read one after the other."""
-
-    def __init__(self, path: Path) -> None:
-        self._root = path.resolve().parent
-        self.files: list[Path] = []
-        self.contents: dict[str, bytes] = {}
-        self.scripts: list[_Script] = []
-        self._scripts: set[str] = set()
-
-    def script(self, path: Path, place: str) -> None:
+    def _read_script(self, path: Path, place: str) -> None:
         """Take a file for a script."""
-        if place in self._scripts:
+        if place in self._places:
             return
-        self._scripts.add(place)
+        self._places.add(place)
         data = read_bytes(path).removeprefix(b"\xef\xbb\xbf")
         text = data.decode("latin-1")
         if found := _UNPRINTED.search(text):
@@ -194,15 +166,15 @@ class _Reading:
                 self._follow(script, number, place)
         self._options(path, place)
 
-    def _merged(self, path: Path, place: str) -> None:
+    def _read_any(self, path: Path, place: str) -> None:
         """Take a file for what its content says it is."""
         if place in self.contents:
-            if place not in self._scripts and not _is_data(path.name, self.contents[place]):
-                self.script(path, place)
+            if place not in self._places and not _is_data(path.name, self.contents[place]):
+                self._read_script(path, place)
             return
         data = read_bytes(path)
         if not _is_data(path.name, data):
-            self.script(path, place)
+            self._read_script(path, place)
             return
         self._keep(path, place, data)
         self._options(path, place)
@@ -217,7 +189,7 @@ class _Reading:
         if options.is_file():
             if not options.resolve().is_relative_to(self._root):
                 raise InputError("is not in the folder of the script", file=options)
-            self.script(options, place + ".opt")
+            self._read_script(options, place + ".opt")
 
     def _follow(self, script: _Script, number: int, place: str) -> None:
         """Check the file that a statement includes."""
@@ -238,11 +210,33 @@ class _Reading:
         if not exists:
             raise script.refusal(command.line, f"includes {quoted}, which does not exist")
         if command.text == "Include":
-            if target in self.contents and target not in self._scripts:
+            if target in self.contents and target not in self._places:
                 raise script.refusal(command.line, f"{shown}, which is no script")
-            self.script(there, target)
+            self._read_script(there, target)
         else:
-            self._merged(there, target)
+            self._read_any(there, target)
+
+
+def check_script(path: Path) -> ScriptFiles:
+    """Read a script and what it includes, and refuse all that does not describe geometry and mesh size.
+
+    ``Include`` and ``Merge`` may name files in or below the script's folder, relative to the script that
+    includes. Meshes and CAD files are recognised by content and ending; all other files are scripts, as is
+    the .opt that gmsh reads beside any file, and are checked alike.
+
+    Raises
+    ------
+    InputError
+        A statement that is not on the list, with line and word; text that gmsh would read otherwise than it
+        looks; a file outside the folder.
+    """
+    checked = ScriptFiles(path)
+    names = set().union(*(script.names for script in checked.scripts))
+    for script in checked.scripts:
+        for number, token in enumerate(script.tokens):
+            if token.kind == "word":
+                _check_word(script, number, names)
+    return checked
 
 
 def _place(includer: str, name: str) -> str | None:

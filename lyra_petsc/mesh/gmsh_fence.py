@@ -1,4 +1,4 @@
-"""What the kernel holds back from the process that gmsh runs in: seccomp and Landlock, through ctypes.
+"""The sandbox of gmsh's process: the kernel's seccomp and Landlock, through ctypes.
 
 Raised once gmsh and its libraries are loaded, and never lowered again: the process can start no program and
 no other process, open no socket, and create, change or remove no file; it goes on writing to what is open.
@@ -120,7 +120,7 @@ class _Beneath(ctypes.Structure):
 
 
 def raise_fence(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
-    """Give up all that gmsh does not need, for all threads of this process and for good.
+    """Drop all rights that gmsh does not need, for all threads of this process, irrevocably.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def raise_fence(readable: Iterable[str | os.PathLike[str]] | None) -> list[str]:
 
 
 def in_words(stands: Sequence[str], *, trusted: bool = False) -> str:
-    """Which fences stand around gmsh, for the user."""
+    """How gmsh is sandboxed, in words for the user."""
     first = (
         "scripts are trusted, whatever they say" if trusted else "scripts are read by a list of statements"
     )
@@ -153,7 +153,7 @@ def in_words(stands: Sequence[str], *, trusted: bool = False) -> str:
 
 @cache
 def standing() -> list[str]:
-    """What a process like gmsh's can raise here, tried in one."""
+    """Which parts of the sandbox this system supports, tried in a process like gmsh's."""
     code = "import json, lyra_petsc.mesh.gmsh_fence as fence; print(json.dumps(fence.raise_fence(None)))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
     try:

@@ -33,7 +33,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Source:
-    """One source of a mesh: its name or file, and how much of the mesh is its."""
+    """One source of a mesh: its name or file, and its numbers of vertices and triangles."""
 
     label: str
     n_vertices: int

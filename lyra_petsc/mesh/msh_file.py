@@ -53,13 +53,12 @@ class NoTrianglesError(MshError):
     """A sound file without a surface mesh."""
 
 
-def read_msh(path: Path, *, note_loose: bool = True) -> Sheet:
+def read_msh(path: Path) -> Sheet:
     """Read a .msh file.
 
     Vertices come in the order in which the file lists its nodes; those in no triangle are dropped, with
-    a note unless ``note_loose`` is False. Triangles come in file order. Quads are split on the shorter
-    diagonal, elements of higher order reduced to their corners, with a note. A physical group without a
-    name is called by its number.
+    a note. Triangles come in file order. Quads are split on the shorter diagonal, elements of higher order
+    reduced to their corners, with a note. A physical group without a name is called by its number.
 
     Raises
     ------
@@ -78,7 +77,7 @@ def read_msh(path: Path, *, note_loose: bool = True) -> Sheet:
         physical = _entities(content)
         section = "Elements"
         blocks = _elements(content, physical)
-        return assemble(tags, points, blocks, _names(content), note_loose=note_loose)
+        return assemble(tags, points, blocks, _names(content), note_loose=True)
     except NoTrianglesError as error:
         raise InputError(f"the mesh has {error}", file=path) from None
     except MshError as error:

@@ -29,7 +29,7 @@ MOST_CORNERS = 256
 
 @dataclass
 class _Raw:
-    """What the lines say, flat; corner numbers from 0, -1 for a missing ``vt``."""
+    """The content of the lines as flat lists; corner numbers from 0, -1 for a missing ``vt``."""
 
     points: array[float] = field(default_factory=lambda: array("d"))
     uv: array[float] = field(default_factory=lambda: array("d"))

@@ -45,14 +45,14 @@ class MakesMotion(Protocol):
 
 
 class _Carried:
-    """What a rigid motion T carries from where it is at t = 0: by T(t) T(0)⁻¹."""
+    """A body that a rigid motion T moves from its place at t = 0: by T(t) T(0)⁻¹."""
 
     points: Array
     motion: RigidMotion | None
 
     def displacement(self, time: float) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) [m] that lead from t = 0 to a time [s]."""
-        if self.motion is None:
+        if self.motion is None or time == 0.0:  # where rounding would move it
             return np.eye(3), np.zeros(3)
         (start, from_), (turn, to) = self.motion.transform(0.0), self.motion.transform(time)
         rotation = turn @ start.T

@@ -1,9 +1,8 @@
-"""Start positions that contact cannot begin with: what crosses, or is in an obstacle."""
+"""What of a sheet is in an obstacle, and start positions that contact cannot begin with."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,14 +62,16 @@ def refuse_crossings(
         )
     remedy = "move the sheet, or the obstacle"
     for obstacle in obstacles:
-        key = f"obstacles.{obstacle.name}"
-        if _is_mesh(obstacle, scene):
+        key, shape = f"obstacles.{obstacle.name}", (scene.obstacles or {})[obstacle.name]
+        if shape.mesh is not None and isinstance(obstacle, Solid):
             pairs = mutual_crossings(positions, triangles, obstacle.points, obstacle.triangles)
             if len(pairs):
                 named = (f"{a} and {b} {around(a)}" for a, b in pairs[:NAMED].tolist())
                 count = _counted(len(pairs), "pair", "of a triangle of the sheet and one of it", "cross")
                 refuse(key, count, named, remedy)
-        elif len(inside := _overlaps(positions, triangles, obstacle).triangles):
+            continue
+        inside = overlaps_of(obstacle, positions, triangles, 0.0, is_box=shape.box is not None).triangles
+        if len(inside):
             where = "into it" if isinstance(obstacle, Solid) else "beyond it"
             named = (f"{a} {around(a)}" for a in inside[:NAMED].tolist())
             refuse(
@@ -78,18 +79,24 @@ def refuse_crossings(
             )
 
 
-def _is_mesh(obstacle: Solid | Container, scene: Scene) -> TypeGuard[Solid]:
-    return (scene.obstacles or {})[obstacle.name].mesh is not None
+def overlaps_of(
+    obstacle: Solid | Container, positions: Array, triangles: Ints, time: float, *, is_box: bool
+) -> Overlaps:
+    """What of a sheet at positions (V, 3) [m] is at a time [s] where an obstacle does not let it.
 
-
-def _overlaps(positions: Array, triangles: Ints, obstacle: Solid | Container) -> Overlaps:
-    """What of a sheet is where a sphere, capsule, box or plane does not let it."""
-    sheet, points = (positions, triangles), obstacle.points
-    if isinstance(obstacle, Solid):
-        return in_ball(*sheet, points, obstacle.radius) if obstacle.radius else in_box(*sheet, points)
-    if obstacle.kind == "planes":
-        return beyond_planes(*sheet, points, obstacle.normals)
-    return out_of_ball(*sheet, points, obstacle.radius)
+    ``is_box`` tells a box from a mesh, of which only the triangles that cross it are found.
+    """
+    sheet, points = (positions, triangles), obstacle.positions(time)
+    if isinstance(obstacle, Container):
+        if obstacle.kind == "planes":
+            return beyond_planes(*sheet, points, obstacle.normals_at(time))
+        return out_of_ball(*sheet, points, obstacle.radius)
+    if obstacle.radius > 0.0:
+        return in_ball(*sheet, points, obstacle.radius)
+    if is_box:
+        return in_box(*sheet, points)
+    crossed = mutual_crossings(*sheet, points, obstacle.triangles)[:, 0]
+    return Overlaps(np.empty(0, np.int64), np.empty((0, 2), np.int64), np.unique(crossed))
 
 
 def _counted(count: int, noun: str, of: str, verb: str) -> str:

@@ -26,7 +26,7 @@ class Background:
         self._work: Future[None] | None = None
 
     def begin(self, work: Callable[[], None]) -> None:
-        """Start a task on rank 0; `settle` has to come before."""
+        """Start a task on rank 0; call `settle` before."""
         if self._comm.rank == 0:
             self._work = self._worker.submit(work)
 

@@ -33,7 +33,7 @@ Scalars = dict[str, Any]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What was read back.
+    """The content of a checkpoint.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ def checkpoint_file(
     edge_arrays: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     elements: Mapping[str, NDArray[Any]] = MappingProxyType({}),
 ) -> NewFile:
-    """A newer checkpoint, to be written; then the old one is kept as the previous.
+    """A new checkpoint to write to; the old one is kept as the previous.
 
     Parameters
     ----------

@@ -31,17 +31,20 @@ def _velocity(problem: Problem) -> Array:
 
 
 def _displacement(problem: Problem) -> Array:
+    """From the positions at t = 0."""
     assert problem.start is not None  # see `check_field`
     moved: Array = problem.system.x[: problem.points.n_vertices] - problem.start
     return moved
 
 
 def _green_strain(problem: Problem) -> Array:
+    """In material axes; see `tensors`."""
     strain, _ = problem.membrane.strain_and_stress(problem.system.x)
     return six_components(strain[: problem.membrane.n_owned])
 
 
 def _stress(problem: Problem) -> Array:
+    """Second Piola-Kirchhoff, in material axes; see `tensors`."""
     _, stress = problem.membrane.strain_and_stress(problem.system.x)
     return six_components(stress[: problem.membrane.n_owned])
 
@@ -85,6 +88,7 @@ def _bending_energy(problem: Problem) -> Array:
 
 
 def _curvature(problem: Problem) -> Array:
+    """Sum of the principal curvatures."""
     return _on_vertices(
         problem,
         # the angle of a collapsed triangle is undefined
@@ -107,6 +111,7 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 
 def _contact_pressure(problem: Problem) -> Array:
+    """From the normal forces on both sides together."""
     contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
     forces = contact.normal_forces(system.x, system.active.frozen[contact])
     return _per_area(problem, np.arange(len(forces), dtype=np.int32), forces)
@@ -118,11 +123,10 @@ def _rank(problem: Problem) -> Array:
 
 @dataclass(frozen=True)
 class Field:
-    """Where a field lives, what it is, and how it is computed on one rank (owned rows)."""
+    """A field, what its rows belong to, how one rank computes its own, and the terms that it needs one of."""
 
     name: str
     on: Literal["vertex", "triangle"]
-    meaning: str
     compute: Callable[[Problem], Array]
     terms: tuple[str, ...] = ("membrane",)
 
@@ -133,36 +137,19 @@ _BENDING = ("bending", "midedge")
 FIELDS = {
     field.name: field
     for field in (
-        Field("velocity", "vertex", "m/s, (V, 3)", _velocity),
-        Field("displacement", "vertex", "from the positions at t = 0, m, (V, 3)", _displacement),
-        Field("green_strain", "triangle", "in material axes, (F, 6): see `tensors`", _green_strain),
-        Field("stress", "triangle", "second Piola-Kirchhoff, N/m, likewise, (F, 6)", _stress),
-        Field("membrane_energy", "triangle", "J per m² of rest area, (F,)", _membrane_energy),
-        Field(
-            "bending_energy",
-            "vertex",
-            "J per m² of rest area, averaged, (V,)",
-            _bending_energy,
-            _BENDING,
-        ),
-        Field("curvature", "vertex", "κ1 + κ2, 1/m, averaged, (V,)", _curvature, _BENDING),
-        Field(
-            "curvature_tensor",
-            "triangle",
-            "in material axes, 1/m, of bending_model: midedge, (F, 6): see `tensors`",
-            _curvature_tensor,
-            ("midedge",),
-        ),
-        Field(
-            "contact_pressure",
-            "vertex",
-            "normal forces of contact on both sides together, N per m² of rest area, (V,)",
-            _contact_pressure,
-            ("contact",),
-        ),
-        Field("rank", "vertex", "owning rank, (V,)", _rank),
+        Field("velocity", "vertex", _velocity),
+        Field("displacement", "vertex", _displacement),
+        Field("green_strain", "triangle", _green_strain),
+        Field("stress", "triangle", _stress),
+        Field("membrane_energy", "triangle", _membrane_energy),
+        Field("bending_energy", "vertex", _bending_energy, _BENDING),
+        Field("curvature", "vertex", _curvature, _BENDING),
+        Field("curvature_tensor", "triangle", _curvature_tensor, ("midedge",)),
+        Field("contact_pressure", "vertex", _contact_pressure, ("contact",)),
+        Field("rank", "vertex", _rank),
     )
 }
+"""By their names; units stand in `scene.schema.FIELD_UNITS`, of densities per rest area."""
 
 
 def chosen(problem: Problem) -> list[Field]:

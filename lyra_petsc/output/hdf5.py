@@ -83,11 +83,11 @@ class NewFile:
 
     @property
     def part(self) -> Path:
-        """What it is called until all files are complete."""
+        """Its name until all files are complete."""
         return self.path if self.places is not None else self.path.with_name(self.path.name + ".part")
 
     def discard(self) -> None:
-        """Remove what is not complete."""
+        """Remove the incomplete file."""
         if self.places is None:
             self.part.unlink(missing_ok=True)
 
@@ -296,7 +296,7 @@ def cannot_write(path: Path, error: BaseException) -> OutputError:
 
 
 def write_slabs(path: Path, part: Path, pieces: Sequence[Piece], comm: MPI.Comm) -> None:
-    """Write each rank's pieces; collective. What other machines than rank 0's wrote is on the disk then.
+    """Write each rank's pieces; collective. Pieces from other machines than rank 0's are synced to disk.
 
     Parameters
     ----------

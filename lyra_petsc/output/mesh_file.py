@@ -137,7 +137,7 @@ def _parts(group: Group) -> dict[str, NDArray[np.int64]]:
 
 
 def _difference(stored: StoredMesh, mesh: Mesh, used: set[str]) -> str:
-    """What sets a mesh apart from the one in the file, in words; empty if nothing does."""
+    """How a mesh differs from the one in the file, in words; empty if it does not."""
     counts = len(stored.rest), len(stored.triangles)
     if counts != (mesh.n_vertices, mesh.n_triangles):
         ours_too = f"{mesh.n_vertices} vertices and {mesh.n_triangles} triangles"

@@ -271,7 +271,7 @@ class StoredRun:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """What changes when a file is replaced or changed."""
+    """A mark that changes when a file is replaced or changed."""
     try:
         status = path.stat()
     except OSError:
@@ -374,7 +374,7 @@ def _place(element: Element) -> Place:
 
 
 class StateArrays(Sequence[NDArray[Any]]):
-    """What all states hold under one name: ``[i]`` reads one array, ``[i:j]`` reads nothing yet.
+    """One array of every state: ``[i]`` reads the array of one, ``[i:j]`` selects states, unread.
 
     ``numpy.asarray`` of it reads them all, stacked along a first axis.
 

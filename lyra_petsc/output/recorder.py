@@ -183,7 +183,7 @@ class Recorder:
         return self._vertices.look_up(own, numbers.ravel()).reshape(numbers.shape), rows[:, n:]
 
     def _check_kind(self, folder: Path, checkpoint: Checkpoint) -> None:
-        """Refuse what cannot go on from the checkpoint (rank 0)."""
+        """Refuse a scene that cannot continue from the checkpoint (rank 0)."""
         now = self._simulation.scene.time.scheme
         before = checkpoint.scalars.get("scheme", now)
         if "static" in (now, before) and now != before:
@@ -196,7 +196,7 @@ class Recorder:
             check_columns(folder / name, columns)
 
     def _note_changes(self, before: Path) -> None:
-        """Tell what the scene says otherwise than the one in the folder."""
+        """Note in which keys the scene differs from the one in the folder."""
         scene, notes = self._simulation.scene, self._simulation.notes
         try:
             self.changes = on_root(self._comm, lambda: changes(before, scene))
@@ -253,7 +253,7 @@ class Recorder:
     # -- a step --------------------------------------------------------------------------------------
 
     def record(self, report: StepReport) -> None:
-        """Everything that the step just accepted has to leave on disk, be it during the next ones."""
+        """Write all that the step just accepted requires, partly in the background of the next steps."""
         self._steps_since += 1
         due = self._write_row(report)
         control = self._simulation.control

@@ -56,7 +56,7 @@ def _check_resumable(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class FolderKind:
-    """What a folder is for.
+    """The purpose of a folder: a run or a study.
 
     Attributes
     ----------
@@ -438,7 +438,7 @@ class FolderLock:
         return "".join(c for c in text if c.isprintable()) or "a process that has not said which"
 
     def _stands(self) -> bool:
-        """Whether the file locked is still the one that others would find."""
+        """Whether the locked file is still the one at its path."""
         try:
             return os.path.samestat(os.fstat(self.descriptor), os.stat(self.path))
         except FileNotFoundError:

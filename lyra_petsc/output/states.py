@@ -315,7 +315,7 @@ class _Row:
 
 
 def _forget(path: Path, last_step: int) -> None:
-    """Say that a file holds no states behind ``last_step``."""
+    """Mark in a file that it holds no states after ``last_step``."""
     with open_stored(path) as file:
         if TABLE not in file:
             return

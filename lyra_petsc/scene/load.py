@@ -90,7 +90,7 @@ def _materials(data: Any) -> list[dict[str, Any]]:
 
 
 def bent_as_stored(scene: Scene, stored: Path) -> Scene:
-    """A scene that a run goes on with: where neither it nor the ``stored`` one names a bending model, hinges.
+    """The scene of a resumed run: hinges where neither it nor the ``stored`` one names a bending model.
 
     As it is where the stored one cannot be read.
     """
@@ -151,7 +151,7 @@ def _checked(
 
 
 def _read(path: Path, text: str) -> Any:
-    """The scene as plain values in our keys, whichever program the file was written for."""
+    """The scene as plain values with the keys of this program, also from a file of the original one."""
     start = text.lstrip()
     if path.suffix.lower() == ".json" or start.startswith(("//", "/*")):
         data = parse_json(text, file=path)

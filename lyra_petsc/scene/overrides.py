@@ -107,7 +107,7 @@ def _step(
     rest: list[str],
     option: str,
 ) -> Any:
-    """One part of the path: descend, or set ``value`` if no ``rest`` follows; ``walked`` grows by it."""
+    """Follow one part of the path, which is added to ``walked``; set ``value`` if no ``rest`` follows."""
     if isinstance(target, list):
         # Python converts no number of thousands of digits
         if not part.isdecimal() or len(part) > 9 or int(part) > len(target):

@@ -79,7 +79,7 @@ def parse_yaml(text: str, *, file: object | None, key: str | None = None) -> Any
 
 
 def _entries(node: Node | None, known: dict[int, float]) -> float:
-    """Entries below a node, those behind an anchor counted wherever it is named; inf in a loop.
+    """Number of entries below a node, those of an anchor counted at each use; inf for a loop.
 
     ``known`` holds the counts by the nodes' identities.
     """

@@ -51,9 +51,9 @@ def shown(value: object) -> str:
     return cut(text)
 
 
-def cut(text: str, most: int = 60) -> str:
+def cut(text: str) -> str:
     """``text``, or its beginning where it is too long to be quoted."""
-    return text if len(text) <= most else text[: most - 3] + "..."
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def one_line(text: str) -> str:

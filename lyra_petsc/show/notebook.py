@@ -66,7 +66,7 @@ class Media:
 
 
 class Run(StoredRun):
-    """The results of a run; reads what was asked for and keeps no file open.
+    """The results of a run; reads files only when asked for their content, and keeps none open.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def run(
         bar = None
         if in_notebook() if progress is None else progress:
             scene = load(scene)
-            bar = NotebookProgress(scene.time.end if scene.time.analysis != "static" else 1.0)
+            bar = NotebookProgress(1.0 if scene.time.static else scene.time.end)
 
         def step(report: StepReport) -> None:
             if bar is not None:

@@ -20,8 +20,15 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 
-EARLY = ("cli.app", "kernels.cache", "scene.load", "scene.dump")
-"""Modules that take long to load, and know nothing of MPI."""
+EARLY = (
+    *("cli.app", "cli.progress", "scene.load", "scene.dump", "scene.json_schema", "mesh.build"),
+    *("mesh.obj_file", "mesh.msh_file", "mesh.geo_file", "kernels.scatter", "terms.registry"),
+    *("terms.membrane", "terms.bending", "terms.prescribed_handles", "terms.gravity"),
+    *("linear.pattern", "linear.block_rows", "linear.gauss_seidel", "linear.edge_couplings"),
+    *("stepping.step_control", "output.read_run", "output.run_folder"),
+    *("output.vtkhdf_file", "output.summary"),
+)
+"""Modules that runs load, and that know nothing of MPI."""
 
 DRAWING = (
     "jinja2",

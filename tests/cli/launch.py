@@ -7,6 +7,7 @@ imports (see ``forks``), which take longer than most of these runs.
 from __future__ import annotations
 
 import atexit
+import csv
 import json
 import os
 import select
@@ -15,7 +16,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,9 @@ output: {every: 0.02}
 
 DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
 
+PICTURES = ("matplotlib", "jinja2")
+"""Packages without which reports have no pictures."""
+
 
 @dataclass
 class Left:
@@ -66,6 +70,18 @@ def write_scene(folder: Path, text: str = SCENE, name: str = "scene.yaml") -> Pa
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What a JSON file holds."""
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
 
 
 def command(
@@ -124,6 +140,17 @@ def finish(process: subprocess.Popen[str], patience: float = PATIENCE) -> Left:
     return Left(process.returncode, out, err)
 
 
+def wait_until(
+    condition: Callable[[], object], process: subprocess.Popen[str] | None = None, patience: float = PATIENCE
+) -> None:
+    """Wait for what a started process does; it fails the test where it ends before, or takes too long."""
+    deadline = time.monotonic() + patience
+    while not condition():
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "the program does not get on"
+        time.sleep(0.01)
+
+
 class Forks:
     """Starts ``forks`` and asks it for runs."""
 
@@ -131,7 +158,9 @@ class Forks:
         self._process: subprocess.Popen[bytes] | None = None
         self._heard = b""
 
-    def run(self, arguments: Sequence[object], folder: Path, patience: float) -> Left:
+    def run(
+        self, arguments: Sequence[object], folder: Path, extra: Mapping[str, str] | None, patience: float
+    ) -> Left:
         """A run to its end."""
         if self._process is None:
             self._process = subprocess.Popen(
@@ -148,7 +177,7 @@ class Forks:
         asked = {
             "arguments": [str(argument) for argument in arguments],
             "folder": str(folder),
-            "environment": environment(),
+            "environment": environment(extra),
         }
         self._process.stdin.write(json.dumps(asked).encode() + b"\n")
         pid = self._answer(PATIENCE)
@@ -197,29 +226,19 @@ def lyra(
     **keywords: Any,
 ) -> Left:
     """Run the program in ``folder`` to its end."""
-    if ranks == 1 and not extra and not keywords:
-        return FORKS.run(arguments, folder, patience)
+    if ranks == 1 and not keywords:
+        return FORKS.run(arguments, folder, extra, patience)
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 
-def without_pictures(arguments: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run the program on one rank as if matplotlib and Jinja were not installed."""
+def without(packages: Sequence[str], arguments: Sequence[object], folder: Path) -> Left:
+    """Run the program on one rank as if these packages were not installed."""
     program = (
-        "import sys;"
-        "sys.modules['matplotlib'] = None; sys.modules['jinja2'] = None;"
-        "import importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name in ('matplotlib', 'jinja2') else real(name, *rest);"
+        f"import sys; sys.modules.update(dict.fromkeys({list(packages)!r}));"
         "from lyra_petsc.cli.app import run_command_line;"
-        f"sys.exit(run_command_line({['lyra-petsc', *arguments]!r}))"
+        "sys.exit(run_command_line(['lyra-petsc', *sys.argv[1:]]))"
     )
-    return subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=folder,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    return lyra(arguments, folder, program=("-c", program))
 
 
 def done(

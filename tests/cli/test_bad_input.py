@@ -138,7 +138,12 @@ def test_every_case_makes_a_mistake() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.quick) if name in QUICK else name for name in MISTAKES]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.quick] * (name in QUICK))
+        for name in MISTAKES
+        if name in QUICK or name in OF_PETSC
+    ],
 )
 def test_a_mistake_is_one_line(tmp_path: Path, name: str) -> None:
     arguments, words = set_out(tmp_path, name)
@@ -157,9 +162,12 @@ def test_a_job_of_two_ranks_leaves_with_one_line(tmp_path: Path, name: str) -> N
     assert listing(tmp_path) == before
 
 
-@pytest.fixture(scope="module")
-def together(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Listing, list[Left]]]:
-    """What every mistake but PETSc's left on each of two ranks, made one after the other in one job."""
+@pytest.fixture(scope="module", params=[1, 2])
+def together(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[Path, Listing, list[Left]]]:
+    """What every mistake but PETSc's left on each rank, made one after the other in one job."""
+    ranks = request.param
     work = tmp_path_factory.mktemp("together")
     made = {}
     for number, name in enumerate(name for name in MISTAKES if name not in OF_PETSC):
@@ -168,21 +176,19 @@ def together(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, 
         made[name] = folder, set_out(folder, name)[0], listing(folder)
     (work / "one_by_one.py").write_text(ONE_BY_ONE)
     (work / "mistakes.json").write_text(json.dumps([(str(f), words) for f, words, _ in made.values()]))
-    left = done([work], work, 2, program=("one_by_one.py",))
+    left = done([work], work, ranks, program=("one_by_one.py",))
     assert (left.out, left.err) == ("", "")
-    ranks = [json.loads((work / f"left-{rank}.json").read_text()) for rank in range(2)]
+    each = [json.loads((work / f"left-{rank}.json").read_text()) for rank in range(ranks)]
     return {
-        name: (folder, before, [Left(*each[number]) for each in ranks])
+        name: (folder, before, [Left(*left[number]) for left in each])
         for number, (name, (folder, _, before)) in enumerate(made.items())
     }
 
 
 @pytest.mark.parametrize("name", [name for name in MISTAKES if name not in OF_PETSC])
-def test_two_ranks_agree_on_a_mistake(
-    together: dict[str, tuple[Path, Listing, list[Left]]], name: str
-) -> None:
-    folder, before, (first, second) = together[name]
+def test_ranks_agree_on_a_mistake(together: dict[str, tuple[Path, Listing, list[Left]]], name: str) -> None:
+    folder, before, (first, *others) = together[name]
     refused(first, MISTAKES[name][2])
     assert first.err.splitlines() == first.ours
-    assert second == Left(2, "", "")
+    assert all(other == Left(2, "", "") for other in others)
     assert listing(folder) == before

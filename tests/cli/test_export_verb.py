@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import signal
-import sys
-import time
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from launch import done, finish, lyra, start
+from launch import done, finish, lyra, start, wait_until
 from written_run import position, written
 
 
@@ -64,10 +62,7 @@ sys.exit(run_command_line(sys.argv))
 def test_a_signal_leaves_nothing(tmp_path: Path, number: signal.Signals, code: int) -> None:
     written(tmp_path / "run")
     process = start(["export", "run", "--to", "obj", "--out", "out"], tmp_path, program=("-c", SLOW))
-    deadline = time.monotonic() + 30
-    while not (tmp_path / "out.part" / "run_0002.obj").exists():
-        assert time.monotonic() < deadline, sys.argv
-        time.sleep(0.02)
+    wait_until((tmp_path / "out.part" / "run_0002.obj").exists)
     process.send_signal(number)
     left = finish(process)
     assert left.code == code

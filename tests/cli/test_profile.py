@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from launch import SCENE, done, environment, write_scene
+from launch import SCENE, done, environment, read_csv, write_scene
 
 STAGE = re.compile(r"^ *\d+: +(mesh|partition|assembly|solve|balance|output): +\S+ +[\d.]+%", re.M)
 
@@ -20,8 +19,7 @@ def counts(log: str, name: str) -> list[int]:
 
 
 def column(folder: Path, name: str) -> list[int]:
-    with (folder / "history.csv").open(encoding="utf-8") as file:
-        return [int(row[name]) for row in csv.DictReader(file)]
+    return [int(row[name]) for row in read_csv(folder / "history.csv")]
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
-from launch import SCENE, lyra, start, write_scene
-from mpi4py import MPI
+from launch import SCENE, lyra, start, without, write_scene
 from written_run import Writer, written
 
-from lyra_petsc.cli.progress import FrameProgress
 from lyra_petsc.errors import InputError
 from lyra_petsc.show.render.paraview_script import SCRIPT, write_script
 from lyra_petsc.show.render.render_plan import RenderOptions, make_plan
@@ -110,13 +107,7 @@ def test_a_signal_ends_a_film_without_a_trace(tmp_path):
 
 def test_a_missing_package_is_one_line(tmp_path):
     written(tmp_path / "run")
-    program = (
-        "import sys, importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name == 'pyvista' else real(name, *rest);"
-        "from lyra_petsc.cli.app import run_command_line;"
-        "sys.exit(run_command_line(['lyra-petsc', 'render', 'run']))"
-    )
-    left = lyra([], tmp_path, program=("-c", program))
+    left = without(["pyvista"], ["render", "run"], tmp_path)
     assert left.code == 2
     assert (
         left.err
@@ -132,23 +123,6 @@ def test_a_run_that_goes_on_is_drawn_as_far_as_it_is(tmp_path):
     assert plan.states == [0, 1, 2]
     writer.write()
     assert make_plan(RenderOptions(tmp_path / "run")).states == [0, 1, 2, 3]
-
-
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    for stream, expected in (
-        (Terminal(), "50 of 100 states drawn"),
-        (io.StringIO(), "50 of 100 states drawn"),
-    ):
-        with FrameProgress(MPI.COMM_SELF, stream=stream) as progress:
-            progress.LINE_SECONDS = 0.0
-            progress.update(0, 100)
-            progress.update(50, 100)
-        assert expected in stream.getvalue()
-        assert ("━" in stream.getvalue()) == stream.isatty()
 
 
 def test_nothing_optional_is_imported_unless_something_is_drawn(tmp_path):

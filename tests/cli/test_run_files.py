@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import os
 import pty
 import select
@@ -15,7 +13,7 @@ import h5py
 import meshio
 import numpy as np
 import pytest
-from launch import SCENE, command, done, environment, write_scene
+from launch import SCENE, command, done, environment, read_csv, read_json, write_scene
 
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.states import stored_states
@@ -28,11 +26,6 @@ ALL_FIELDS = (
 )
 FULL = SCENE.replace("{every: 0.02}", "{every: 0.02, reactions: true, fields: " + ALL_FIELDS + "}")
 FULL += "probes: {corner: {nodes: [20]}, edge: {nodes: [20, 24]}}\n"
-
-
-def table(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["one rank", "two ranks"])
@@ -85,7 +78,7 @@ def test_states_stand_at_the_start_at_multiples_and_at_the_end(full: Path) -> No
 def test_fields_agree_with_the_history(full: Path) -> None:
     """Energy densities integrate to the energies of the same step; kinetic energy is ½ m v²."""
     last = states(full)[max(states(full))]
-    row = table(full / "history.csv")[-1]
+    row = read_csv(full / "history.csv")[-1]
     assert last["membrane_energy"].sum() / 32 == pytest.approx(float(row["membrane_energy"]), rel=1e-9)
     with h5py.File(full / "mesh.h5", "r") as file:
         triangles = np.array(file["mesh/triangles"])
@@ -111,7 +104,7 @@ def test_the_time_series_reads_back(full: Path) -> None:
 
 
 def test_the_history_has_its_columns_and_each_step(full: Path) -> None:
-    rows = table(full / "history.csv")
+    rows = read_csv(full / "history.csv")
     assert list(rows[0]) == list(HISTORY_COLUMNS)
     assert ",".join(HISTORY_COLUMNS) == (
         "step,time,dt,newton_iterations,linear_iterations,rejected,kinetic_energy,membrane_energy,"
@@ -122,7 +115,7 @@ def test_the_history_has_its_columns_and_each_step(full: Path) -> None:
 
 
 def test_probes_are_means_of_positions(full: Path) -> None:
-    rows = table(full / "probes.csv")
+    rows = read_csv(full / "probes.csv")
     last = states(full)[max(states(full))]["position"]
     for axis, name in enumerate("xyz"):
         assert float(rows[-1][f"corner_{name}"]) == pytest.approx(last[20, axis], abs=1e-14)
@@ -134,13 +127,13 @@ def test_the_scene_as_understood_loads_equal(full: Path) -> None:
 
 
 def test_the_summary_says_how_it_went(full: Path) -> None:
-    summary = json.loads((full / "summary.json").read_text())
+    summary = read_json(full / "summary.json")
     assert summary["outcome"] == "done"
     assert summary["sizes"] == {"vertices": 25, "triangles": 32, "unknowns": 75}
     assert summary["terms"] == ["membrane", "bending", "gravity"]
     assert {"mesh", "partition", "assembly", "solve", "balance", "output"} <= set(summary["wall_seconds"])
     assert {"petsc", "mpi", "numpy", "lyra_petsc"} <= set(summary["versions"])
-    rows = table(full / "history.csv")
+    rows = read_csv(full / "history.csv")
     assert summary["newton_iterations"] == sum(int(row["newton_iterations"]) for row in rows)
 
 
@@ -151,8 +144,8 @@ def test_reactions_of_a_sheet_at_rest_carry_its_weight(tmp_path: Path) -> None:
         "gravity: [0, 0, -9.81]", "gravity: [0, 9.81, 0]"
     )
     done(["run", write_scene(tmp_path, scene), "--out", "out"], tmp_path)
-    assert float(table(tmp_path / "out/history.csv")[-1]["kinetic_energy"]) < 1e-12
-    force = [float(table(tmp_path / "out/reactions.csv")[-1][f"handle0_{axis}"]) for axis in "xyz"]
+    assert float(read_csv(tmp_path / "out/history.csv")[-1]["kinetic_energy"]) < 1e-12
+    force = [float(read_csv(tmp_path / "out/reactions.csv")[-1][f"handle0_{axis}"]) for axis in "xyz"]
     assert force == pytest.approx([0, -0.15 * 9.81, 0], abs=1e-4 * 0.15 * 9.81)
 
 

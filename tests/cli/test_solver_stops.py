@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from launch import DIRECT, SCENE, done, lyra, write_scene
+from launch import DIRECT, SCENE, done, lyra, read_csv, read_json, write_scene
 
 from lyra_petsc.output.states import stored_states
 
 STIFF = SCENE.replace("end: 0.05, step: 0.01", "end: 0.4, step: 0.04").replace("every: 0.02", "every: 0.04")
-
-
-def history(folder: Path) -> list[dict[str, str]]:
-    with (folder / "history.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
@@ -39,7 +32,7 @@ def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks
         "triangle",
     ]
     assert "  look at out/failure.xdmf (ParaView) and out/failure.txt" in told
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["outcome"] == line.removeprefix("lyra-petsc: ")
     failure = summary["failure"]
     assert failure["kind"] == "nonlinear trouble"
@@ -56,7 +49,7 @@ def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks
         residual = failing["residual"][:]
         assert residual[failure["vertex"]["number"]] == pytest.approx(failure["vertex"]["residual"])
         assert np.abs(failing["position"][:] - before["position"][:]).max() > 0.0
-    rows = history(tmp_path / "out")
+    rows = read_csv(tmp_path / "out" / "history.csv")
     assert summary["steps"] == int(rows[-1]["step"])
     assert stored_states(tmp_path / "out")[-1].step == summary["steps"]
     assert (tmp_path / "out/checkpoint.h5").exists()
@@ -71,7 +64,7 @@ def test_a_run_resumed_with_success_leaves_no_failure(tmp_path: Path) -> None:
     assert (tmp_path / "out/failure.xdmf").exists()
     done(["run", scene, "--out", "out", "--resume", *DIRECT], tmp_path)
     assert not list((tmp_path / "out").glob("failure*"))
-    assert "failure" not in json.loads((tmp_path / "out/summary.json").read_text())
+    assert "failure" not in read_json(tmp_path / "out/summary.json")
     lyra(
         [
             "run",
@@ -98,18 +91,18 @@ def test_what_petsc_cannot_do_in_a_step_keeps_the_state(tmp_path: Path) -> None:
     (line,) = left.ours
     assert "PETSc stopped in the step from t = 0 s" in line
     assert line.endswith("check -ksp_converged_reason")
-    assert json.loads((tmp_path / "out/summary.json").read_text())["outcome"] in line
+    assert read_json(tmp_path / "out/summary.json")["outcome"] in line
 
 
 def test_a_step_that_fails_is_retried_smaller_and_recovers(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, STIFF)
     few = ["--set", "solver.max_iterations=6", "--set", "solver.hessian=regularised"]
     done(["run", scene, "--out", "out", *few, *DIRECT], tmp_path)
-    rows = history(tmp_path / "out")
+    rows = read_csv(tmp_path / "out" / "history.csv")
     rejected = [int(row["rejected"]) for row in rows]
     steps = [float(row["dt"]) for row in rows[1:]]
     assert sum(rejected) > 0
-    assert json.loads((tmp_path / "out/summary.json").read_text())["rejected"] == sum(rejected)
+    assert read_json(tmp_path / "out/summary.json")["rejected"] == sum(rejected)
     assert sum(steps) == pytest.approx(0.4, rel=1e-9)
     shortened = next(i for i, dt in enumerate(steps) if dt < 0.03)
     assert min(steps) == pytest.approx(0.02, rel=1e-9)

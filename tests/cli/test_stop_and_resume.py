@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import signal
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from launch import DIRECT, Left, done, finish, start, write_scene
+from launch import DIRECT, Left, done, finish, read_csv, read_json, start, write_scene
 from numpy.typing import NDArray
 
 from lyra_petsc.output.read_run import StoredRun
@@ -32,11 +30,6 @@ probes: {middle: {nodes: [24]}}
 
 
 HALF = ("--set", "time.end=0.4")
-
-
-def history(folder: Path, name: str = "history.csv") -> list[dict[str, str]]:
-    with (folder / name).open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def final_state(folder: Path) -> tuple[float, NDArray[np.float64]]:
@@ -81,9 +74,9 @@ def equal_runs(left: Path, whole: Path, end: float = 0.8) -> None:
     assert time_a == time_b == pytest.approx(end, abs=1e-12)
     np.testing.assert_allclose(a, b, atol=1e-9)
     for name in ("history.csv", "probes.csv", "reactions.csv"):
-        steps = [int(row["step"]) for row in history(left, name)]
-        assert steps == list(range(len(history(whole, name))))
-    for mine, other in zip(history(left), history(whole), strict=True):
+        steps = [int(row["step"]) for row in read_csv(left / name)]
+        assert steps == list(range(len(read_csv(whole / name))))
+    for mine, other in zip(read_csv(left / "history.csv"), read_csv(whole / "history.csv"), strict=True):
         assert float(mine["time"]) == pytest.approx(float(other["time"]), abs=1e-12)
         assert float(mine["dissipation"]) == pytest.approx(float(other["dissipation"]), rel=1e-6, abs=1e-12)
     assert set(state_times(whole)) <= set(state_times(left))
@@ -105,13 +98,13 @@ def test_a_signal_ends_a_step_and_the_run_goes_on(
     (line,) = left.ours
     assert number.name in line
     assert "--resume" in line
-    steps = len(history(tmp_path / "out")) - 1
-    assert steps < len(history(uninterrupted)) - 1
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    steps = len(read_csv(tmp_path / "out" / "history.csv")) - 1
+    assert steps < len(read_csv(uninterrupted / "history.csv")) - 1
+    summary = read_json(tmp_path / "out/summary.json")
     assert number.name in summary["outcome"]
     assert summary["steps"] == steps
     done(["run", "--out", "out", "--resume", *DIRECT], tmp_path)
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert (summary["outcome"], summary["steps_of_this_run"]) == ("done", summary["steps"] - steps)
     equal_runs(tmp_path / "out", uninterrupted)
 
@@ -129,10 +122,10 @@ def test_goes_on_with_another_number_of_ranks(
     scene = write_scene(tmp_path, LONG)
     direct = [*DIRECT, "-pc_factor_mat_solver_type", "mumps"]
     done(["run", scene, "--out", "out", "-ts_max_steps", "61", *HALF, *direct], tmp_path, before)
-    assert len(history(tmp_path / "out")) == 62
+    assert len(read_csv(tmp_path / "out" / "history.csv")) == 62
     done(["run", scene, "--out", "out", "--resume", *HALF, *direct], tmp_path, after)
     equal_runs(tmp_path / "out", first_half, 0.4)
-    assert json.loads((tmp_path / "out/summary.json").read_text())["ranks"] == after
+    assert read_json(tmp_path / "out/summary.json")["ranks"] == after
 
 
 def test_resume_without_a_folder_takes_the_newest_run_of_the_scene(tmp_path: Path) -> None:
@@ -141,5 +134,5 @@ def test_resume_without_a_folder_takes_the_newest_run_of_the_scene(tmp_path: Pat
     again = done(["run", scene, "-ts_max_steps", "2"], tmp_path)
     assert "note: runs/scene exists: the results go to runs/scene-2" in again.err
     done(["run", scene, "--resume"], tmp_path)
-    assert len(history(tmp_path / "runs/scene-2")) == 6
+    assert len(read_csv(tmp_path / "runs/scene-2" / "history.csv")) == 6
     assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["scene", "scene-2"]

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import signal
-import time
 from pathlib import Path
 
 import pytest
-from launch import lyra, start, without_pictures, write_scene
+from launch import PICTURES, finish, lyra, read_csv, read_json, start, wait_until, without, write_scene
 
 from lyra_petsc.experiments.stress.cases import FAMILIES
 from lyra_petsc.experiments.stress.trials import Stress
@@ -30,46 +27,40 @@ def test_list_names_families_and_cases(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_cases_pass_and_leave_table_and_page(tmp_path: Path) -> None:
-    left = lyra(["stress", "--quick", *TWO, "--out", "out"], tmp_path)
+def test_cases_pass_and_leave_tables_and_a_page_with_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("jinja2")
+    left = lyra(["stress", "--quick", *TWO], tmp_path)
     assert left.code == 0, left.err + left.out
     assert "2 of 2 cases passed" in left.out
-    with open(tmp_path / "out" / "stress.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    folder = tmp_path / "stress" / "sheet"
+    rows = read_csv(folder / "stress.csv")
     assert tuple(rows[0]) == Stress.columns
     assert [row["case"] for row in rows] == ["one-triangle", "chain-1e6"]
     assert {row["passed"] for row in rows} == {"True"}
     assert [int(row["steps"]) for row in rows] == [40, 40]
     assert all(0.0 < float(row["energy_defect"]) < float(row["energy_tolerance"]) for row in rows)
     assert all(float(row["step_over_base"]) > 0.0 for row in rows)
-    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    content = read_json(folder / "stress.json")
     assert content["passed"] is content["complete"] is True
     assert content["ranks"] == 1
     assert set(content["cases"][1]["verdicts"]) == {
         "converged", "equations", "resolved", "energy", "no gain", "momentum", "softening", "stiff limit",
         "whole run"
     }  # fmt: skip
-    report = (tmp_path / "out" / "report.md").read_text()
+    report = (folder / "report.md").read_text()
     assert "2 of 2 cases passed" in report
     assert "stress --quick --only one-triangle,chain-1e6" in report
-
-
-def test_the_page_holds_pictures(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    pytest.importorskip("jinja2")
-    left = lyra(["stress", "--quick", *TWO], tmp_path)
-    assert left.code == 0, left.err
-    folder = tmp_path / "stress" / "sheet"
     assert (folder / "report.html").read_text().count("data:image/svg+xml;base64,") == 4
     for name in ("one-triangle-shape", "chain-1e6-shape", "chain-1e6-energy"):
         assert (folder / "plots" / f"{name}.png").stat().st_size > 1000
 
 
 def test_tables_without_the_packages_for_pictures(tmp_path: Path) -> None:
-    left = without_pictures(["stress", "--quick", "--only", "free", "--out", "out"], tmp_path)
-    assert left.returncode == 0, left.stderr
-    assert "1 of 1 cases passed" in left.stdout
-    assert "pip install 'lyra-petsc[study]'" in left.stdout
+    left = without(PICTURES, ["stress", "--quick", "--only", "free", "--out", "out"], tmp_path)
+    assert left.code == 0, left.err
+    assert "1 of 1 cases passed" in left.out
+    assert "pip install 'lyra-petsc[study]'" in left.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "report.md",
         "stress.csv",
@@ -85,11 +76,16 @@ def test_a_scene_is_stressed_with_the_cases_that_fit_it(tmp_path: Path, ranks: i
     assert left.code == 0, left.err + left.out
     assert "slivers: left out" in left.out
     assert "2 of 2 cases passed" in left.out
-    content = json.loads((tmp_path / "stress" / "scene" / "stress.json").read_text())
+    content = read_json(tmp_path / "stress" / "scene" / "stress.json")
     assert [case["name"] for case in content["cases"]] == ["bending-1e6", "jump"]
     assert list(content["left_out"]) == ["slivers"]
-    again = lyra(["stress", scene, "--quick", "--only", "jump"], tmp_path)
-    assert again.code == 0
+
+
+def test_a_second_time_takes_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "stress" / "scene").mkdir(parents=True)
+    (tmp_path / "stress" / "scene" / "stress.csv").write_text("")
+    left = lyra(["stress", write_scene(tmp_path), "--quick", "--only", "jump"], tmp_path)
+    assert left.code == 0, left.err + left.out
     assert (tmp_path / "stress" / "scene-2" / "stress.csv").exists()
 
 
@@ -99,7 +95,7 @@ def test_a_failed_verdict_is_exit_code_1(tmp_path: Path) -> None:
     assert left.code == 1, left.err + left.out
     assert "equations: worst in step" in left.out
     assert left.ours == []
-    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    content = read_json(tmp_path / "out" / "stress.json")
     assert content["passed"] is False
     assert content["cases"][0]["failures"].startswith("equations: ")
     assert "What failed" in (tmp_path / "out" / "report.md").read_text()
@@ -151,7 +147,7 @@ def test_one_mpirun_for_each_case(tmp_path: Path) -> None:
     if "not found" in left.err:
         pytest.skip("needs mpirun")
     assert left.code == 0, left.err + left.out
-    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    content = read_json(tmp_path / "out" / "stress.json")
     assert content["ranks"] == 2
     assert [case["passed"] for case in content["cases"]] == [True, True]
     assert [len(case["newton_iterations"]) for case in content["cases"]] == [40, 40]
@@ -166,16 +162,12 @@ def test_ranks_under_mpirun_are_refused(tmp_path: Path) -> None:
 
 def test_interrupted_between_cases(tmp_path: Path) -> None:  # SIGINT: see the tests of verify
     process = start(["stress", "--only", "one-triangle,rigid-plate", "--out", "out"], tmp_path)
-    deadline = time.monotonic() + 60.0
-    while not (tmp_path / "out" / "stress.json").exists():
-        assert time.monotonic() < deadline
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_until((tmp_path / "out" / "stress.json").exists, process)
     process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 143, err
-    assert "stopped by SIGTERM" in err
-    content = json.loads((tmp_path / "out" / "stress.json").read_text())
+    left = finish(process)
+    assert left.code == 143, left.err
+    assert "stopped by SIGTERM" in left.err
+    content = read_json(tmp_path / "out" / "stress.json")
     assert content["complete"] is False
     assert [case["name"] for case in content["cases"]] == ["one-triangle"]
     assert "one-triangle" in (tmp_path / "out" / "report.md").read_text()
@@ -188,8 +180,7 @@ def test_petsc_options_go_through_and_unused_ones_are_told(tmp_path: Path) -> No
     )
     assert left.code == 0, left.err + left.out
     assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
-    with open(tmp_path / "out" / "stress.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "out" / "stress.csv")
     # a direct solver takes an iteration or two where the default takes tens
     for row in rows:
         assert int(row["linear_iterations"]) < 5 * 40 * float(row["newton_worst"])

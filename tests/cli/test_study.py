@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import fcntl
-import json
 import math
 import os
 import re
 import signal
-import time
 from pathlib import Path
-from typing import Any
 
 import pytest
-from launch import Left, done, finish, lyra, start, write_scene
+from launch import Left, done, finish, lyra, read_csv, read_json, start, wait_until, without, write_scene
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -41,16 +37,6 @@ output: {every: 0.05}
 """
 
 
-def table(folder: Path) -> list[dict[str, str]]:
-    with (folder / "study.csv").open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def content(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "study.json").read_text(encoding="utf-8"))
-    return found
-
-
 def results(folder: Path) -> dict[str, float]:
     """When each finished case was finished."""
     return {path.parent.name: path.stat().st_mtime for path in folder.glob("cases/*/result.json")}
@@ -64,7 +50,7 @@ def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
     folder = tmp_path / "studies" / "scene"
     assert "6 of 6 combinations done, 0 failed" in left.out
     assert "For 1 % choose" in left.out
-    rows = table(folder)
+    rows = read_csv(folder / "study.csv")
     assert [row["combination"] for row in rows][:2] == ["beuler-dt0.02", "beuler-dt0.01"]
     for row in rows:
         assert row["status"] == "done"
@@ -79,7 +65,7 @@ def test_a_study_leaves_all_it_should(tmp_path: Path) -> None:
     assert euler == sorted(euler, reverse=True)
     assert float(rows[2]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.25)
     assert {row["recommended"] for row in rows} == {"yes", "no"}
-    whole = content(folder)
+    whole = read_json(folder / "study.json")
     assert whole["references"][0]["kind"] == "finer"
     assert whole["references"][0]["own_error"]["position_max"]["error"] > 0.0
     assert len(whole["combinations"][0]["timings"]) == 2
@@ -105,8 +91,8 @@ def test_exact_answers_on_two_ranks(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
     words = ["study", "scene.yaml", "--vary", "integrator=beuler,midpoint", "--vary", "dt=0.025,0.0125"]
     done([*words, "--repeats", "1", "--out", "two"], tmp_path, ranks=2)
-    rows = table(tmp_path / "two")
-    assert content(tmp_path / "two")["references"][0]["kind"] == "exact"
+    rows = read_csv(tmp_path / "two" / "study.csv")
+    assert read_json(tmp_path / "two" / "study.json")["references"][0]["kind"] == "exact"
     assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
     assert float(rows[3]["order_dt_position_max"]) == pytest.approx(2.0, abs=0.1)
     assert rows[0]["ranks"] == "2"
@@ -135,7 +121,7 @@ def test_a_failed_combination_is_a_row_and_the_study_goes_on(tmp_path: Path) -> 
         [*words, "--repeats", "1", "--out", "out", "--quantities", "energy", "-ts_adapt_dt_min", "0.004"],
         tmp_path,
     )
-    rows = table(tmp_path / "out")
+    rows = read_csv(tmp_path / "out" / "study.csv")
     assert [row["status"] for row in rows] == ["failed"] * 3 + ["done", "failed", "done"]
     assert "did not converge" in rows[0]["reason"]
     assert "bogus" in rows[4]["reason"]
@@ -154,7 +140,7 @@ def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
     assert left.code == 3
     assert len(left.ours) == 1
     assert "all 1 combinations failed" in left.ours[0]
-    assert table(tmp_path / "out")[0]["status"] == "failed"
+    assert read_csv(tmp_path / "out" / "study.csv")[0]["status"] == "failed"
     assert (tmp_path / "out" / "report.html").exists()
     assert "★" not in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
 
@@ -162,21 +148,13 @@ def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
 LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.001", "--repeats", "1", "--out", "out"]
 
 
-def wait_for(path: Path, left: Any, seconds: float = 40.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not path.exists():
-        assert left.poll() is None, left.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, code: int) -> None:
     write_scene(tmp_path, HANGING)
     process = start(LONG, tmp_path)
-    wait_for(tmp_path / "out" / "cases" / "dt0.02" / "result.json", process)
-    wait_for(tmp_path / "out" / "cases" / "dt0.001" / "history.csv", process)
+    wait_until((tmp_path / "out" / "cases" / "dt0.02" / "result.json").exists, process)
+    wait_until((tmp_path / "out" / "cases" / "dt0.001" / "history.csv").exists, process)
     process.send_signal(number)
     stopped = finish(process)
     assert stopped.code == code
@@ -196,12 +174,12 @@ def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, 
     (tmp_path / "out" / "study.csv").unlink()
     done(["study", "scene.yaml", "--out", "out", "--resume"], tmp_path)
     assert results(tmp_path / "out") == after
-    assert len(table(tmp_path / "out")) == 2
+    assert len(read_csv(tmp_path / "out" / "study.csv")) == 2
     # a wider sweep runs what is new
     done(["study", "--out", "out", "--resume", "--vary", "dt=0.01,0.02,0.001"], tmp_path)
     wider = results(tmp_path / "out")
     assert {name: wider[name] for name in after} == after
-    assert len(table(tmp_path / "out")) == 3
+    assert len(read_csv(tmp_path / "out" / "study.csv")) == 3
 
 
 @pytest.mark.slow
@@ -209,7 +187,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
     write_scene(tmp_path, FALLING)
     words = ["study", "scene.yaml", "--vary", "dt=0.025,0.0125", "--repeats", "1", "--ranks", "2"]
     done([*words, "--vary", "integrator=beuler", "--out", "two", "-ksp_rtol", "1e-4"], tmp_path)
-    rows = table(tmp_path / "two")
+    rows = read_csv(tmp_path / "two" / "study.csv")
     assert [row["ranks"] for row in rows] == ["2", "2"]
     assert float(rows[1]["order_dt_position_max"]) == pytest.approx(1.0, abs=0.1)
     assert not list(tmp_path.glob("two/cases/*.json"))
@@ -224,7 +202,7 @@ def test_ranks_start_an_mpirun_for_each_case(tmp_path: Path) -> None:
 def test_ranks_stop_together(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
     process = start([*LONG[:3], "dt=0.0001", *LONG[4:], "--ranks", "2"], tmp_path)
-    wait_for(tmp_path / "out" / "cases" / "dt0.0001" / "history.csv", process)
+    wait_until((tmp_path / "out" / "cases" / "dt0.0001" / "history.csv").exists, process)
     process.send_signal(signal.SIGTERM)
     left = finish(process)
     assert left.code == 143
@@ -257,9 +235,9 @@ def test_a_run_as_reference(tmp_path: Path) -> None:
     done(fine, tmp_path)
     words = ["study", "scene.yaml", "--vary", "dt=0.01", "--repeats", "1", "--out", "out"]
     done([*words, "--reference", "run:fine"], tmp_path)
-    whole = content(tmp_path / "out")
+    whole = read_json(tmp_path / "out" / "study.json")
     assert whole["references"][0]["kind"] == "run"
-    assert float(table(tmp_path / "out")[0]["error_position_max"]) > 1e-4
+    assert float(read_csv(tmp_path / "out" / "study.csv")[0]["error_position_max"]) > 1e-4
     for change, words_of_it in (
         ("mesh.grid.nx=5", "is a run of another mesh"),
         ("output.every=0.02", "has no state at t = 0.02 s"),
@@ -302,11 +280,7 @@ def test_bad_input_on_two_ranks(tmp_path: Path) -> None:
 
 def test_without_the_extra_it_says_how_to_get_it(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
-    program = (
-        "import lyra_petsc.extras as extras; extras.missing = lambda packages=(): ['matplotlib']; "
-        "from lyra_petsc.__main__ import main; main()"
-    )
-    left = lyra(["study", "scene.yaml"], tmp_path, program=("-c", program))
+    left = without(["matplotlib"], ["study", "scene.yaml"], tmp_path)
     assert left.code == 2
     assert left.ours == [
         "lyra-petsc: study: matplotlib is not installed; get the extra: pip install 'lyra-petsc[study]'"

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import signal
-import time
 from pathlib import Path
 
 import pytest
-from launch import lyra, start, without_pictures
+from launch import PICTURES, finish, lyra, read_csv, read_json, start, wait_until, without
 
 from lyra_petsc.experiments.verification.cases import CASES
 
@@ -28,13 +25,12 @@ def test_a_case_passes(tmp_path: Path) -> None:
     assert "2 of 2 cases passed" in left.out
     assert "order 1.00, as expected 1" in left.out
     assert "exact [m]" in left.out
-    with open(tmp_path / "out" / "verify.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_csv(tmp_path / "out" / "verify.csv")
     fall = [row for row in rows if row["case"] == "free-fall" and row["quantity"].startswith("mean z")]
     assert [float(row["n"]) for row in fall] == [10, 100]
     assert float(fall[1]["error"]) == pytest.approx(0.1)
     assert {row["passed"] for row in rows} == {"True"}
-    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    content = read_json(tmp_path / "out" / "verify.json")
     assert content["passed"] is True
     assert content["ranks"] == 2
     assert [case["name"] for case in content["cases"]] == ["free-fall", "patch-states"]
@@ -43,11 +39,12 @@ def test_a_case_passes(tmp_path: Path) -> None:
     assert "verify free-fall patch-states --quick" in report
 
 
-def test_the_page_holds_its_plots(tmp_path: Path) -> None:
+def test_the_page_holds_its_plots_and_unused_petsc_options_are_told(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     pytest.importorskip("jinja2")
-    left = lyra(["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
+    left = lyra(["verify", "free-fall", "--quick", "--out", "out", "-snes_typo", "1"], tmp_path)
     assert left.code == 0, left.err
+    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/svg+xml;base64,") == 2
     for name in ("free-fall-convergence", "free-fall-run-time"):
@@ -55,10 +52,10 @@ def test_the_page_holds_its_plots(tmp_path: Path) -> None:
 
 
 def test_tables_without_the_packages_for_plots(tmp_path: Path) -> None:
-    left = without_pictures(["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
-    assert left.returncode == 0, left.stderr
-    assert "1 of 1 cases passed" in left.stdout
-    assert "pip install 'lyra-petsc[study]'" in left.stdout
+    left = without(PICTURES, ["verify", "free-fall", "--quick", "--out", "out"], tmp_path)
+    assert left.code == 0, left.err
+    assert "1 of 1 cases passed" in left.out
+    assert "pip install 'lyra-petsc[study]'" in left.out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "report.md",
         "verify.csv",
@@ -73,7 +70,7 @@ def test_a_wrong_answer_is_exit_code_1(tmp_path: Path) -> None:
     assert left.code == 1, left.err
     assert "1 of 2 cases passed" in left.out
     assert "FAILED" in left.out
-    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    content = read_json(tmp_path / "out" / "verify.json")
     assert content["passed"] is False
     assert [case["passed"] for case in content["cases"]] == [False, True]
 
@@ -112,22 +109,12 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     assert len(left.ours) == 1
 
 
-def test_unused_petsc_options_are_told(tmp_path: Path) -> None:
-    left = lyra(["verify", "free-fall", "--quick", "-snes_typo", "1"], tmp_path)
-    assert left.code == 0
-    assert left.ours == ["lyra-petsc: warning: PETSc options that nothing used: -snes_typo"]
-
-
 def test_interrupted_after_a_case(tmp_path: Path) -> None:
     process = start(["verify", "free-fall", "circular-membrane", "--out", "out"], tmp_path)
-    deadline = time.monotonic() + 60.0
-    while not (tmp_path / "out" / "verify.json").exists():
-        assert time.monotonic() < deadline
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_until((tmp_path / "out" / "verify.json").exists, process)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    assert "stopped by SIGINT" in err
-    content = json.loads((tmp_path / "out" / "verify.json").read_text())
+    left = finish(process)
+    assert left.code == 130, left.err
+    assert "stopped by SIGINT" in left.err
+    content = read_json(tmp_path / "out" / "verify.json")
     assert [case["name"] for case in content["cases"]] == ["free-fall"]

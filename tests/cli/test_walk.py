@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from launch import SCENE, done, environment, write_scene
+from launch import SCENE, done, environment, lyra, write_scene
 
 LISTS = ("ksp_type", "pc_type", "snes_type", "snes_linesearch_type")
 SLOW = ("cp", "deflation")
@@ -176,21 +176,14 @@ NEEDS_A_DISPLAY = ("-ts_monitor_sp_swarm",)
 @pytest.mark.parametrize("words", AT_THE_START_OR_END, ids=" ".join)
 def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: list[str]) -> None:
     """PETSc reads some options only as it starts; at its end it frees what calls Python."""
-    left = subprocess.run(
-        [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out", *words],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert left.returncode == 2, left.stderr
-    lines = left.stderr.splitlines()
-    assert len(lines) == 1 or words[0] in NEEDS_A_DISPLAY, left.stderr
-    assert lines[-1].startswith("lyra-petsc: "), left.stderr
-    assert "Traceback" not in left.stdout + left.stderr
+    left = lyra(["run", write_scene(tmp_path), "--out", "out", *words], tmp_path)
+    assert left.code == 2, left.err
+    lines = left.err.splitlines()
+    assert len(lines) == 1 or words[0] in NEEDS_A_DISPLAY, left.err
+    assert lines[-1].startswith("lyra-petsc: "), left.err
+    assert "Traceback" not in left.out + left.err
     told = {"-prefix_pop": "prefixes popped"}.get(words[-1], words[-1].removeprefix(":").removesuffix("/log"))
-    assert told in left.stderr
+    assert told in left.err
 
 
 @pytest.mark.parametrize(
@@ -198,14 +191,7 @@ def test_the_process_ends_with_the_code_of_its_message(tmp_path: Path, words: li
 )
 def test_files_of_options_are_looked_at_before_petsc_reads_them(tmp_path: Path, line: str) -> None:
     (tmp_path / ".petscrc").write_text(f"# mine\n-ksp_type cg # usual\n{line}\n")
-    left = subprocess.run(
-        [sys.executable, "-m", "lyra_petsc", "run", write_scene(tmp_path), "--out", "out"],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert left.returncode == 2, left.stderr
-    (told,) = left.stderr.splitlines()
+    left = lyra(["run", write_scene(tmp_path), "--out", "out"], tmp_path)
+    assert left.code == 2, left.err
+    (told,) = left.err.splitlines()
     assert told.startswith(f"lyra-petsc: .petscrc: {line.split()[0]}: ")

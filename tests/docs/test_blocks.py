@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import os
+import json
 import re
 import shutil
+import socketserver
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import click
 import pytest
 from blocks import PAGES, ROOT, Block, blocks_of, commands_of
+from launch import FORKS, environment
 
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.verbs import verbs
@@ -36,14 +40,22 @@ BASE = {
 """What a piece of a scene is put into."""
 
 PROGRAM = f"""\
-#!{sys.executable}
-# the program as installed; runs are shortened, but for load factors
-import os, sys
+#!{sys.executable} -IS
+# the program as installed, on one rank by way of the test; runs are shortened, but for load factors
+import json, os, socket, sys
 words = sys.argv[1:]
 scenes = [open(word).read() for word in words if word.endswith(".yaml") and os.path.exists(word)]
 if words[:1] == ["run"] and not any("analysis: static" in scene for scene in scenes):
     words += ["--set", "time.end={END}"]
-os.execv(sys.executable, [sys.executable, "-m", "lyra_petsc", *words])
+if "OMPI_COMM_WORLD_SIZE" in os.environ:
+    os.execv(sys.executable, [sys.executable, "-m", "lyra_petsc", *words])
+test = socket.socket(socket.AF_UNIX)
+test.connect(os.environ["TEST_SOCKET"])
+test.sendall(json.dumps([words, os.getcwd(), dict(os.environ)]).encode() + b"\\n")
+code, out, err = json.loads(test.makefile().read())
+sys.stdout.write(out)
+sys.stderr.write(err)
+sys.exit(code)
 """
 PYTHON = f"""\
 #!/bin/sh
@@ -71,8 +83,17 @@ def coarse(script: str) -> str:
 LANGUAGES = {"", "sh", "yaml", "json", "python", "geo", "text", "diff"}
 
 
+class Commands(socketserver.StreamRequestHandler):
+    """Runs what ``PROGRAM`` is asked for in a process that needs no imports, which take longest."""
+
+    def handle(self) -> None:
+        words, folder, variables = json.loads(self.rfile.readline())
+        left = FORKS.run(words, Path(folder), variables, PATIENCE)
+        self.wfile.write(json.dumps([left.code, left.out, left.err]).encode())
+
+
 @pytest.fixture
-def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+def checkout(tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
     """What a reader has: a checkout with ``.venv`` and an installed program; and the environment."""
     folder = tmp_path / "lyra_petsc"
     folder.mkdir()
@@ -90,17 +111,11 @@ def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     for name, text in (("lyra-petsc", PROGRAM), ("python", PYTHON)):
         (programs / name).write_text(text, encoding="utf-8")
         (programs / name).chmod(0o755)
-    ours = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_", "PMIX_", "PETSC_OPTIONS"))}
-    return folder, {
-        **ours,
-        "PATH": f"{programs}:{ours['PATH']}",
-        "PYTHONPATH": str(ROOT) + os.pathsep + ours.get("PYTHONPATH", ""),
-        "OMPI_ALLOW_RUN_AS_ROOT": "1",
-        "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-        "OMPI_MCA_rmaps_base_oversubscribe": "1",
-        "OMPI_MCA_mpi_yield_when_idle": "1",
-        "OMP_NUM_THREADS": "1",
-    }
+    variables = environment({"TEST_SOCKET": str(tmp_path / "test")})
+    with socketserver.UnixStreamServer(variables["TEST_SOCKET"], Commands) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, {**variables, "PATH": f"{programs}:{variables['PATH']}"}
+        server.shutdown()
 
 
 @pytest.mark.slow
@@ -109,7 +124,7 @@ def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
 )
 def test_commands(page: Path, checkout: tuple[Path, dict[str, str]]) -> None:
     """The files of a page are written and its commands run, in their order."""
-    folder, environment = checkout
+    folder, variables = checkout
     for block in ALL[page]:
         if block.title:
             path = folder / block.title
@@ -121,7 +136,7 @@ def test_commands(page: Path, checkout: tuple[Path, dict[str, str]]) -> None:
         if block.language == "python":
             command = [sys.executable, "-c", block.text]
         process = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE
+            command, cwd=folder, env=variables, capture_output=True, text=True, timeout=PATIENCE
         )
         said = f"{block.place}\n{block.text}\n{process.stdout[-2000:]}\n{process.stderr[-3000:]}"
         assert process.returncode == block.exit_code, said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from module_of import module_of
 
 from lyra_petsc.cli.verbs import verbs
 from lyra_petsc.linear.presets import PRESETS
@@ -20,12 +20,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 @pytest.fixture(scope="module")
 def reference() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("reference", ROOT / "scripts/docs/reference.py")
-    assert specification is not None
-    assert specification.loader is not None
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module
+    return module_of(ROOT / "scripts" / "docs" / "reference.py")
 
 
 @pytest.mark.parametrize("name", ["scene.md", "petsc.md", "commands.md"])

@@ -55,6 +55,13 @@ class Run:
         )
 
 
+@pytest.fixture
+def run(comm, shared_tmp):
+    """A run that has written its mesh."""
+    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
+    return Run(comm, shared_tmp)
+
+
 def position(step):
     return REST + [0, 0, step]
 
@@ -91,10 +98,8 @@ def on_first(comm, check):
 
 
 @pytest.mark.parametrize("one_machine", [True, False])
-def test_states_read_back_as_a_time_series(comm, shared_tmp, monkeypatch, one_machine):
+def test_states_read_back_as_a_time_series(comm, shared_tmp, run, monkeypatch, one_machine):
     monkeypatch.setattr("lyra_petsc.output.hdf5.on_one_machine", lambda comm: one_machine)
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
     assert [run.write(step) for step in (0, 4, 9)] == [0, 1, 2]
 
     def check():
@@ -116,10 +121,8 @@ def test_states_read_back_as_a_time_series(comm, shared_tmp, monkeypatch, one_ma
     on_first(comm, check)
 
 
-def test_vtk_reads_the_time_series(comm, shared_tmp):
+def test_vtk_reads_the_time_series(comm, shared_tmp, run):
     vtk = pytest.importorskip("vtk", reason="ParaView's own reader; meshio's is tested above")
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
     for step in (0, 4, 9):
         run.write(step)
 
@@ -149,9 +152,7 @@ def test_vtk_reads_the_time_series(comm, shared_tmp):
     on_first(comm, check)
 
 
-def test_a_state_cut_short_is_never_announced(comm, shared_tmp, monkeypatch):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
+def test_a_state_cut_short_is_never_announced(comm, shared_tmp, run, monkeypatch):
     run.write(0)
     write_rows = hdf5._write_rows
 
@@ -172,9 +173,7 @@ def assert_times(folder, times):
     assert [time for time, _ in announced(folder)] == pytest.approx(times)
 
 
-def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
+def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp, run):
     for step in (0, 3, 6, 9):
         run.write(step)
     comm.Barrier()
@@ -191,9 +190,7 @@ def test_resume_keeps_what_came_before_and_goes_on(comm, shared_tmp):
     on_first(comm, lambda: np.testing.assert_array_equal(announced(shared_tmp)[1][1].points, position(3)))
 
 
-def test_resume_passes_over_a_damaged_file(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
+def test_resume_passes_over_a_damaged_file(comm, shared_tmp, run):
     for step in range(11):
         run.write(step)
     assert sorted(path.name for path in shared_tmp.glob("states-*.h5")) == [
@@ -239,10 +236,9 @@ def test_an_older_folder_goes_on(comm, shared_tmp):
     on_first(comm, check)
 
 
-def test_few_files_and_a_document_that_grows(comm, shared_tmp, monkeypatch):
+def test_few_files_and_a_document_that_grows(comm, shared_tmp, run, monkeypatch):
     """Files double; the document is copied now and then only, and is whole after every write to it."""
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run, copies, whole = Run(comm, shared_tmp), [], []
+    copies, whole = [], []
     make, pwrite = xdmf.GrowingXdmf._make, os.pwrite
 
     def counted(self, *arguments, **keywords):
@@ -268,9 +264,7 @@ def test_few_files_and_a_document_that_grows(comm, shared_tmp, monkeypatch):
     assert [state.step for state in stored_states(shared_tmp)] == list(range(90))
 
 
-def test_a_document_that_was_removed_is_made_anew(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
+def test_a_document_that_was_removed_is_made_anew(comm, shared_tmp, run):
     for step in range(3):
         run.write(step)
     on_first(comm, (shared_tmp / XDMF_FILE).unlink)
@@ -278,9 +272,7 @@ def test_a_document_that_was_removed_is_made_anew(comm, shared_tmp):
     on_first(comm, lambda: assert_times(shared_tmp, [0.0, 0.1, 0.2, 0.3]))
 
 
-def test_more_than_9999_states(comm, shared_tmp):
-    write_mesh(shared_tmp, strip() if comm.rank == 0 else None, comm)
-    run = Run(comm, shared_tmp)
+def test_more_than_9999_states(comm, shared_tmp, run):
     run.write(0)
     run.writer._next = 9999
     assert [run.write(1), run.write(2)] == [9999, 10000]

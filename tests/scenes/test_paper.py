@@ -6,11 +6,11 @@ References: ``tests/reference/paper.json``, made by ``scripts/references/paper.p
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
+from module_of import module_of
 from mpi4py import MPI
 from physics import reference
 
@@ -50,13 +50,7 @@ def test_semi_implicit_steps_lock() -> None:
 
 
 def test_reference_comes_from_its_script(monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = importlib.util.spec_from_file_location(
-        "paper_reference", ROOT / "scripts" / "references" / "paper.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = module_of(ROOT / "scripts" / "references" / "paper.py")
     monkeypatch.setattr(script, "TIMES", tuple(ANSWERS["times"][:3]))
     rows = script.motion(1e-9, seed=1)
     for column in ("kinetic_energy", "mean_y", "mean_z", "edge_y", "edge_z"):

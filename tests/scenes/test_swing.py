@@ -5,12 +5,12 @@ References: ``tests/reference/swing.json``, made by ``scripts/references/swing.p
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from module_of import module_of
 from mpi4py import MPI
 from numpy.typing import NDArray
 from physics import Simulation, grid, reference
@@ -120,12 +120,7 @@ def test_reference_is_consistent() -> None:
 
 
 def test_reference_comes_from_its_script() -> None:
-    path = Path(__file__).resolve().parents[2] / "scripts" / "references" / "swing.py"
-    spec = importlib.util.spec_from_file_location("swing_reference", path)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    script = module_of(Path(__file__).resolve().parents[2] / "scripts" / "references" / "swing.py")
     found = script.swing(20, 1e3)
     expected = [answer(1e3, t, 20) for t in script.TIMES]
     np.testing.assert_allclose(found["edge"], expected, atol=1e-6)

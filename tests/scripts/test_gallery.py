@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from module_of import module_of
 from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -16,13 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def gallery() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gallery", ROOT / "scripts" / "gallery.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["gallery"] = module  # dataclasses look themselves up
-    spec.loader.exec_module(module)
-    return module
+    return module_of(ROOT / "scripts" / "gallery.py")
 
 
 def test_every_scene_is_shown_and_all_is_small(gallery):

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from module_of import module_of
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "mutate.py"
 
 
 @pytest.fixture
-def mutate(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mutate", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "mutate", module)
-    spec.loader.exec_module(module)
-    return module
+def mutate() -> ModuleType:
+    return module_of(SCRIPT)
 
 
 def test_every_change_is_of_the_present_code(

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import os
-import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import h5py
 import meshio
 import numpy as np
+from launch import read_csv, wait_until
 
 from lyra_petsc.output.states import stored_states
 
@@ -47,8 +46,7 @@ def announced(out: Path) -> list[float]:
 
 def steps(out: Path, name: str = "history.csv") -> list[int]:
     """Step numbers of a table."""
-    with (out / name).open(encoding="utf-8") as file:
-        return [int(row["step"]) for row in csv.DictReader(file)]
+    return [int(row["step"]) for row in read_csv(out / name)]
 
 
 def ranks_in(folder: Path) -> list[int]:
@@ -70,7 +68,4 @@ def ranks_in(folder: Path) -> list[int]:
 
 def wait_for_states(out: Path, number: int, patience: float = 60.0) -> None:
     """Until that many states are on disk."""
-    deadline = time.monotonic() + patience
-    while not out.is_dir() or len(stored_states(out)) < number:
-        assert time.monotonic() < deadline, "the run does not get on"
-        time.sleep(0.01)
+    wait_until(lambda: out.is_dir() and len(stored_states(out)) >= number, patience=patience)

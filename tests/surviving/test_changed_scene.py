@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import pytest
-from launch import DIRECT, done, lyra, write_scene
+from launch import DIRECT, done, lyra, read_json, write_scene
 from leftovers import SHEET, announced, steps
 
 SCENE = SHEET % 0.04
@@ -80,7 +79,7 @@ def test_changed_parameters_are_told(run: Path) -> None:
         "note: changed since the run was begun: wind: absent → "
         '{"velocity": [0.0, 3.0, 0.0], "density": 1.2, "drag": 0.0}',
     ]
-    (entry,) = json.loads((run / "summary.json").read_text())["resumed"]
+    (entry,) = read_json(run / "summary.json")["resumed"]
     assert (entry["step"], entry["ranks"]) == (5, 1)
     assert entry["changes"][1] == {"key": "time.end", "old": "0.04", "new": "0.05"}
     # the folder's scene is the one that counts now: going on again tells nothing new
@@ -88,7 +87,7 @@ def test_changed_parameters_are_told(run: Path) -> None:
     assert [line for line in again.err.splitlines() if line.startswith("note: ")] == [
         "note: time.end: 0.05 → 0.06"
     ]
-    assert len(json.loads((run / "summary.json").read_text())["resumed"]) == 2
+    assert len(read_json(run / "summary.json")["resumed"]) == 2
     assert steps(run) == list(range(13))
     assert announced(run) == pytest.approx([0, 0.02, 0.025, 0.04, 0.05, 0.06])
 

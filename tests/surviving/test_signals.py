@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -11,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from launch import DIRECT, command, done, environment, finish, start, write_scene
+from launch import DIRECT, command, done, environment, finish, read_json, start, wait_until, write_scene
 from leftovers import ENDLESS, announced, ranks_in, steps, wait_for_states
 
 SLOW_STEPS = """
@@ -84,7 +83,7 @@ def test_one_rank_that_gets_a_signal_has_all_finish_the_step(
     assert announced(tmp_path / "out")
     assert not ranks_in(tmp_path)
     done(["run", "--out", "out", "--resume", "-ts_max_steps", "1"], tmp_path, 2)
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["resumed"][-1]["step"] == summary["steps"]
     assert summary["resumed"][-1]["ranks"] == 2
 
@@ -97,10 +96,7 @@ def test_mpirun_leaves_a_second_and_nothing_announced_is_lost(tmp_path: Path, nu
     process.send_signal(number)
     left = finish(process)
     assert "Traceback" not in left.err
-    deadline = time.monotonic() + 20
-    while ranks_in(tmp_path):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: not ranks_in(tmp_path), patience=20)
     before = announced(tmp_path / "out")
     assert len(before) >= 4
     done(["run", scene, "--out", "out", "--resume", "--set", f"time.end={before[-1] + 0.1:.3f}"], tmp_path, 2)
@@ -126,17 +122,14 @@ def test_a_long_step_under_mpirun_has_its_start_in_the_checkpoint(tmp_path: Path
         tmp_path, ENDLESS.replace("every: 0.02", "every: 10").replace("step: 0.005", "step: 0.02")
     )
     process = start(["run", scene, "--out", "out", *DIRECT], tmp_path, program=(str(program),))
-    deadline = time.monotonic() + 30
-    while not (tmp_path / "in-step").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until((tmp_path / "in-step").exists)
     process.send_signal(signal.SIGTERM)
     time.sleep(1.0)
     process.kill()
     finish(process)
     assert steps(tmp_path / "out") == list(range(7))
     done(["run", scene, "--out", "out", "--resume", "-ts_max_steps", "1", *DIRECT], tmp_path)
-    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    summary = read_json(tmp_path / "out/summary.json")
     assert summary["resumed"][-1]["step"] == 6
 
 
@@ -146,10 +139,7 @@ def test_a_long_step_is_finished_and_kept(tmp_path: Path) -> None:
     process = start(
         ["run", write_scene(tmp_path, ENDLESS), "--out", "out"], tmp_path, program=(str(program),)
     )
-    deadline = time.monotonic() + 30
-    while not (tmp_path / "in-step").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until((tmp_path / "in-step").exists)
     process.send_signal(signal.SIGUSR1)
     left = finish(process)
     assert left.code == 143

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from launch import done, finish, lyra, start, write_scene
+from launch import done, finish, lyra, start, wait_until, write_scene
 from leftovers import ENDLESS, SHEET, announced, wait_for_states
 
 from lyra_petsc.output.states import stored_states
@@ -61,10 +61,7 @@ def test_a_second_run_is_refused_while_the_first_sets_up(tmp_path: Path, number:
     program.write_text(SLOW_SET_UP)
     scene = write_scene(tmp_path, SHEET % 0.02)
     first = start(["run", scene, "--out", "deep/out"], tmp_path, program=(str(program),))
-    deadline = time.monotonic() + 30
-    while not (tmp_path / "in-set-up").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until((tmp_path / "in-set-up").exists)
     for words in ([], ["--force"]):
         left = lyra(["run", scene, "--out", "deep/out", *words], tmp_path)
         assert left.code == 2

@@ -203,7 +203,7 @@ def setting_of(
         base = checked(Scene, data, file=None, overridden=overridden)
     else:
         base = load_scene(scene, settings)
-    if base.time.analysis == "static":
+    if base.time.static:
         raise InputError(
             "stress tests motions; give --set time.analysis=dynamic --set time.step=0.005",
             file=scene,

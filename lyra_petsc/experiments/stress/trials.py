@@ -49,7 +49,7 @@ BASE_STEPS = 20
 
 @dataclass
 class StressOutcome(Outcome[StressCase]):
-    """What came of a case.
+    """The result of a case.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class StressOutcome(Outcome[StressCase]):
 
     @property
     def verdict(self) -> str:
-        """In a word: what is solved need not be right, where the integrator takes much of the energy away."""
+        """In a word; ``solved`` instead of ``right`` where the integrator dissipates much of the energy."""
         if not self.passed:
             return "FAILED"
         return "right" if self.record.lost <= LITTLE_LOST else "solved"
@@ -243,7 +243,7 @@ class Told:
 
 
 def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: Watch) -> StressOutcome:
-    """What comes of a case in processes of its own.
+    """The result of a case that is run in processes of its own.
 
     Parameters
     ----------

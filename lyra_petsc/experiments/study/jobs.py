@@ -83,7 +83,7 @@ class Timing:
 
 @dataclass
 class Result:
-    """What came of a case.
+    """The result of a case.
 
     Attributes
     ----------
@@ -243,7 +243,7 @@ def _warm_up(comm: MPI.Comm, scene: Scene) -> None:
 
 
 def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result, watch: Watch) -> None:
-    """One timed run; the first also records, and the recording is charged apart."""
+    """One timed run; the first also writes results, whose time is measured separately."""
     folder = Path(job.folder)
     comm.Barrier()
     phases, began = Phases(), time.perf_counter()
@@ -302,7 +302,7 @@ PROGRESS_FILE = "progress"
 
 
 def launched(launcher: Launcher, job: Job, watch: Watch, lock: int) -> Result:
-    """What comes of a job in processes of its own.
+    """The result of a job that is run in processes of its own.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ def _fraction(progress: Path) -> float:
 
 
 def run_job(comm: MPI.Comm, path: Path, obey: Callable[[], None]) -> None:
-    """Run the job in a file, and tell some times a second how far it is; collective.
+    """Run the job in a file, and report its progress a few times a second; collective.
 
     Parameters
     ----------

@@ -293,7 +293,7 @@ def combinations(axes: Sequence[Axis]) -> list[Combination]:
 
 
 def overrides(base: Scene, chosen: Choice) -> list[str]:
-    """What ``--set`` would say to get these values of axes, with what else of the ``time`` block must change.
+    """The ``--set`` overrides for these values of axes, with the changes of ``time`` that they require.
 
     Raises
     ------
@@ -561,7 +561,7 @@ class Plan:
 
 
 def make_plan(request: Request) -> Plan:
-    """Work a request out; reads the scene and its meshes, runs and writes nothing. For rank 0.
+    """Plan a requested study; reads the scene and its meshes, runs and writes nothing. For rank 0.
 
     Raises
     ------
@@ -660,7 +660,7 @@ def _sampling(base: Scene, axes: Sequence[Axis], end: float, notes: list[str]) -
 
 
 def _numbered_vertices(base: Scene) -> list[str]:
-    """A note on vertices picked by number, which are others on another mesh."""
+    """A note on vertices picked by number, which differ from mesh to mesh."""
     picked = [f"handles[{i}]" for i, handle in enumerate(base.handles) if handle.nodes is not None]
     picked += [f"loads[{i}]" for i, load in enumerate(base.loads) if load.nodes is not None]
     picked += [f"probes.{name}" for name, probe in base.probes.items() if probe.nodes is not None]

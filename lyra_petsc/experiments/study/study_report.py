@@ -1,4 +1,4 @@
-"""What a study tells: errors, observed orders, Pareto front and recommendation, as CSV, JSON and pages."""
+"""Results of a study: errors, observed orders, Pareto front and recommendation, as CSV, JSON and pages."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def observed_orders(rows: Sequence[StudyRow], axes: Sequence[Axis], quantities: 
 
 
 def mark_front(rows: Sequence[StudyRow], quantity: str) -> None:
-    """Mark the rows that no other beats in both run time and error."""
+    """Mark the Pareto front: the rows that no other beats in both run time and error."""
     able = _able(rows, quantity)
     costs = [(row.run, row.at_most(quantity)) for row in able]
     for row, mine in zip(able, costs, strict=True):
@@ -299,7 +299,7 @@ def _advise(report: Report, plan: Plan, physics: Physics, known: Reference, advi
 
 
 def _left_out(plan: Plan, known: Reference) -> str:
-    """Which error is common to all runs and their reference, and hence not in the numbers."""
+    """Which error all runs share with their reference, so that the numbers do not contain it."""
     if known.kind == "exact":
         return "The errors are whole: the reference is exact on any mesh."
     if plan.axis("mesh") is None:
@@ -371,11 +371,8 @@ def _short_title(quantity: Quantity) -> str:
 def _error_cell(row: StudyRow, name: str) -> str:
     if name in row.unresolved:
         return f"< {short(SAFETY * row.own[name])}"
-    return _told(row.errors.get(name, math.nan))
-
-
-def _told(value: float, digits: int = 3) -> str:
-    return short(value, digits) if math.isfinite(value) else ""
+    error = row.errors.get(name, math.nan)
+    return short(error) if math.isfinite(error) else ""
 
 
 def _orders(report: Report, orders: Sequence[Order]) -> None:

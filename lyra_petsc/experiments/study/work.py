@@ -76,7 +76,7 @@ class Estimate:
 
 @dataclass
 class Reference:
-    """The reference of one physical scene, as chosen and as it came out.
+    """The reference of one physical scene: how it was chosen, and its results.
 
     Attributes
     ----------
@@ -181,7 +181,7 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
 
 
 def _differences(plan: Plan, folder: Path) -> Sequence[str]:
-    """What the scene of a run has that the study's has not, beside how it was solved."""
+    """How the scene of a run differs physically from the study's, in words."""
     try:
         other = load_scene(folder / "scene.yaml")
     except InputError:
@@ -207,6 +207,9 @@ SAFETY = 2.0
 
 LARGEST_SAFETY = 1.25
 """Factor on the estimates of largest errors."""
+
+REFINED = 2.0
+"""Factor between neighbours of a chain."""
 
 SLOWEST = 0.5
 """Order of convergence below which an estimate is not trusted to follow it."""
@@ -361,7 +364,7 @@ def joined(estimates: Sequence[dict[str, Estimate]]) -> dict[str, Estimate]:
     return found
 
 
-def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -> dict[str, Estimate]:
+def of_chain(differences: Sequence[History], chain: Chain) -> dict[str, Estimate]:
     """Own error of a chain's finest run, by quantity.
 
     A largest error wanders over the sheet and in time, so that the differences of the largest ones tell
@@ -383,11 +386,11 @@ def of_chain(differences: Sequence[History], chain: Chain, ratio: float = 2.0) -
         if len(differences) == 1:
             found[name] = Estimate(first, math.nan, True)
             continue
-        found[name] = whole = richardson(first, sums[1][name], ratio, chain.order)
+        found[name] = whole = richardson(first, sums[1][name], REFINED, chain.order)
         if name != MEAN_SQUARE and not math.isnan(whole.error):
             pairs = zip(differences[0][name], differences[1][name], strict=True)
             each = [
-                richardson(float(fine), float(coarse), ratio, chain.order).error for fine, coarse in pairs
+                richardson(float(fine), float(coarse), REFINED, chain.order).error for fine, coarse in pairs
             ]
             found[name] = replace(whole, error=LARGEST_SAFETY * max(whole.error, *each))
     return found
@@ -398,7 +401,7 @@ ROUND_OFF = 1e-13
 
 
 class Observer(Protocol):
-    """Who wants to know how far a study is, and may end it."""
+    """Receives the progress of a study, and may end it."""
 
     def case(self, label: str, *, resumed: bool) -> None:
         """A case begins, or was found finished."""
@@ -407,12 +410,12 @@ class Observer(Protocol):
         """Work done and in all, in the same unit; called after every step on all ranks, may raise."""
 
     def note(self, text: str) -> None:
-        """Something the user should know."""
+        """A message for the user."""
 
 
 @dataclass
 class StudyRow(Outcome[Combination]):
-    """What came of a combination.
+    """The result of a combination.
 
     Attributes
     ----------
@@ -466,7 +469,7 @@ class StudyRow(Outcome[Combination]):
 
     @property
     def line(self) -> str:
-        """What its line in a diagram is called: its integrator."""
+        """The name of its line in a diagram: its integrator."""
         return self.result.integrator or str(self.case.settings.get("integrator", ""))
 
 

@@ -50,7 +50,7 @@ def read_curve(path: Path) -> list[Place]:
 
 
 def checked_points(points: list[Place], whole: str = "the curve") -> Points:
-    """A curve from (0, 0) on; ``whole`` is its place in words.
+    """Check a curve and begin it at (0, 0); ``whole`` names it in messages.
 
     Raises
     ------

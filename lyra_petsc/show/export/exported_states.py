@@ -80,7 +80,7 @@ class ExportedStates:
 
     @cached_property
     def obstacles(self) -> dict[str, ObstacleSurface]:
-        """The run's obstacles, by names of letters, digits and underscores, each another, none ``cloth``."""
+        """The run's obstacles by unique names of letters, digits and underscores, none of them ``cloth``."""
         if not self.run.scene.obstacles:
             return {}
         from lyra_petsc.show.obstacle_surfaces import obstacle_surfaces

@@ -39,25 +39,24 @@ class ColourRange:
     percent: bool = False
 
     @classmethod
-    def parse(cls, text: str, key: str = "--range") -> ColourRange:
+    def parse(cls, text: str) -> ColourRange:
         """``0,5`` or ``2%,98%``.
 
         Raises
         ------
         InputError
         """
-        words = [word.strip() for word in text.split(",")]
-        percent = bool(words) and all(word.endswith("%") for word in words)
+        given = [word.strip() for word in text.split(",")]
+        percent = all(word.endswith("%") for word in given)
         try:
-            ends = [float(word.removesuffix("%") if percent else word) for word in words]
+            ends = [float(word.removesuffix("%") if percent else word) for word in given]
         except ValueError:
             ends = []
         if len(ends) != 2 or not -np.inf < ends[0] < ends[1] < np.inf:
-            raise InputError(
-                f"must be two numbers, the lower first, as in 0,5 or 2%,98%, not {text!r}", key=key
-            )
+            words = f"must be two numbers, the lower first, as in 0,5 or 2%,98%, not {text!r}"
+            raise InputError(words, key="--range")
         if percent and not 0.0 <= ends[0] < ends[1] <= 100.0:
-            raise InputError(f"must be from 0% to 100%, not {text!r}", key=key)
+            raise InputError(f"must be from 0% to 100%, not {text!r}", key="--range")
         return cls(ends[0], ends[1], percent)
 
 
@@ -121,7 +120,7 @@ class ColourQuantity:
         return colour_limits(float(low), float(high))
 
     def on_vertices(self, run: StoredRun) -> ColourQuantity:
-        """The same with values on vertices: the means of their triangles', weighted by rest area.
+        """The same with values on vertices: means over their triangles, weighted by rest area.
 
         Constant strain triangles alternate from one to the next around the field that they stand for; the
         means follow it. Ranks are no such field.

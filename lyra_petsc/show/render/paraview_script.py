@@ -118,7 +118,7 @@ def write_script(folder: Path) -> Path:
         fields=", ".join(map(repr, names)) or "none was written",
         vectors=repr({name: True for name in names if len(run.field(name)[0].shape) > 1}),
         units=repr({name: f" [{unit}]" for name in names if (unit := run.field_units(name)) != "1"}),
-        unit="" if scene.time.analysis == "static" else " s",
+        unit="" if scene.time.static else " s",
         up=repr([float(v) + 0.0 for v in upwards(scene)]),
         sight=repr([round(float(v), 6) + 0.0 for v in run_line_of_sight(run, scene)]),
     )

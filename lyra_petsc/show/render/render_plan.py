@@ -146,7 +146,7 @@ def make_plan(options: RenderOptions) -> RenderPlan:
     """
     run = StoredRun(options.run)
     scene = scene_shown(run, options.settings)
-    static = scene.time.analysis == "static"
+    static = scene.time.static
     size = _size(options.size)
     limits = _range(options)
     _check_speeds(options)
@@ -295,7 +295,7 @@ def film_timing(
 
 
 def _natural_rate(times: Array, speed: float, fastest: float) -> float:
-    """Frames a second so that each state, or each one of so many, is shown in one frame or in several."""
+    """Frame rate at which every state, or every nth, is shown in one or several whole frames."""
     intervals = np.diff(times)
     if len(intervals) == 0:
         return SLOWEST

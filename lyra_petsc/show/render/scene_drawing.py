@@ -152,7 +152,7 @@ class SceneDrawing:
             plotter.add_mesh(arrows, color=WIND_COLOR, ambient=0.35, reset_camera=False)
         self._time = self._add_text(" ", (18 * self._scale, 14 * self._scale), font="arial")
         digits = f"{{:.{decimals(plan.run.times)}f}}"
-        static = plan.scene.time.analysis == "static"
+        static = plan.scene.time.static
         self._label = f"load = {digits}" if static else f"t = {digits} s"
         self._first = True
 
@@ -235,7 +235,7 @@ class SceneDrawing:
             self._add_bar(quantity)
 
     def _add_obstacle(self, obstacle: ObstacleSurface) -> Any:
-        """Its mesh, in the right place only once a state is drawn."""
+        """Its mesh, which is moved into place when a state is drawn."""
         points = obstacle.positions(0.0)
         mesh = self._pyvista.PolyData.from_regular_faces(points, obstacle.triangles)
         look = {"ambient": 0.3, "diffuse": 0.7, "interpolation": "phong" if obstacle.round else "flat"}

@@ -269,7 +269,9 @@ def lacking() -> list[str]:
 def close(
     report: Report, folder: Path, versions: Mapping[str, str], command: Sequence[str], *, pictures: str
 ) -> str:
-    """Add versions and command, and write ``report.md``, where nothing is lacking with all else. On one rank.
+    """Add versions and command, and write ``report.md``; if no package is missing, also HTML and figures.
+
+    Call on one rank.
 
     Returns
     -------

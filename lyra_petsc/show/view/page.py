@@ -144,7 +144,7 @@ class Page:
         self._held: HeldVertices | None = None
         self._obstacles: list[ObstacleSurface] | None = None
         self._find_handles()
-        self._unit = "" if run.scene.time.analysis == "static" else "s"
+        self._unit = "" if run.scene.time.static else "s"
         self._figures: dict[str, dict[str, Any]] = {}
         self._fill()
         self._look_at_all()
@@ -182,7 +182,7 @@ class Page:
         self._show()
 
     def _offer_quantities(self) -> None:
-        """List the quantities of this run; the chosen one is kept if it is among them."""
+        """List the quantities of this run; the chosen one stays chosen if it is among them."""
         known, state = content.names(self._run), self._state
         state.quantities = [{"title": name.replace("_", " "), "value": name} for name in (PLAIN, *known)]
         if state.quantity not in known:
@@ -247,7 +247,7 @@ class Page:
         self._again()
 
     def press(self, event: Any) -> None:
-        """Called where the left button goes down on the cloth."""
+        """Called when the left mouse button is pressed on the cloth."""
         self._pressed = _place(event, "position")
 
     def pick(self, event: Any) -> None:
@@ -327,7 +327,7 @@ class Page:
             self._mark()
 
     def _show_around(self, index: int) -> None:
-        """Show what is held, and the vertex that was picked."""
+        """Show the held vertices and the picked one."""
         x, probe = self._positions, self._probe
         held, edges = np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
         if self._held is not None and self._state.around:

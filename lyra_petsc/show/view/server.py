@@ -185,7 +185,7 @@ def _in_address(host: str) -> str:
 
 
 def open_browser(address: str) -> bool:
-    """Open the page if there is a desktop, or a browser in BROWSER; whether that was tried."""
+    """Open the page if there is a desktop, or BROWSER is set; returns whether that was tried."""
     import webbrowser
 
     known = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))

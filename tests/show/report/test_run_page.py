@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ pytest.importorskip("jinja2")
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "cli"))
 
-from launch import SCENE, done, finish, lyra, start, without_pictures, write_scene
+from launch import PICTURES, SCENE, done, finish, lyra, read_json, start, wait_until, without, write_scene
 
 from lyra_petsc.linear.presets import PRESETS
 from lyra_petsc.output.history import HISTORY_COLUMNS
@@ -106,7 +105,7 @@ def test_a_run_that_failed_says_why_and_what_to_try(tmp_path: Path) -> None:
 
 def test_a_killed_run_is_told_from_one_that_goes_on(finished: Path, tmp_path: Path) -> None:
     run = copied(finished, tmp_path)
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    summary = read_json(run / "summary.json")
     (run / "summary.json").write_text(json.dumps({**summary, "outcome": "running"}), encoding="utf-8")
     with open(run / "history.csv", "a", encoding="utf-8") as table:
         table.write("6,0.06,0.0")  # a kill in the middle of a row
@@ -123,9 +122,7 @@ def test_a_killed_run_is_told_from_one_that_goes_on(finished: Path, tmp_path: Pa
 def test_a_stopped_run_says_how_to_go_on(tmp_path: Path) -> None:
     write_scene(tmp_path, SCENE.replace("end: 0.05, step: 0.01", "end: 1000, step: 0.01"))
     process = start(["run", "scene.yaml", "--out", "long"], tmp_path)
-    states, deadline = tmp_path / "long" / "states.xdmf", time.monotonic() + 60
-    while not states.exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until((tmp_path / "long" / "states.xdmf").exists)
     running = page_of(tmp_path / "long")  # also while it goes on
     process.send_signal(signal.SIGTERM)
     assert finish(process).code == 143
@@ -160,9 +157,9 @@ def test_the_page_can_go_elsewhere_and_mistakes_are_one_line(finished: Path, tmp
 
 
 def test_without_matplotlib_one_line_says_how_to_get_it(finished: Path) -> None:
-    left = without_pictures(["report", str(finished)], finished)
-    assert left.returncode == 2
-    assert "pip install 'lyra-petsc[study]'" in left.stderr
+    left = without(PICTURES, ["report", str(finished)], finished)
+    assert left.code == 2
+    assert "pip install 'lyra-petsc[study]'" in left.err
 
 
 # -- advice ------------------------------------------------------------------------------------------

@@ -18,6 +18,14 @@ SOCKET = {
 }
 
 
+def words_at_the_end(page):
+    """Of a page that is stopped, on stderr."""
+    page.process.send_signal(signal.SIGINT)
+    left = finish(page.process)
+    assert left.code == 0
+    return left.err
+
+
 def test_nothing_without_the_token(serve, tmp_path):
     page = serve(written(tmp_path / "run"))
     wrong = page.token[:-1] + ("A" if page.token[-1] != "A" else "B")
@@ -64,10 +72,7 @@ def test_what_opens_no_web_socket_is_answered_and_the_end_is_clean(serve, tmp_pa
         for method in ("GET", "HEAD", "POST"):
             assert page.get(f"/ws?token={page.token}", method, **headers)[0] == 426
     assert page.get(f"/index.html?token={page.token}")[0] == 200
-    page.process.send_signal(signal.SIGINT)
-    left = finish(page.process)
-    assert left.code == 0
-    assert left.err == ""
+    assert words_at_the_end(page) == ""
 
 
 def test_what_is_no_request_is_answered_without_a_traceback(serve, tmp_path):
@@ -84,10 +89,7 @@ def test_what_is_no_request_is_answered_without_a_traceback(serve, tmp_path):
         with socket.create_connection(("127.0.0.1", page.port), PATIENCE) as connection:
             connection.sendall(request + b"\r\n\r\n")
             assert connection.recv(12).endswith(b" 400"), request
-    page.process.send_signal(signal.SIGINT)
-    left = finish(page.process)
-    assert left.code == 0
-    assert left.err == ""
+    assert words_at_the_end(page) == ""
 
 
 def test_messages_that_are_none_of_the_page_end_their_web_socket_only(serve, tmp_path):
@@ -105,10 +107,7 @@ def test_messages_that_are_none_of_the_page_end_their_web_socket_only(serve, tmp
 
     asyncio.run(send())
     assert page.get(f"/index.html?token={page.token}")[0] == 200
-    page.process.send_signal(signal.SIGINT)
-    left = finish(page.process)
-    assert left.code == 0
-    assert "Traceback" not in left.err
+    assert "Traceback" not in words_at_the_end(page)
 
 
 def test_other_names_and_other_sites_are_refused_with_the_token_too(serve, tmp_path):

@@ -1,11 +1,9 @@
 """``view`` as a program: how it begins and ends."""
 
 import signal
-import subprocess
-import sys
 
 import pytest
-from launch import PATIENCE, environment, finish, lyra
+from launch import finish, lyra, without
 from written_run import Writer, written
 
 
@@ -66,23 +64,9 @@ def test_under_mpirun_one_rank_serves_and_all_leave_alike(serve, tmp_path):
 
 
 def test_a_missing_package_is_one_line(tmp_path):
-    program = (
-        "import sys, importlib.util as u; real = u.find_spec;"
-        "u.find_spec = lambda name, *rest: None if name == 'trame_vtk' else real(name, *rest);"
-        "from lyra_petsc.cli.app import run_command_line;"
-        f"sys.exit(run_command_line(['lyra-petsc', 'view', {str(written(tmp_path / 'run'))!r}]))"
-    )
-    left = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
-
-    assert left.returncode == 2
-    assert left.stderr == (
+    left = without(["trame_vtk"], ["view", written(tmp_path / "run")], tmp_path)
+    assert left.code == 2
+    assert left.err == (
         "lyra-petsc: view: trame_vtk is not installed; get the extra: pip install 'lyra-petsc[view]'\n"
     )
 

@@ -29,7 +29,7 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 )
 from lyra_petsc.experiments.verification.answers import grid
 from lyra_petsc.mesh.crossings import self_crossings
-from lyra_petsc.output.run_crossings import inside
+from lyra_petsc.mesh.start_crossings import overlaps_of
 from lyra_petsc.parallel import on_root
 
 MOST = 12
@@ -111,7 +111,7 @@ def _pressed(setting: Setting, bench: Bench) -> Content:
 
 
 def _crossings(trial: Trial) -> int:
-    """How many pairs of triangles cross now, and parts are inside of obstacles."""
+    """Number of pairs of triangles that cross now, plus parts that lie inside obstacles."""
     simulation, x = trial.simulation, trial.x
     mesh = simulation.problem.mesh  # on rank 0
     term: Any = simulation.problem.terms["contact"]
@@ -122,7 +122,7 @@ def _crossings(trial: Trial) -> int:
         found = len(self_crossings(x, triangles))
         for one in term.obstacles.each:
             box = (simulation.scene.obstacles or {})[one.name].box is not None
-            found += sum(len(part) for part in inside(one, triangles, is_box=box)(x, simulation.time))
+            found += sum(map(len, overlaps_of(one, x, triangles, simulation.time, is_box=box)))
         return found
 
     return on_root(simulation.comm, count)

@@ -43,7 +43,7 @@ def _noisy(x: Array, spacing: float) -> Array:
 
 
 def _crumpled(x: Array, spacing: float) -> Array:
-    """Folded again and again, at random planes near the middle of what the folds before have left."""
+    """Folded repeatedly along random planes near the middle of the shape that previous folds have left."""
     random = np.random.default_rng(2)
     y = x - x.mean(axis=0)
     for _ in range(FOLDS):
@@ -67,7 +67,7 @@ def _folded(x: Array, spacing: float) -> Array:
 
 
 def _mirrored(x: Array, spacing: float) -> Array:
-    """The other way up, where a curved shell would rather not be."""
+    """Turned inside out, where a curved shell is not at rest."""
     y = x.copy()
     y[:, 2] = 2.0 * x[:, 2].min() - x[:, 2]
     return y

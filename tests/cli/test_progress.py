@@ -1,9 +1,11 @@
+"""What runs, films and studies show while they are at work."""
+
 import io
 from types import SimpleNamespace
 
 import pytest
 
-from lyra_petsc.cli.progress import Progress, closing_table, duration
+from lyra_petsc.cli.progress import FrameProgress, Progress, StudyProgress, closing_table, duration
 
 
 class Terminal(io.StringIO):
@@ -112,3 +114,54 @@ def test_closing_table(stream):
 
 def test_duration():
     assert [duration(s) for s in (0, 65.4, 3909, float("nan"))] == ["0:00", "1:05", "1:05:09", "?"]
+
+
+@pytest.mark.parametrize("stream", [io.StringIO(), Terminal()], ids=["file", "terminal"])
+def test_a_film_has_a_bar_on_a_terminal_and_lines_elsewhere(stream):
+    with FrameProgress(FIRST, stream=stream) as progress:
+        progress.LINE_SECONDS = 0.0
+        progress.update(0, 100)
+        progress.update(50, 100)
+    assert "50 of 100 states drawn" in stream.getvalue()
+    assert ("━" in stream.getvalue()) == stream.isatty()
+
+
+def test_lines_of_a_study_name_each_case_and_the_time_left():
+    stream, clock = io.StringIO(), Clock()
+    with StudyProgress(FIRST, lambda: None, 2, stream=stream, clock=clock) as progress:
+        progress.case("bdf2, Δt 10 ms", resumed=True)
+        progress.progress(10.0, 40.0)
+        progress.case("bdf2, Δt 5 ms", resumed=False)
+        for second in range(200):
+            clock.now = float(second)
+            progress.progress(10.0 + 0.1 * second, 40.0)
+        progress.case("reference: bdf2, Δt 1.25 ms", resumed=False)
+        progress.note("something")
+    lines = stream.getvalue().splitlines()
+    assert lines[0] == "1/2 bdf2, Δt 10 ms: finished before"
+    assert lines[1] == "2/2 bdf2, Δt 5 ms"
+    # after 60 s of what took no time before: 6 of 30 units, four times as long to go
+    assert lines[2] == " 40%  2/2 bdf2, Δt 5 ms  4:00 left"
+    assert len(lines) == 7
+    assert lines[-2:] == ["reference: bdf2, Δt 1.25 ms", "note: something"]
+
+
+def test_the_bar_of_a_study():
+    stream, clock = Terminal(), Clock()
+    with StudyProgress(FIRST, lambda: None, 1, stream=stream, clock=clock) as progress:
+        progress.case("[b]Δt 10 ms", resumed=False)
+        progress.progress(0.0, 4.0)
+        clock.now = 30.0
+        progress.progress(1.0, 4.0)
+    assert "1/1 [b]Δt 10 ms  1:30 left" in stream.getvalue()
+
+
+def test_a_stop_of_a_study_comes_through():
+    def stop():
+        raise KeyboardInterrupt
+
+    with (
+        pytest.raises(KeyboardInterrupt),
+        StudyProgress(FIRST, stop, 1, stream=io.StringIO()) as progress,
+    ):
+        progress.progress(0.0, 1.0)
