@@ -111,6 +111,6 @@ def test_a_reef_knot_holds(comm: MPI.Comm, shared_tmp: Path) -> None:
     pull = [column(run.reactions, f"handle{number}_x")[-1] for number in range(4)]
     assert pull[0] + pull[1] == pytest.approx(-0.75, abs=0.1)
     assert sum(pull) == pytest.approx(0.0, abs=0.02)
-    # from bight to bight; steps of 10 and 2.5 ms: 0.0610, 0.0669
+    # from bight to bight; steps of 10 and 5 ms: 0.0644, 0.0722
     x, left = run.positions[-1], run.rest[:, 1] < 0.5
-    assert x[left, 0].max() - x[~left, 0].min() == pytest.approx(0.064, abs=5e-3)
+    assert x[left, 0].max() - x[~left, 0].min() == pytest.approx(0.068, abs=6e-3)
