@@ -80,7 +80,7 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "energy_balance.py",
-        "self._moving += energy if term.moving else 0.0",
+        "self._moving += energy if term.moving and not term.pushes else 0.0",
         "self._moving += 0.0",
         ("tests/stepping/test_budgets.py",),
     ),

@@ -19,8 +19,9 @@ Array = NDArray[np.float64]
 def first_guess(system: StageEquations, out: Array) -> None:
     """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
     n = system.points.n_owned
-    if isinstance(system.integrator, Static):
-        ahead, out[:] = system.integrator.ahead, 0.0
+    if system.integrator.lagged_loads:
+        out[:] = 0.0
+        ahead = system.integrator.ahead if isinstance(system.integrator, Static) else None
         if ahead is not None and not system.discretisation.guards:
             out[:] = ahead / system.integrator.pseudo
             system.leap()

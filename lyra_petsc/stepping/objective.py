@@ -64,7 +64,8 @@ class Objective:
             stiffness = self.stiffnesses.get(term)
             if stiffness is None:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
-            square += 2.0 * (rate * self._size) ** 2 * float(np.vdot(each, stiffness))
+            of_size = rate * self._size  # ** would raise where the square is infinite
+            square += 2.0 * of_size * of_size * float(np.vdot(each, stiffness))
         parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
         if of.damping.acts:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))

@@ -51,7 +51,7 @@ FORWARD = {0: -25.0 / 12.0, 1: 4.0, 2: -3.0, 3: 4.0 / 3.0, 4: -0.25}
 those of the neighbours at and above it.
 """
 
-RELATIVE = 3e-4
+RELATIVE = 6e-4
 """δ over the size of the number."""
 
 MOST_CORRECTIONS = 60
