@@ -111,10 +111,12 @@ def _curvature_tensor(problem: Problem) -> Array:
 
 
 def _contact_pressure(problem: Problem) -> Array:
-    """From the normal forces on both sides together."""
+    """From the normal forces on both sides together; collective."""
     contact, system = cast("ContactBarrier", problem.terms["contact"]), problem.system
-    forces = contact.normal_forces(system.x, system.active.frozen[contact])
-    return _per_area(problem, np.arange(len(forces), dtype=np.int32), forces)
+    forces = np.zeros_like(system.x)
+    forces[:, 0] = contact.normal_forces(system.x, system.active.frozen[contact])
+    system.points.add_to_owners(forces)
+    return _per_area(problem, np.arange(len(forces), dtype=np.int32), np.ascontiguousarray(forces[:, 0]))
 
 
 def _rank(problem: Problem) -> Array:

@@ -44,6 +44,7 @@ def surplus(system: StageEquations, before: float, x_before: Array, surplus_befo
     impulse = np.zeros_like(system.x)
     for term in terms:
         _add_impulses(term, system, frozen[term], impulse)
+    system.points.add_to_owners(impulse)
     impulse = np.where(system.prescribed.free, impulse[:n], 0.0)
     mass = system.mass[:, None]
     change = np.divide(impulse, mass, out=np.zeros_like(impulse), where=mass > 0.0)
@@ -59,7 +60,9 @@ def surplus(system: StageEquations, before: float, x_before: Array, surplus_befo
 
 
 def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array) -> None:
-    """Add impulses between the pairs that touch at the stage to rows of out (n_local, 3), up to a factor."""
+    """Add impulses, up to a factor, to rows of out (n_local, 3), between what touches at the stage of the
+    pairs that this rank counts.
+    """
     points, beta, normal, force = term.touching_points(system.stage_positions, frozen)
     sheet = points >= 0
     between = sheet.all(axis=1)

@@ -485,13 +485,15 @@ class ContactBarrier(Elastic):
         return beta[keeps], normal[keeps], force[keeps], at[keeps]
 
     def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array]:
-        beta, normal, force, at = self.touching(x, frozen.now, self.n_elements)
+        beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
         return self.points[at], beta, normal, force
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
-        """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,); whole on owned ones."""
+        """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this
+        rank counts: only the owner of a vertex knows all that it is shared between.
+        """
         out = np.zeros(len(x))
-        beta, _, force, at = self.touching(x, frozen.now, self.n_elements)
+        beta, _, force, at = self.touching(x, frozen.now, self.n_owned)
         contact_pairs.add_normal_forces(self.points[at], beta, force, out)
         return out
 
