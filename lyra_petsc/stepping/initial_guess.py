@@ -18,18 +18,19 @@ Array = NDArray[np.float64]
 
 def first_guess(system: StageEquations, out: Array) -> None:
     """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
-    n = system.points.n_owned
-    if system.integrator.lagged_loads:
+    n, integrator = system.points.n_owned, system.integrator
+    if integrator.lagged_loads:
         out[:] = 0.0
-        ahead = system.integrator.ahead if isinstance(system.integrator, Static) else None
-        if ahead is not None and not system.discretisation.guards:
-            out[:] = ahead / system.integrator.pseudo
-            system.leap()
+        if isinstance(integrator, Static) and not system.discretisation.guards:
+            ahead = integrator.ahead
+            if ahead is not None:
+                out[:] = ahead / integrator.pseudo
+                system.leap()
         system.prescribe(out)
         return
     going_on = system.v[:n].copy()
     system.prescribe(going_on)
-    if system.integrator.order > 1 and not system.discretisation.guards:
+    if integrator.order > 1 and not system.discretisation.guards:
         out[:] = going_on
         return
     staying = system.beginning()

@@ -329,8 +329,8 @@ class Elastic(Term):
 
     def touching_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array]:
         """What touches at positions x (n_local, 3), of the pairs that this rank counts: points (m, 4), below
-        0 those of obstacles, their barycentric coordinates β (m, 4), unit normals (m, 3) towards the first, and
-        normal forces (m,) [N].
+        0 those of obstacles, their barycentric coordinates β (m, 4), unit normals (m, 3) towards the first,
+        and normal forces (m,) [N].
         """
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0)
