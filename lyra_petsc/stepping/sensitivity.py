@@ -250,18 +250,7 @@ class Sensitivities:
             for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
                 for each in beside:
                     self._put(each, before, tangent, step, end)
-                change = _combined(beside, step, lambda each: each.system.prescribed.velocity)
-                prescribed = np.zeros_like(velocity)
-                system.prescribed.put(prescribed, change)
-                way = self._solved(
-                    solve,
-                    partial(self._change_of_stage, beside, step, velocity),
-                    prescribed,
-                    step,
-                )
-                for each in beside:
-                    ahead = velocity + each.offset * step * way
-                    each.system.prescribe(ahead)
+                for each, ahead in self._at_their_stages(solve, beside, step, velocity):
                     each.system.accept(ahead)
         if system.edges_lag:
             self._follow_edges(before)
@@ -298,6 +287,21 @@ class Sensitivities:
         if found:
             system.active.refreeze(found)
             system.forget_forces()
+
+    def _at_their_stages(
+        self, solve: Callable[[Array], Array], beside: list[Neighbour], step: float, velocity: Array
+    ) -> list[tuple[Neighbour, Array]]:
+        """A number's neighbours with the velocities (n_owned, 3) of their stages; collective."""
+        change = _combined(beside, step, lambda each: each.system.prescribed.velocity)
+        prescribed = np.zeros_like(velocity)
+        self._system.prescribed.put(prescribed, change)
+        of_stage = partial(self._change_of_stage, beside, step, velocity)
+        way = self._solved(solve, of_stage, prescribed, step)
+        found = []
+        for each in beside:
+            each.system.prescribe(ahead := velocity + each.offset * step * way)
+            found.append((each, ahead))
+        return found
 
     def _change_of_stage(self, beside: list[Neighbour], step: float, velocity: Array, way: Array) -> Array:
         """Derivative (n_owned, 3) of G where the stage's velocities change by ``way``."""
@@ -362,18 +366,7 @@ class Sensitivities:
                 self._use_frames(each.system)
         with self._solver(rates, set_up=True, keep=False) as solve:
             for beside, step in zip(self._neighbours, self._steps, strict=True):
-                change = _combined(beside, step, lambda each: each.system.prescribed.velocity)
-                prescribed = np.zeros_like(rates)
-                system.prescribed.put(prescribed, change)
-                way = self._solved(
-                    solve,
-                    partial(self._change_of_stage, beside, step, rates),
-                    prescribed,
-                    step,
-                )
-                for each in beside:
-                    ahead = rates + each.offset * step * way
-                    each.system.prescribe(ahead)
+                for each, ahead in self._at_their_stages(solve, beside, step, rates):
                     each.system.end_edges(ahead)
         system.end_edges(rates)
 
