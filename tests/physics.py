@@ -60,6 +60,15 @@ def grid(width: float, height: float, nx: int, ny: int, pattern: str = "diagonal
     return {"grid": {"width": width, "height": height, "nx": nx, "ny": ny, "pattern": pattern}}
 
 
+def direct_solver(comm: MPI.Comm) -> dict[str, str]:
+    """Options of a direct solver that this PETSc has on so many ranks."""
+    if comm.size == 1:
+        return {"pc_type": "lu"}
+    if PETSc.Sys.hasExternalPackage("mumps"):
+        return {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
+    return {"pc_type": "redundant"}
+
+
 def obj_file(
     path: Path, vertices: Iterable[Sequence[float]], triangles: Iterable[Sequence[int]]
 ) -> dict[str, Any]:
@@ -110,10 +119,7 @@ class Simulation:
     def __init__(
         self, content: dict[str, Any], comm: MPI.Comm = MPI.COMM_WORLD, options: dict[str, str] | None = None
     ) -> None:
-        direct = {"pc_type": "lu"}
-        if comm.size > 1:
-            direct["pc_factor_mat_solver_type"] = "mumps"
-        self._options = (direct if options is None else options) | {"ksp_rtol": "1e-12"}
+        self._options = (direct_solver(comm) if options is None else options) | {"ksp_rtol": "1e-12"}
         database = PETSc.Options()
         for name, value in self._options.items():
             database.setValue(name, value)

@@ -7,6 +7,9 @@ from petsc4py import PETSc
 NOT_A_NUMBER = -4
 """SNES reason of a residual that is not a number; its name changed in PETSc 3.25."""
 
+NO_REASON = ("error code", "See https://")
+"""How lines of PETSc's errors begin that do not say what went wrong."""
+
 _NOT_A_NUMBER = "the residual is not a finite number"
 _SNES = {
     PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "Newton did not converge within its iterations",
@@ -55,5 +58,5 @@ def preconditioner_failed(ksp: PETSc.KSP) -> bool:
 def last_words(error: Exception) -> str:
     """The innermost message of an error from within PETSc, in one line."""
     lines = [line.split("] ", 1)[-1].strip() for line in str(error).splitlines()]
-    told = [line for line in lines if line and "() at " not in line and not line.startswith("error code")]
+    told = [line for line in lines if line and "() at " not in line and not line.startswith(NO_REASON)]
     return "; ".join(told[-2:]) if told else " ".join(str(error).split())

@@ -35,7 +35,7 @@ from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
 from lyra_petsc.stepping.stepper import Attempt, Stepper
-from lyra_petsc.stepping.ts_options import with_ts_options
+from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
@@ -158,7 +158,7 @@ class SteppedScene:
         ts = self.stepper.ts
         self.max_steps = ts.getMaxSteps()
         self.control = self._control(
-            _positive("-ts_dt", petsc_number("ts_dt", ts.getTimeStep())),
+            _positive(f"-{step_option()}", petsc_number(step_option(), ts.getTimeStep())),
             _positive("-ts_max_time", petsc_number("ts_max_time", ts.getMaxTime())),
         )
         self._check_length(self.control)
@@ -210,7 +210,7 @@ class SteppedScene:
             return
         steps = control.end / control.step
         if steps > MOST_STEPS:
-            names = [f"-{name}" for name in ("ts_adapt_dt_max", "ts_dt", "ts_max_time") if is_set(name)]
+            names = [f"-{name}" for name in ("ts_adapt_dt_max", *STEP_OPTIONS, "ts_max_time") if is_set(name)]
             self._refuse_length(f"{steps:.3g} steps", MOST_STEPS, control.step, [*names, "time.step"][0])
         states = steps if every is None else control.end / every
         if states > MOST_STATES:

@@ -26,8 +26,25 @@ ALLOWED = (
 TOLERANCE = 1e-3
 """Of ``-ts_adapt_type basic`` where the scene has no ``time.tolerance``."""
 
-OURS = ("ts_type", "ts_theta_theta", "ts_bdf_order", "ts_adapt_type")
+STEP_OPTIONS = ("ts_dt", "ts_time_step")
+"""Names of Δt: that of PETSc up to 3.24, and that of PETSc from 3.25 on."""
+
+OURS = ("ts_type", "ts_theta_theta", "ts_bdf_order", "ts_adapt_type", *STEP_OPTIONS)
 """Options that are not for the TS that solves the stages."""
+
+
+def step_option() -> str:
+    """Which of `STEP_OPTIONS` is in the database; the first where none is.
+
+    Raises
+    ------
+    InputError
+        If both are.
+    """
+    given = [name for name in STEP_OPTIONS if is_set(name)]
+    if len(given) > 1:
+        raise InputError("mean the same; leave one out", key=" and ".join(f"-{name}" for name in given))
+    return given[0] if given else STEP_OPTIONS[0]
 
 
 def with_ts_options(scene: Scene) -> Scene:
@@ -95,9 +112,9 @@ def _steps(time: Time) -> dict[str, Any]:
         return {} if time.adaptive else {"step": "auto", "tolerance": time.tolerance or TOLERANCE}
     if not time.adaptive:
         return {}
-    if not is_set("ts_dt"):
+    if not is_set(step_option()):
         raise InputError("none needs the length of the steps: give -ts_dt", key="-ts_adapt_type")
-    return {"step": petsc_number("ts_dt", 0.0)}
+    return {"step": petsc_number(step_option(), 0.0)}
 
 
 @contextmanager

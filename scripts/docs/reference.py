@@ -28,6 +28,7 @@ MADE = "<!-- made by scripts/docs/reference.py; change the program, not this pag
 
 OPTIONS = {
     "ts_dt": "Δt [s] instead of `time.step`; with `step: auto` the first step.",
+    "ts_time_step": "The same: its name from PETSc 3.25 on.",
     "ts_max_time": "End [s] instead of `time.end`.",
     "ts_max_steps": "Steps after which the run ends.",
     "ts_adapt_dt_min": "Smallest Δt [s], of steps of automatic length and of repeated ones.",
@@ -73,7 +74,7 @@ OPTIONS = {
 """What the program does with options that it reads, sets defaults for, or refuses."""
 
 _READ = re.compile(
-    r"(?:is_set|petsc_number|hasName|getString|getReal|getInt|getBool)\(\s*\"(\w+)\"|\"(ts_theta_\w+)\""
+    r"(?:is_set|petsc_number|hasName|getString|getReal|getInt|getBool)\(\s*\"(\w+)\"|\"(ts_(?:theta_\w+|dt|time_step))\""
 )
 
 _PLAIN = {

@@ -36,7 +36,7 @@ CASES: dict[str, tuple[tuple[str, str] | None, list[str], str]] = {
     "unknown Krylov method": (None, ["-ksp_type", "foo"], "foo"),
     "another time scheme": (None, ["-ts_type", "cn"], "-ts_type"),
     "theta endpoint": (None, ["-ts_theta_endpoint"], "-ts_theta_endpoint"),
-    "no number for PETSc": (None, ["-ts_dt", "abc"], "abc has no numeric value"),
+    "no number for PETSc": (None, ["-ts_dt", "abc"], "must be a number, not 'abc'"),
     "negative step for PETSc": (None, ["-ts_dt", "-1"], "-ts_dt"),
     "unknown option": (None, ["--ouut", "x"], "--ouut: no such option"),
     "option without value": (None, ["--out"], "--out"),

@@ -18,7 +18,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import CLOTH, grid, scene_of
+from physics import CLOTH, direct_solver, grid, scene_of
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.errors import Interrupted
@@ -68,9 +68,7 @@ def journey(
     comm: MPI.Comm, scene: dict[str, Any], folder: Path, stop: int | None, *, resume: bool = False
 ) -> tuple[int, float]:
     """A run (up to step ``stop``) with a direct solver and files in ``folder``: step number and time."""
-    options = {"pc_type": "lu", "ksp_rtol": "1e-12"}
-    if comm.size > 1:
-        options["pc_factor_mat_solver_type"] = "mumps"
+    options = direct_solver(comm) | {"ksp_rtol": "1e-12"}
     for name, value in options.items():
         PETSc.Options().setValue(name, value)
     asked = itertools.count(last(folder)[0] if resume else 0)  # before the first step, and after each

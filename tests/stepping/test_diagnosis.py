@@ -12,7 +12,7 @@ import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from physics import CLOTH, gathered, grid, scene_of
+from physics import CLOTH, direct_solver, gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping import equilibrium
@@ -45,9 +45,7 @@ def failing(
     options: Mapping[str, str] = ONE_ATTEMPT,
 ) -> Iterator[tuple[SteppedScene, SolverError, Failure]]:
     """A simulation whose step fails, and what it says of that."""
-    direct = {"pc_type": "lu", "ksp_rtol": "1e-12"}
-    if comm.size > 1:
-        direct["pc_factor_mat_solver_type"] = "mumps"
+    direct = direct_solver(comm) | {"ksp_rtol": "1e-12"}
     database = PETSc.Options()
     for name, value in (direct | dict(options)).items():
         database.setValue(name, value)

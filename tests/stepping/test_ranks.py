@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.linear.presets import BETWEEN_RANKS, PRESETS
@@ -101,6 +102,8 @@ def test_start_noise_does_not_depend_on_the_ranks_and_spares_held_vertices(comm:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name not in ("cholesky", "ilu")])
 def test_ranks_without_vertices(comm: MPI.Comm, preset: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if preset == "direct" and not PETSc.Sys.hasExternalPackage("mumps"):
+        pytest.skip("PETSc has no MUMPS")
     with Simulation(TINY, MPI.COMM_SELF) as direct:
         expected = direct.run(0.01, 3)
     partition = distribute.partition

@@ -22,6 +22,7 @@ from lyra_petsc.output.agreement import reason
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.schema import INTEGRATORS, Scene
 from lyra_petsc.show.report.document import seconds, short
+from lyra_petsc.stepping.ts_options import STEP_OPTIONS
 
 Value = float | str
 Physics = tuple[tuple[str, Value], ...]
@@ -59,6 +60,7 @@ SYNONYMS = {
     "scheme": "integrator",
     "method": "integrator",
     "ts_dt": "dt",
+    "ts_time_step": "dt",
     "ts_type": "integrator",
 }
 """What users may call the keys; refused with the right name."""
@@ -502,7 +504,11 @@ AUTO_STEPS = 200.0
 LANDING = 1e-6
 """Fraction of Δt by which a multiple of it may miss a sample time."""
 
-FIXED_BY = {"time.step": "ts_dt", "time.integrator": "ts_type", "time.tolerance": "ts_dt"}
+FIXED_BY = {
+    "time.step": STEP_OPTIONS,
+    "time.integrator": ("ts_type",),
+    "time.tolerance": STEP_OPTIONS,
+}
 """PETSc options that would override what an axis varies."""
 
 
@@ -670,9 +676,8 @@ def _numbered_vertices(base: Scene) -> list[str]:
 
 def _refuse_fixed(axis: Axis) -> None:
     """An option on the command line wins over the scene, and the axis would vary nothing."""
-    option = axis.path.removeprefix("petsc.") if axis.path.startswith("petsc.") else None
-    name = FIXED_BY.get(axis.path, option)
-    if name and is_set(name):
+    option = (axis.path.removeprefix("petsc."),) if axis.path.startswith("petsc.") else ()
+    for name in filter(is_set, FIXED_BY.get(axis.path, option)):
         raise InputError(
             f"-{name} on the command line (or in PETSC_OPTIONS, .petscrc) would fix what varies; "
             "leave it out",
