@@ -472,15 +472,8 @@ class ContactBarrier(Elastic):
         given = met.at, met.weight, met.beta, met.felt
         n = contact_pairs.touching(x, places, *self._of_pairs, met.least, given, counted, found)
         beta, normal, force, at = (part[:n] for part in found)
-        vertex = self.points[at, 0]
-        if (force < 0.0).any():  # where a surface is hollow: less of what else the vertex feels
-            of_sheets = vertex >= 0
-            shared = vertex[of_sheets & (self.kind[at] == VERTEX_TRIANGLE)]
-            mine = np.flatnonzero(of_sheets & (self.kind[at] == VERTEX_TRIANGLE))
-            whole = np.bincount(shared, force[mine], minlength=len(x))
-            positive = np.bincount(shared, np.maximum(force[mine], 0.0), minlength=len(x))
-            part = np.divide(whole, positive, out=np.zeros(len(x)), where=positive > 0.0)
-            force[mine] *= np.clip(part[shared], 0.0, 1.0)
+        if (force < 0.0).any():
+            contact_pairs.share_negative(self.kind[at], self.points[at, 0], normal, force)
         keeps = force > 0.0
         return beta[keeps], normal[keeps], force[keeps], at[keeps]
 

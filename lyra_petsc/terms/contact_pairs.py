@@ -912,6 +912,33 @@ def touching(x, others, kind, points, offset, gap, stiffness, parallel, least, m
 
 
 @kernel()
+def share_negative(kind, vertex, normal, force):  # type: ignore[no-untyped-def]
+    """Take negative normal forces (E,) [N] off the positive ones that the vertex feels from the same side.
+
+    They stand where the surface before a vertex of a sheet is hollow; what is left there is 0. A vertex
+    between two layers feels both, each for itself. Pairs of a vertex are next to each other.
+    """
+    begin = 0
+    while begin < len(force):
+        end = begin + 1
+        while end < len(force) and vertex[end] == vertex[begin] and kind[end] == kind[begin]:
+            end += 1
+        for j in range(begin, end):
+            if not force[j] < 0.0 or kind[j] != VERTEX_TRIANGLE or vertex[j] < 0:
+                continue
+            positive = 0.0
+            for i in range(begin, end):
+                if force[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
+                    positive += force[i]
+            left = max(0.0, 1.0 + force[j] / positive) if positive > 0.0 else 0.0
+            for i in range(begin, end):
+                if force[i] > 0.0 and dot(normal[i], normal[j]) > 0.0:
+                    force[i] *= left
+            force[j] = 0.0
+        begin = end
+
+
+@kernel()
 def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
     """What `free_way` gives for each of the first len(out) pairs alone."""
     nearer = approach(way, others_way)

@@ -496,3 +496,13 @@ def test_what_a_vertex_feels_before_a_bent_surface_is_smooth() -> None:
     along = np.array([energy(x + t * ahead) for t in np.linspace(0.0, 1.0, 2001)])
     assert np.abs(np.diff(along)).max() < 20.0 * np.abs(np.diff(along)).mean()
     assert np.abs(np.diff(along, 2)).max() < 0.1 * np.abs(np.diff(along)).max()
+
+
+def test_negative_normal_forces_are_taken_off_those_of_the_same_side() -> None:
+    up, down = [0.0, 0.0, 1.0], [0.0, 0.1, -1.0]
+    # two vertices; the first one is between two layers, and that below it is hollow
+    normal = np.array([up, up, [0.1, 0.0, 1.0], down, down, up, down])
+    force = np.array([0.9, -0.4, 0.6, 0.5, -0.1, 2.0, -3.0])
+    vertex, kind = np.array([4, 4, 4, 4, 4, 7, 7]), np.full(7, VERTEX_TRIANGLE)
+    contact_pairs.share_negative(kind, vertex, normal, force)
+    np.testing.assert_allclose(force, [0.9 * 11 / 15, 0.0, 0.6 * 11 / 15, 0.4, 0.0, 2.0, 0.0], rtol=1e-14)

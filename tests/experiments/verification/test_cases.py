@@ -20,7 +20,8 @@ LONG = (
     "catenary", "catenary-unequal", "circular-membrane", "plate", "plate-vibration", "column",
     "post-buckling", "lateral-buckling", "elastica-tip", "elastica-weight", "elastica-roll-up",
     "elastica-overhang", "slit-annulus", "sze-end-moment", "pinched-cylinder", "open-cylinder",
-    "hinged-roof", "incline", "rest", "capstan", "collision", "ruck", "pole", "table-edge", "cusick",
+    "hinged-roof", "incline", "rest", "capstan", "collision", "layers", "ruck", "pole",
+    "table-edge", "cusick",
 )  # fmt: skip
 """Cases whose finest resolutions take long."""
 

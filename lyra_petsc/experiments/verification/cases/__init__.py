@@ -57,6 +57,7 @@ CASES: Registry[VerificationCase] = Registry(
         "rest": "contacts",
         "capstan": "contacts",
         "collision": "contacts",
+        "layers": "contacts",
         "ruck": "drapes",
         "pole": "drapes",
         "table-edge": "drapes",

@@ -328,3 +328,62 @@ def collision(bench: Bench, n: float) -> Iterator[Measured]:
             yield Measured(f"angular momentum, {words}", found.angular, 0.0, scale=1.0)
         yield Measured(f"momentum, {words}", found.momentum, 0.0, scale=1.0)
         yield Measured(f"energy, {words}", found.energy, 0.0, scale=1.0)
+
+
+# -- a block of layers -----------------------------------------------------------------------------------
+
+LAYERS, WIDE, NARROW, LAYER_GAP = 3, 0.4, 0.3, 0.002
+"""Sheets below, their side, that of the one on top, and the gap [m]"""
+
+WIDE_CELLS, NARROW_CELLS = 6, 5
+"""Along a side, so that vertices do not lie on vertices"""
+
+RUBS, PUSH, SETTLE = 0.3, 0.8, 0.4
+"""μ between sheets, speed of the one on top [m/s], and how long the block settles before [s]"""
+
+
+@case(
+    "Block of four layers on a plane without friction; the top one, smaller, is pushed along it: its way on "
+    "the others, which go together, the velocities of all in the end, and the work of friction",
+    source="Coulomb: v = v₀ m/M, way v₀² (1 − m/M) / (2 μ g), work ½ m v₀² (1 − m/M)",
+    resolutions=(125, 250),
+    claim=Converges(1.0, 2.5e-2, slack=0.5),
+    # sheets that still tremble in their planes
+    claims={"velocity in the end": Exact(3e-3)},
+    counts="steps per second",
+    quick=1,
+)
+def layers(bench: Bench, n: float) -> Iterator[Measured]:
+    def sheet(side: float, cells: int, number: int) -> dict[str, Any]:
+        place = [0.01 * (side < WIDE), 0.5 * (WIDE - side), CLEAR * LAYER_GAP * (number + 1)]
+        return grid(side, side, cells, cells, "alternating") | {"transform": {"translate": place}}
+
+    part = NARROW**2 / (NARROW**2 + LAYERS * WIDE**2)
+    slows = RUBS * G / (1.0 - part)
+    content = {
+        "mesh": [
+            *(sheet(WIDE, WIDE_CELLS, number) for number in range(LAYERS)),
+            sheet(NARROW, NARROW_CELLS, LAYERS),
+        ],
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": LAYER_GAP, "friction": RUBS},
+        "obstacles": {
+            "floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}, "friction": 0.0}
+        },
+        "time": {"end": SETTLE + 1.4 * PUSH / slows, "step": 1.0 / n},
+    }
+    with bench.simulation(content) as trial:
+        while trial.simulation.time < SETTLE - 0.5 / n:
+            trial.step()
+        number = np.minimum(np.arange(len(trial.start)) // (WIDE_CELLS + 1) ** 2, LAYERS)
+        top, mass, before = number == LAYERS, trial.mass, trial.x[:, 0]
+        trial.set_state(v=np.where(top[:, None], [PUSH, 0.0, 0.0], 0.0))
+        work = trial.simulation.budget.external_work
+        moved, v = trial.run().x[:, 0] - before, trial.v[:, 0]
+        work -= trial.simulation.budget.external_work
+    means = np.bincount(number, mass * v) / np.bincount(number, mass)
+    way = float(np.average(moved[top], weights=mass[top]) - np.average(moved[~top], weights=mass[~top]))
+    yield Measured("velocity in the end", farthest(means, part * PUSH), part * PUSH, "m/s")
+    yield Measured("way on the others", way, 0.5 * PUSH**2 / slows, "m")
+    yield Measured("work of friction", work, 0.5 * float(mass[top].sum()) * PUSH**2 * (1.0 - part), "J")
