@@ -124,11 +124,18 @@ def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances)
 def more_room(meets: NearPair, scene: Scene) -> str:
     """What to change where two parts meet that may not."""
     moving = [name for name, obstacle in (scene.obstacles or {}).items() if obstacle.motion]
+    handled = any(handle.motion for handle in scene.handles)
     named = [meets.obstacle] if meets.obstacle in moving else moving
     who = [f"obstacles.{name}.motion" for name in named]
-    if meets.obstacle not in moving and (not who or any(handle.motion for handle in scene.handles)):
+    if handled and meets.obstacle not in moving:
         who.append("the motions of handles")
-    return f"more room for the sheet: {' and '.join(who)} must leave it some"
+    if who:
+        return f"more room for the sheet: {' and '.join(who)} must leave it some"
+    if scene.time.scheme in ("static", "beuler"):
+        return (
+            "slower motion or smaller loads (initial.velocity, gravity, loads, wind), or a larger contact.gap"
+        )
+    return f"time.integrator: beuler, which stands impacts that {scene.time.scheme} does not"
 
 
 def _overflow(diagnosis: Diagnosis, now: Circumstances) -> str:
