@@ -218,6 +218,18 @@ class CoulombFriction(Elastic):
         self._pairs = self._pairs._replace(key=self._key[mine], slip=self._slip[mine], slid=slides[mine])
         self._renew(x, frozen.places)
 
+    def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
+        # what obstacles take along in the load step would go that way twice
+        if all((turn == np.eye(3)).all() and not way.any() for turn, way in frozen.end):
+            self.accept(x, frozen)
+
+    def touched(self) -> tuple[Pairs, Array, Array]:
+        return self._pairs, self._heat.copy(), self._on_obstacles
+
+    def touch_again(self, touched: tuple[Pairs, Array, Array]) -> None:
+        self._pairs, self._heat, self._on_obstacles = touched
+        self.stale = True
+
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""
         number = self._obstacle[: self.n_owned]
