@@ -10,9 +10,9 @@ The other method lives here. Pairs keep the distance c, half of that at which th
 multipliers λ ≥ 0, one for a vertex and each side of it or obstacle, one for each other pair. Newton's solve
 with the energy max(0, λ − r (δ − c))² / 2 r is repeated with λ ← max(0, λ − r (δ − c)) until no distance is
 less than c by more than a part of it (`LEFT`) and no multiplier changes by more than `SETTLED` of the
-largest; multipliers are carried over from step to step. Search, geometry of pairs, continuous collision detection and
-friction are the program's, friction with the multiplier in the place of the barrier's force. The guard of the
-energy is off, one rank.
+largest; multipliers are carried over from step to step. Search, geometry of pairs, continuous collision
+detection and friction are the program's, friction with the multiplier for the barrier's force. The guard of
+the energy is off, one rank.
 
 Source: J. C. Simo & T. A. Laursen, Computers & Structures 42 (1992) 97-116.
 """
