@@ -392,7 +392,7 @@ class SteppedScene:
             self._told.add("impact")
             self.notes.append(
                 f"step {self.step_number + 1} ({self._now()}): {usual.name} {self.guard.words} where something "
-                "met; such steps are repeated by backward Euler (energy_balance in summary.json has their number)"
+                "touches; such steps are repeated by backward Euler"
             )
         return True
 
