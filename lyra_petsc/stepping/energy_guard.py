@@ -373,8 +373,8 @@ class EnergyGuard:
 
 
 def _with_gain(recent: list[float], gain: float, over: int) -> list[float]:
-    """Gains of the last steps and a new one, of which no more is left than the ``over`` last steps made in all:
-    a loss must not pass out of sight before what is given back of it.
+    """Gains of the last steps and a new one, of which no more is left than the ``over`` last steps made in
+    all: a loss must not pass out of sight before what is given back of it.
     """
     found = list(recent)
     for i in range(len(found) - 1, max(len(found) - over, -1), -1):

@@ -391,8 +391,8 @@ class SteppedScene:
         if "impact" not in self._told:
             self._told.add("impact")
             self.notes.append(
-                f"step {self.step_number + 1} ({self._now()}): {usual.name} {self.guard.words} where something "
-                "touches; such steps are repeated by backward Euler"
+                f"step {self.step_number + 1} ({self._now()}): {usual.name} {self.guard.words} where "
+                "something touches; such steps are repeated by backward Euler"
             )
         return True
 
