@@ -48,7 +48,7 @@ LARGEST_SUM = 0.05
 """Sum of the gains since the start, or over the last steps, over S, above which the step is repeated."""
 
 IMPACT_GAIN, IMPACT_SUM = 1e-3, 0.01
-"""The same of integrators of second order while something touches: backward Euler takes such a step."""
+"""The same of integrators of second order while something touches, for which there is a remedy."""
 
 RECENT = 20
 """How many steps the last ones are."""
@@ -271,15 +271,18 @@ class EnergyGuard:
 
     # -- the verdict -------------------------------------------------------------------------------
 
-    def stands(self, step: Balance) -> bool:
-        """Whether a step may stand; then it is remembered. The same on all ranks; collective."""
+    def stands(self, step: Balance, *, strict: bool) -> bool:
+        """Whether a step may stand; then it is remembered. The same on all ranks; collective.
+
+        ``strict``: where something touches, it may make but little under an integrator of second order.
+        """
         new = self._with(step)
         over = self._system.integrator.judged_over
         # a step that makes none of it would make none either if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self.gain = of_step, of_steps, new.scale
-        meets = self._system.touches and self._system.integrator.order > 1
+        meets = strict and self._system.touches and self._system.integrator.order > 1
         most, most_in_all = (IMPACT_GAIN, IMPACT_SUM) if meets else (LARGEST_GAIN, LARGEST_SUM)
         good = of_step <= max(most * new.scale, step.noise)
         good = good and of_steps <= max(most_in_all * new.scale, step.noise)
