@@ -79,6 +79,20 @@ class ActiveTerms:
         turning = [term for term in self.moving if not term.pushes]
         return sum(float(term.energies(x, self.frozen[term]).sum()) for term in turning)
 
+    def on_the_way(self, x: Array) -> None:
+        """A part of a static load step led to positions x."""
+        for term in self.near:
+            term.on_the_way(x, self.frozen[term])
+
+    def touched(self) -> dict[Elastic, Any]:
+        """What terms know of what touches, to come back to by `touch_again`."""
+        return {term: term.touched() for term in self.near}
+
+    def touch_again(self, touched: Mapping[Elastic, Any]) -> None:
+        """Know just this of what touches."""
+        for term, what in touched.items():
+            term.touch_again(what)
+
     def carry_frames(self, x: Array, frozen: Mapping[Term, Any] | None = None) -> None:
         """Let the frames of directors follow to positions x, from those in use or ``frozen``."""
         for term in self.edged:

@@ -47,6 +47,9 @@ LARGEST_GAIN = 0.01
 LARGEST_SUM = 0.05
 """Sum of the gains since the start, or over the last steps, over S, above which the step is repeated."""
 
+IMPACT_GAIN, IMPACT_SUM = 1e-3, 0.01
+"""The same of integrators of second order while something touches, for which there is a remedy."""
+
 RECENT = 20
 """How many steps the last ones are."""
 
@@ -76,7 +79,7 @@ class Gains:
     inertia, bracket : float
         Of backward Euler's identity: Σ ½ ‖Δv‖²_M, and the sum of its brackets.
     recent : list of float
-        Gains of the last steps, the newest last.
+        Gains of the last steps, the newest last, less what schemes of several steps gave back (`_with_gain`).
     repeated : int
         Attempts that were rejected.
     """
@@ -268,16 +271,21 @@ class EnergyGuard:
 
     # -- the verdict -------------------------------------------------------------------------------
 
-    def stands(self, step: Balance) -> bool:
-        """Whether a step may stand; then it is remembered. The same on all ranks; collective."""
+    def stands(self, step: Balance, *, strict: bool) -> bool:
+        """Whether a step may stand; then it is remembered. The same on all ranks; collective.
+
+        ``strict``: where something touches, it may make but little under an integrator of second order.
+        """
         new = self._with(step)
         over = self._system.integrator.judged_over
         # a step that makes none of it would make none either if it were shorter
         of_step = min(math.fsum(new.recent[-over:]) / min(over, len(new.recent)), new.recent[-1])
         of_steps = max(new.total, math.fsum(new.recent))
         self.gain = of_step, of_steps, new.scale
-        good = of_step <= max(LARGEST_GAIN * new.scale, step.noise)
-        good = good and of_steps <= max(LARGEST_SUM * new.scale, step.noise)
+        meets = strict and self._system.touches and self._system.integrator.order > 1
+        most, most_in_all = (IMPACT_GAIN, IMPACT_SUM) if meets else (LARGEST_GAIN, LARGEST_SUM)
+        good = of_step <= max(most * new.scale, step.noise)
+        good = good and of_steps <= max(most_in_all * new.scale, step.noise)
         good = bool(self._system.points.comm.bcast(good, root=0))
         if good:
             self.gains, self._pull = new, self._next_pull
@@ -312,7 +320,7 @@ class EnergyGuard:
             heat=heat,
             inertia=old.inertia + step.inertia,
             bracket=old.bracket + step.bracket,
-            recent=[*old.recent, judged][-RECENT:],
+            recent=_with_gain(old.recent, judged, self._system.integrator.judged_over)[-RECENT:],
             repeated=old.repeated,
         )
 
@@ -325,7 +333,7 @@ class EnergyGuard:
         if not (math.isfinite(scale) and math.isfinite(of_step)):
             return "makes energy without bounds"
         share, what = of_step / scale, ""
-        if share <= LARGEST_GAIN:
+        if share <= LARGEST_GAIN and of_steps > of_step:
             share, what = of_steps / scale, " in the steps so far"
         return f"makes {100.0 * share:.2g} % of the energy at work out of nothing{what}"
 
@@ -365,3 +373,14 @@ class EnergyGuard:
         self.gains = Gains(**memory)
         if not same:
             self.gains.total, self.gains.recent = 0.0, []
+
+
+def _with_gain(recent: list[float], gain: float, over: int) -> list[float]:
+    """Gains of the last steps and a new one, of which no more is left than the ``over`` last steps made in
+    all: a loss must not pass out of sight before what is given back of it.
+    """
+    found = list(recent)
+    for i in range(len(found) - 1, max(len(found) - over, -1), -1):
+        back = min(max(gain, 0.0), max(-found[i], 0.0))
+        found[i], gain = found[i] + back, gain - back
+    return [*found, gain]

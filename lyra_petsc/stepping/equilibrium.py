@@ -4,7 +4,8 @@ A load step begins where the polynomial through the last equilibria leads, with 
 Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian
 where the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy,
 until the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
-are taken anew before every solve, under-relaxed.
+are taken anew before every solve, under-relaxed. So is friction, where obstacles stand still: a sheet that
+comes to lie on something in a load step is held there by the forces found on the way.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -52,6 +53,11 @@ GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
 
 LEAP, LEAP_ITERATIONS = 1e3, 20
 """Further growth of Δτ, until such a solve has taken more iterations; so it is with what sufficed before."""
+
+BELOW, RISE = 0.5, 2.0
+"""With contact, how far Δτ may grow over one that was too long, and by what that grows in each solve: sheets
+fall for a while before they rest, during which longer ones fail again and again.
+"""
 
 LONGEST = 1e7
 """Largest Δτ over the first one: beyond it the last term is round-off."""
@@ -124,6 +130,8 @@ class Equilibrium:
         system.applied.factor = factor
         newton = linear = solves = 0
         anchored, last, arrived, leaps = 0.0, np.inf, False, not self._follows
+        ceiling, touches = np.inf, system.discretisation.guards
+        touched = system.active.touched()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
         history: list[Iteration] = []
         relaxation = Relaxation(system.points.comm)
@@ -144,6 +152,8 @@ class Equilibrium:
             if force > WORSE * last:
                 self._integrator.pseudo *= SHRINK
             last = force
+            if attempt.converged:
+                system.active.on_the_way(system.x)
             system.applied.given = relaxation.following(system.applied.now.copy()) if self._follows else None
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
@@ -155,12 +165,16 @@ class Equilibrium:
                 arrived = True
                 system.active.carry_frames(system.x)  # edges may turn far until they are in equilibrium
                 self._careful = self._integrator.pseudo * growth(attempt.newton_iterations)
+                self._careful = max(min(self._careful, BELOW * ceiling), self._integrator.pseudo)
+                ceiling *= RISE
                 self._integrator.pseudo = min(self._careful * (LEAP if leaps else 1.0), self._longest)
             elif leap:  # too far, also where without inertia no preconditioner can be set up
-                self._integrator.pseudo, leaps = self._careful, self._sufficed == ANY and not arrived
+                leaps = self._sufficed == ANY and not arrived and not touches
+                self._integrator.pseudo = self._careful
             elif self._stepper.linear_solver_failed or self._stepper.stopped_by:
                 break
             else:
+                ceiling = self._integrator.pseudo if touches else ceiling
                 self._integrator.pseudo *= SHRINK
                 leaps = False
         self._sufficed = 0.0
@@ -169,6 +183,7 @@ class Equilibrium:
         system.x[:n] = x
         system.points.update_ghosts(system.x)
         system.active.carry_frames(system.x, frozen)
+        system.active.touch_again(touched)
         return dataclasses.replace(
             attempt,
             converged=False,

@@ -42,8 +42,10 @@ class Globalisation:
         """Note energy and residual of the present iterate, against which trial points are judged."""
         self._at = self._equations.objective(u.getArray(readonly=True).reshape(self._shape))
         self._at_norm = self._snes.getFunctionNorm()
-        # where forces are in balance differences of energies are round-off, and kinks far away
-        self._near = self._equations.touches and not self._convergence.balanced
+        # where forces are in balance differences of energies are round-off, and kinks far away; in statics,
+        # where steps are long, searches along tangents would creep
+        kinks = self._equations.touches and self._equations.integrator.moves
+        self._near = kinks and not self._convergence.balanced
         energy, size = self._at
         self._watchdog.see(u, energy, ENERGY_ROUNDOFF * size)
 

@@ -556,7 +556,7 @@ class StageEquations:
         """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
         collective.
         """
-        if self.stage.after == self.dt and self.integrator.lagged_loads is False:
+        if self.stage.after == self.dt and not (self.integrator.lagged_loads and self.integrator.moves):
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]

@@ -315,7 +315,7 @@ class Stepper:
         self._follow_stencils()
         self.velocity.setArray(equations.history.ravel())
         # a TS step that ends where its stage shall be, with the shift that the integrator wants
-        theta = 0.5 if equations.integrator.ts_type == "theta" else 1.0
+        theta = 0.5 if self.ts.getType() == "theta" else 1.0
         length = 1.0 / (theta * stage.sigma)
         self.ts.setTime(t0 + stage.after - theta * length)
         self.ts.setTimeStep(length)

@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+SLIP = 4
+"""Place of the elastic parts of the ways among what the kernels take."""
+
 ELASTIC = 0.01
 """Part of the gap that a pair which sticks may go before it slides, at most."""
 
@@ -209,14 +212,28 @@ class CoulombFriction(Elastic):
 
     def accept(self, x: Array, frozen: ObstacleMoves) -> None:
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
-        state = self._state(frozen.end)
-        self._on_obstacles = self._forces(x, state)
+        state = list(self._state(frozen.end))
+        self._on_obstacles = self._forces(x, tuple(state))
+        # forces stay those of the step until there are other pairs
+        state[SLIP] = slip = self._slip.copy()
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
         mine = slice(self.n_owned)
-        self._pairs = self._pairs._replace(key=self._key[mine], slip=self._slip[mine], slid=slides[mine])
+        self._pairs = self._pairs._replace(key=self._key[mine], slip=slip[mine], slid=slides[mine])
         self._renew(x, frozen.places)
+
+    def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
+        # what obstacles take along in the load step would go that way twice
+        if all((turn == np.eye(3)).all() and not way.any() for turn, way in frozen.end):
+            self.accept(x, frozen)
+
+    def touched(self) -> tuple[Pairs, Array, Array]:
+        return self._pairs, self._heat.copy(), self._on_obstacles
+
+    def touch_again(self, touched: tuple[Pairs, Array, Array]) -> None:
+        self._pairs, self._heat, self._on_obstacles = touched
+        self.stale = True
 
     def _forces(self, x: Array, state: tuple[NDArray[Any], ...]) -> Array:
         """Force [N] on each obstacle and its torque [N m] about the origin by the owned pairs, (count, 6)."""

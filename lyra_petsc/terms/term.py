@@ -347,6 +347,16 @@ class Elastic(Term):
     def accept(self, x: Array, frozen: Any) -> None:
         """The step to positions x (n_local, 3) is accepted; for terms that have a state."""
 
+    def on_the_way(self, x: Array, frozen: Any) -> None:
+        """A part of a static load step led to positions x; for terms that take up there what touches."""
+
+    def touched(self) -> Any:
+        """What it knows of what touches, which `touch_again` goes back to."""
+        return None
+
+    def touch_again(self, touched: Any) -> None:
+        """Go back to it."""
+
     def heat(self, x: Array, frozen: Any) -> float:
         """What of the energy [J] of its owned elements is none when the step to x is accepted, but heat."""
         return 0.0

@@ -118,6 +118,31 @@ def test_impacts_add_little_energy_under_the_midpoint_rule(comm: MPI.Comm) -> No
     simulation.destroy()
 
 
+ON_A_TABLE: dict[str, Any] = {
+    "mesh": grid(1.0, 1.0, 6, 6, "alternating") | {"transform": {"translate": [-0.5, -0.5, 0.05]}},
+    "material": {"cloth": "gray-interlock"},
+    "contact": {"gap": 0.02},
+    "obstacles": {"it": {"box": {"min": [-0.3, -0.3, -0.05], "max": [0.3, 0.3, 0]}}},
+    "initial": {"velocity": [0, 0, -5.0]},
+}
+
+
+@pytest.mark.parametrize(("integrator", "step"), [("bdf2", 0.001), ("alpha2", 0.005), ("midpoint", 0.005)])
+def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) -> None:
+    """What these remember of a motion does not hold over an impact; there backward Euler takes over."""
+    time = {"end": 0.04, "step": step, "integrator": integrator}
+    simulation = SteppedScene(comm, scene_of(ON_A_TABLE | {"time": time}))
+    start, most = simulation.budget.total, 0.0
+    while not simulation.finished:
+        simulation.step()
+        most = max(most, simulation.budget.total)
+        assert simulation.problem.system.integrator.name == integrator
+    assert most < 1.005 * start
+    assert simulation.budget.total > 0.6 * start
+    assert any("backward Euler" in note for note in simulation.notes) == (integrator == "alpha2")
+    simulation.destroy()
+
+
 def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
     """A blade turns by 120° a step, whose ends are on both sides of the sheet's edge."""
     blade = {"capsule": {"from": [-0.1, 0, 0], "to": [0.5, 0, 0], "radius": 0.01}, "motion": "turn"}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from physics import gathered, grid, scene_of
 
 from lyra_petsc.errors import SolverError
+from lyra_petsc.stepping.energy_guard import _with_gain
 from lyra_petsc.stepping.simulation import SteppedScene
 
 MEMBRANE = {"c11": 1000.0, "c22": 1000.0, "c12": 300.0, "c33": 350.0}
@@ -60,6 +61,14 @@ def test_a_free_sheet_gains_nothing(integrator: str, comm: MPI.Comm) -> None:
         assert identity["velocity_changes"] - identity["bracket"] == pytest.approx(lost, rel=1e-4)
     else:
         assert "time.integrator: b" in notes[0]
+
+
+def test_what_is_given_back_of_a_loss_passes_out_of_sight_with_it() -> None:
+    assert _with_gain([-0.2, -0.03], 0.05, 4) == pytest.approx([-0.18, 0.0, 0.0])
+    assert _with_gain([-0.2, 0.0, 0.0, 0.0], 0.05, 4) == [-0.2, 0.0, 0.0, 0.0, 0.05]
+    assert _with_gain([-0.2], 0.3, 4) == pytest.approx([0.0, 0.1])
+    assert _with_gain([-0.2], 0.05, 1) == [-0.2, 0.05]
+    assert _with_gain([0.1], -0.05, 4) == [0.1, -0.05]
 
 
 def test_a_step_that_was_repeated_is_counted() -> None:

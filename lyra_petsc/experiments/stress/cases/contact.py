@@ -1,4 +1,4 @@
-"""Sheets that meet obstacles and each other: thin and thick, fast, stiff, squeezed, pulled through a ring.
+"""Sheets that meet obstacles and each other: thin and thick, fast, stiff, squeezed, in a ring, in a knot.
 
 Nothing may cross in any state, and a step takes at most `MOST` Newton iterations in the median.
 """
@@ -15,6 +15,7 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
@@ -41,6 +42,10 @@ CELLS, RADIUS = 12, 0.3
 STEPS = 40
 PRESSURE, LAYERS, RAMP = 1e5, 10, 20
 """Pa, and steps in which the pressure grows"""
+
+KNOT, CUT, TAIL, STRAND, WIDE, PULLED = 0.04, 0.2, 3.0, 0.01, 2, 0.25
+"""Size of the knot [m], angle from its cut [rad], tails over its size, edges [m] and how many are across, how
+far each end is pulled [m]"""
 
 
 def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **more: Any) -> Content:
@@ -110,6 +115,44 @@ def _pressed(setting: Setting, bench: Bench) -> Content:
     return _scene(setting, meshes, {"gap": 0.004}, floor, loads=loads)
 
 
+def _knot(setting: Setting, bench: Bench) -> Content:
+    """A strip in an overhand knot, a trefoil that is cut open where it is outermost, and is pulled."""
+    t = np.linspace(CUT, 2.0 * math.pi - CUT, 2000) + math.pi / 3.0
+    bow = np.column_stack(
+        [np.sin(t) + 2.0 * np.sin(2.0 * t), np.cos(t) - 2.0 * np.cos(2.0 * t), -np.sin(3.0 * t)]
+    )
+    # the ends turn outwards
+    s = np.linspace(0.0, TAIL, 200)[1:, None]
+    out = np.array([math.sqrt(0.75), 0.5, 0.0])
+    apart = bow[0] - bow[-1]
+    apart /= np.linalg.norm(apart)
+    tails = []
+    for end, before in ((bow[0], bow[1]), (bow[-1], bow[-2])):
+        on = (end - before) / np.linalg.norm(end - before)
+        tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * on + s * out)
+    way = KNOT * np.concatenate([tails[0][::-1], bow, tails[1]])
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
+    cells = round(float(length[-1]) / STRAND)
+    at = np.linspace(0.0, length[-1], cells + 1)
+    middle = np.column_stack([np.interp(at, length, way[:, k]) for k in range(3)])
+    along = np.gradient(middle, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    flat, faces = rectangle(cells, WIDE, float(length[-1]), WIDE * STRAND)
+    side = np.arange(WIDE + 1.0) - 0.5 * WIDE
+    start = (middle + STRAND * side[:, None, None] * across).reshape(-1, 3)
+    row = (cells + 1) * np.arange(WIDE + 1)
+    handles = [{"nodes": row.tolist(), "motion": "back"}, {"nodes": (row + cells).tolist(), "motion": "on"}]
+    pulls = {"back": PULLED * apart, "on": -PULLED * apart}
+    motions = {
+        name: [{"time": 0.0}, {"time": 80 * STEP, "translate": pull.tolist()}] for name, pull in pulls.items()
+    }
+    mesh = bench.mesh(start, faces, rest=flat[:, :2])
+    contact = {"gap": 0.4 * STRAND, "friction": 0.3}
+    return _scene(setting, mesh, contact, {}) | {"handles": handles, "motions": motions}
+
+
 def _crossings(trial: Trial) -> int:
     """Number of pairs of triangles that cross now, plus parts that lie inside obstacles."""
     simulation, x = trial.simulation, trial.x
@@ -143,7 +186,7 @@ GAP = 0.01
 
 contact = family(
     "contact",
-    "contact: thickness, gap, Δt, stiffness, speed, needles, a ring, ten layers",
+    "contact: thickness, gap, Δt, stiffness, speed, friction, needles, a ring, a knot, ten layers",
     _case("contact-plain", "over a ball", partial(_over_ball, contact={"gap": GAP}), level=QUICK),
     *(
         _case(
@@ -180,5 +223,14 @@ contact = family(
     ),
     _case("contact-needles", "on a roof of triangles of aspect 1000", _on_needles),
     _case("contact-ring", "pulled through a narrow ring", _through_ring, steps=80),
+    _case(
+        "contact-friction", "friction 0.5",
+        partial(_over_ball, contact={"gap": GAP, "friction": 0.5}), level=QUICK,
+    ),
+    _case(
+        "contact-friction-thrown", "friction 0.5, thrown with 10 m/s",
+        partial(_over_ball, contact={"gap": GAP, "friction": 0.5}, speed=10.0), steps=20,
+    ),
+    _case("contact-knot", "an overhand knot pulled tight", _knot, steps=80),
     _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
 )  # fmt: skip
