@@ -158,6 +158,8 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"fit": None}, "has no block fit"),
         ({"parameters": {"material.bendig": {"start": 1, "bounds": [0, 2]}}}, "did you mean 'bending'"),
         ({"parameters": {"time.end": {"start": 1, "bounds": [0.5, 2]}}}, "no number that can be varied"),
+        ({"parameters": {"handles[0].box[0][0]": {"start": 0, "bounds": [-1, 1]}}}, "what box names"),
+        ({"parameters": {"handles[0].from": {"start": 0, "bounds": [-1, 1]}}}, "what from names"),
         ({"parameters": {"material.bending": {"start": 1, "bounds": [2, 0]}}}, "lowest number first"),
         ({"parameters": {"material.bending": {"start": 3, "bounds": [0, 2]}}}, "within the bounds"),
         ({"parameters": {"material.bending": {"start": 1, "bounds": [-1, 2]}}}, "-1 cannot be taken"),
