@@ -177,6 +177,9 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"table": "vertex,x,uncertainty\n1,zero,1\n"}, "line 2: x must be a number"),
         ({"table": "vertex,x,uncertainty\n1,0\n"}, "line 2 has 2 columns"),
         ({"table": "vertex,x,uncertainty\n1,0,0\n"}, "uncertainty must be > 0"),
+        ({"table": "vertex,x,x,uncertainty\n1,0,0,1\n"}, "two columns 'x'"),
+        ({"table": 'vertex,x,uncertainty\n"1,0,1\n2,0,1\n'}, "line 2 has 1 columns"),
+        ({"table": "vertex,x,uncertainty\n1,nan,1\n"}, "x must be a number"),
     ],
 )
 def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
