@@ -12,7 +12,6 @@ from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
-from lyra_petsc.terms.hinge_friction import HingeFriction
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge import MidEdge, mean_directors
 from lyra_petsc.terms.midedge_friction import MidEdgeFriction
@@ -149,14 +148,11 @@ def bending_blocks(term: Bending, x: Array, blend: float) -> Array:
     sides = term._triangles.sides
     out, g = np.empty((term.n_elements, 4, 4, 3, 3)), np.empty((4, 3))
     angles, limits = dihedral_angles(x, term.stencil), term._limit[sides[:-1] >> 2]
-    stiffness, rest = term.law(angles)
+    stiffness, rest = term.elements.data["k"], term.elements.data["rest_angle"]
     for e, points in enumerate(term.stencil):
         corners = [tuple(x[p].tolist()) for p in points]
         law = stiffness[e], rest[e], (limits[e, 0], limits[e, 1])
         hinge_hessian(*corners, angles[e], *law, blend, g, out[e])
-        if isinstance(term, HingeFriction) and abs(angles[e] - term.bent[e]) > term._friction.give[e]:
-            # what slides has no stiffness
-            out[e] -= (1.0 - blend) * 2.0 * stiffness[e] * np.einsum("ai,bj->abij", g, g)
     return out
 
 

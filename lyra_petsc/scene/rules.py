@@ -17,7 +17,12 @@ _BOUNDS = {
     "exclusiveMinimum": operator.gt,
     "exclusiveMaximum": operator.lt,
 }
-_TYPES: dict[str, tuple[type, ...]] = {"null": (), "number": (int, float), "string": (str, Path)}
+_TYPES: dict[str, tuple[type, ...]] = {
+    "null": (),
+    "number": (int, float),
+    "string": (str, Path),
+    "array": (list, tuple),
+}
 
 
 @dataclass(frozen=True)

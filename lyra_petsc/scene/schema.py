@@ -32,7 +32,7 @@ from lyra_petsc.scene.fit_block import Fit
 from lyra_petsc.scene.materials.curves import Points, checked_points, read_curve
 from lyra_petsc.scene.materials.library import is_isotropic, isotropic, measured, names
 from lyra_petsc.scene.petsc_block import PETSC_BLOCK, PetscValue, petsc_options
-from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, one_of, some, when
+from lyra_petsc.scene.rules import Rule, absent, exactly_one, given, holds, one_of, some, when
 from lyra_petsc.scene.values import (
     INDEX,
     VECTOR,
@@ -367,6 +367,20 @@ def _needed(way: tuple[str, ...], key: str) -> Rule:
     return Rule(when(ways, given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
 
 
+_FRICTION = {
+    "anyOf": [
+        {"type": "number", "exclusiveMinimum": 0},
+        {"type": "array", "not": {"items": {"enum": [0]}}},
+    ]
+}
+_RUBS = {
+    "anyOf": [
+        given(friction_moment=_FRICTION),
+        given(kes={"type": "object", **given(**{"2HB": _FRICTION})}),
+    ]
+}
+
+
 class Material(Block):
     """One material, named from a library or given by its numbers.
 
@@ -389,7 +403,8 @@ class Material(Block):
     bending_model : str or None
         ``hinge``: an angle between neighbouring triangles, fast, but plates depend on their mesh;
         ``midedge``: one unknown more on every edge, converges on any mesh. By default ``midedge`` for young,
-        poisson and thickness, also of the library, and for an orthotropic plate, else ``hinge``.
+        poisson and thickness, also of the library, for an orthotropic plate and with friction_moment, else
+        ``hinge``.
     law : str or LawCurves
         How the membrane's stiffness depends on strain. ``stvk``: not at all; ``measured``: as measured on a
         cloth of the library; ``neo-hookean``: as that of rubber, for young, poisson and thickness, also of
@@ -413,7 +428,7 @@ class Material(Block):
         Curvature κ11, κ22, κ12 at rest, in the material axes.
     friction_moment : float or (2,) [N m/m]
         Moment per width by which friction within the fabric resists bending, of warp and weft: hysteresis,
-        and folds that stay. Half of KES's 2HB. Scaled as bending.
+        and folds that stay. Half of KES's 2HB. Scaled as bending; by ``midedge`` only.
     friction_force : float [N/m]
         Force per width by which it resists shear, half of 2HG. Scaled as membrane.
     kes : KesReport or None
@@ -433,6 +448,11 @@ class Material(Block):
             when(given(bending={"type": "object"}), given(bending_model={"const": "midedge"})),
             "d11, d22, d12, d33 are for bending_model: midedge; hinges take one number, or three",
             "bending",
+        ),
+        Rule(
+            when(_RUBS, given(bending_model={"const": "midedge"})),
+            "friction_moment (2HB of kes) is for bending_model: midedge; hinges would lose more or less",
+            "bending_model",
         ),
         Rule(
             when(given(law={"const": "measured"}), given(cloth={"enum": measured()})),
@@ -494,7 +514,8 @@ class Material(Block):
             data["membrane"] = {"c33": 1.0, **membrane}  # which counts for nothing
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))
-        return {"bending_model": "midedge" if isotropic or plate else "hinge", **data}
+        rubs = holds(_RUBS, data)
+        return {"bending_model": "midedge" if isotropic or plate or rubs else "hinge", **data}
 
     @field_validator("cloth")
     @classmethod

@@ -94,8 +94,9 @@ class Ledger:
         self._at, self._reactions = system.prescribed.at, np.zeros(len(system.prescribed.at))
         self._moving = 0.0
         self._pull: Array | None = None
+        self._targets: list[tuple[Array, Array]] = []
         if not system.integrator.moves:
-            self._pull = self._external(system.forces_now())
+            self._pull, self._targets = self._external(system.forces_now()), self._turning()
         self.measure()
 
     @property
@@ -144,8 +145,14 @@ class Ledger:
         if self._pull is not None:  # the way to an equilibrium has no stage in its middle
             external, self._pull = 0.5 * (external + self._pull), external
         # targets that move with a handle let it work on the sheet
-        turned = system.moving_energy_before - self._moving + system.pushed()
-        turned += system.turn_targets_to_end()
+        turned = system.moving_energy_before - self._moving
+        if self._pull is not None:
+            before, self._targets = self._targets, self._turning()
+            turned = sum(
+                0.5 * float(np.vdot(pull + pull0, at - at0))
+                for (at0, pull0), (at, pull) in zip(before, self._targets, strict=True)
+            )
+        turned += system.pushed() + system.turn_targets_to_end()
         moved = system.x[: len(x_before)] - x_before
         local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
         damping = np.zeros(len(self._at))
@@ -161,6 +168,11 @@ class Ledger:
         self.measure()
         self.works = Works(float(work), float(heat), self._moving - moving, damping)
         return self.budget
+
+    def _turning(self) -> list[tuple[Array, Array]]:
+        """Targets that move with handles, and the pull on them, of each term that has some."""
+        active, x = self._system.active, self._system.x
+        return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
 
     def _external(self, parts: Mapping[str, Array]) -> Array:
         """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F."""
@@ -189,7 +201,7 @@ class Ledger:
             if name != "more":
                 setattr(self.budget, name, float(value))
         if self._pull is not None:  # an older checkpoint holds none
-            self._pull = arrays.get("pull", self._pull)
+            self._pull, self._targets = arrays.get("pull", self._pull), self._turning()
         self.measure()
 
     @property

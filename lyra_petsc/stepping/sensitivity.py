@@ -176,6 +176,8 @@ class Sensitivities:
             ]
             self._neighbours.append(beside)
             self._begin(beside, step, reactions=reactions)
+        if self._system.points.n_edges_global and not self._static:
+            self._settle_edges()
 
     def destroy(self) -> None:
         """Free what the neighbours hold."""
@@ -217,6 +219,32 @@ class Sensitivities:
             if reactions:
                 neighbour.ledger = Ledger(system)
         self.tangents.append(tangent)
+
+    def _settle_edges(self) -> None:
+        """The derivatives of the edges' unknowns at the start, where their moments balance."""
+        system, n = self._system, self._system.points.n_owned
+        start, vertices = system.x[:n].copy(), self._system.points.n_vertices
+        frames = [term.frames for term in _edged(system)]
+        system.begin_at_rest()
+        system.begin_edges(start)
+        for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
+            for each in beside:
+                way = each.offset * step
+                each.system.state.set(start + way * tangent.x, system.v[:n] + way * tangent.v)
+                for term, own in zip(_edged(each.system), frames, strict=True):
+                    term.frames = own
+                each.system.begin_at_rest()
+                each.system.begin_edges(start + way * tangent.x)
+                self._use_frames(each.system, frames)
+        still = np.zeros_like(start)
+        with self._solver(still, set_up=True, keep=False) as solve:
+            for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
+                for each, ahead in self._at_their_stages(solve, beside, step, still):
+                    each.system.end_edges(ahead)
+                    self._to_frames(each.system)
+                change = _combined(beside, step, lambda each: each.system.x[:n])
+                tangent.x[vertices:] = change[vertices:]
+        system.end_edges(still)
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -272,18 +300,22 @@ class Sensitivities:
         system.integrator.restore(memory, before.numbers)
         for term, frames in zip(_edged(system), before.frames, strict=True):
             term.frames = frames
+            term.begin(system.x)
         system.begin_step(before.time, end)
-        self._use_frames(system)
+        self._use_frames(system, before.frames)
         if self._semi:
             start = np.zeros_like(before.x)
             system.prescribe(start)
             each.jacobian = system.discretisation.rows.zeros()
             system.jacobian(start, 1.0, each.jacobian)
 
-    def _use_frames(self, system: StageEquations) -> None:
-        """Let directors be measured from the frames that the simulation has in use."""
-        pairs = zip(_edged(system), _edged(self._system), strict=True)
-        found: dict[Term, Any] = {mine: self._system.active.frozen[theirs] for mine, theirs in pairs}
+    def _use_frames(self, system: StageEquations, started: Sequence[Frames]) -> None:
+        """Let directors be measured from a neighbour's own frames, or from those that the simulation, which
+        ``started`` with others, has turned to.
+        """
+        pairs = zip(_edged(system), _edged(self._system), started, strict=True)
+        used = [(mine, self._system.active.frozen[theirs], start) for mine, theirs, start in pairs]
+        found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
             system.active.refreeze(found)
             system.forget_forces()
@@ -363,7 +395,7 @@ class Sensitivities:
         for tangent, beside, step in zip(self.tangents, self._neighbours, self._steps, strict=True):
             for each in beside:
                 each.system.begin_edges(before.x + each.offset * step * tangent.x)
-                self._use_frames(each.system)
+                self._use_frames(each.system, before.frames)
         with self._solver(rates, set_up=True, keep=False) as solve:
             for beside, step in zip(self._neighbours, self._steps, strict=True):
                 for each, ahead in self._at_their_stages(solve, beside, step, rates):

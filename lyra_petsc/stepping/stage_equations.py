@@ -241,6 +241,8 @@ class StageEquations:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
         x = self._frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
+        if self.active.edged:  # frames have followed, by which forces on vertices are others
+            self.forget_forces()
         self.objective.begin_step()
         if self.integrator.moves or self.applied.given is None:
             lagged = self.active.viscous and self.integrator.lagged_loads

@@ -103,25 +103,17 @@ class Bending(Elastic):
     def energies(self, x: Array, frozen: None = None) -> Array:
         return self.all_energies(x, self.n_owned)
 
-    def law(self, angles: Array) -> tuple[Array, Array]:
-        """k [N·m] and θ̄ [rad], (E,) each, of parabolas k (θ − θ̄)² that have energy and moment at θ."""
-        return self._k, self._rest
-
-    def law_of_hessian(self, bent: Bent, blend: float) -> tuple[Array, Array]:
-        """The same with the stiffness 2 k and the moment that the Hessian is made of."""
-        return self._k, self._rest
-
     def all_energies(self, x: Array, n: int) -> Array:
         """Energy [J] of the first n hinges of this rank, (n,)."""
         out, (triangles, angles, _) = np.empty(n), self._bent(x)
         hinges = self.stencil, self._triangles.sides
-        hinge_forces.energies(x, *hinges, triangles, self._limit, angles, *self.law(angles), out)
+        hinge_forces.energies(x, *hinges, triangles, self._limit, angles, self._k, self._rest, out)
         return out
 
     def add_gradient(self, x: Array, frozen: None, out: Array) -> None:
         corners, sides, hinges = self._triangles
         triangles, angles, lengths = self._bent(x)
-        pulls, law = np.empty(self.n_elements + 1), self.law(angles)
+        pulls, law = np.empty(self.n_elements + 1), (self._k, self._rest)
         hinge_forces.pulls(x, self.stencil, sides, triangles, self._limit, angles, lengths, *law, pulls, out)
         hinge_forces.add_gradient(corners, hinges, triangles, pulls, out)
 
@@ -142,7 +134,7 @@ class Bending(Elastic):
         corners, sides, hinges = self._triangles
         within, across, bent = offsets[self.name], offsets[f"{self.name} across"], self._bent(x)
         factors = np.empty((self.n_elements + 1, 2))
-        law = *self.law_of_hessian(bent, blend), self._limit, weight
+        law = self._k, self._rest, self._limit, weight
         add_across(x, self.stencil, sides, *bent, blend, *law, within, across, values, factors)
         add_within(x, corners, hinges, sides, bent.triangles, factors, within, values)
         self._bent.forget()  # what comes next is a linear solve, which needs the room

@@ -68,6 +68,18 @@ def hessians(x, s, lo, hi, blend, mirror, k, rest, limit, out):  # type: ignore[
         out[e - lo] = o[:3, :3]
 
 
+@kernel()
+def pulls(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
+    """Gradient [N] by the mirror images of the first len(out) edges, (n, 3)."""
+    g = np.empty((4, 3))
+    for e in range(out.shape[0]):
+        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
+        theta = angle(x0, x1, x2, x3)[0]
+        moment = hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
+        for i in range(3):
+            out[e, i] = moment * g[3, i]
+
+
 class Mirrors(NamedTuple):
     """Clamps in one step.
 
@@ -139,6 +151,12 @@ class Clamp(Elastic):
     def hessians(self, x: Array, frozen: Mirrors, lo: int, hi: int, blend: float, out: Array) -> None:
         hessians(x, self.stencil, lo, hi, blend, frozen.mirror, frozen.k, self._rest, self._limit, out)
         out[frozen.k[lo:hi] == 0.0] = 0.0
+
+    def targets(self, x: Array, frozen: Mirrors) -> tuple[Array, Array]:
+        out = np.empty((self.n_owned, 3))
+        pulls(x, self.stencil, frozen.mirror, frozen.k, self._rest, self._limit, out)
+        out[frozen.k[: self.n_owned] == 0.0] = 0.0
+        return frozen.mirror[: self.n_owned], out
 
     def force_scale(self, size: float) -> Array:
         # of the full stiffness: the scale is asked for before the first step

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
-from lyra_petsc.terms import hinge_friction, midedge, midedge_energy
-from lyra_petsc.terms.hinge_friction import GIVE
+from lyra_petsc.terms import bending, midedge, midedge_energy
+from lyra_petsc.terms.bending import edge_in_material
 from lyra_petsc.terms.midedge import NO_FRICTION, MidEdge
 from lyra_petsc.terms.midedge_shape import Frames, tangents
 from lyra_petsc.terms.remembered import Remembered
@@ -30,6 +30,9 @@ from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
 
 Array = NDArray[np.float64]
+
+GIVE = 2.0
+"""κ_y [1/m]: change of curvature at which friction is at its limit."""
 
 
 class Sliding(NamedTuple):
@@ -201,8 +204,19 @@ def elements(rest: RestShape) -> Elements:
 
 
 def coarse_elements(rest: RestShape) -> Elements:
-    """Friction of the hinges between the same triangles, which stands for it while nothing slides."""
-    return hinge_friction.elements(rest, "midedge")
+    """Hinges between the same triangles, which bend as it does while nothing slides."""
+    quad, faces = rest.hinges.vertices, rest.hinges.triangles
+    moments = np.array([shell.friction_moment for shell in rest.shells])
+    limit, bends = np.full(len(quad), np.inf), np.ones(len(quad), dtype=bool)
+    for side in range(2):
+        edge, stiffness = edge_in_material(rest, faces[:, side], quad[:, 0], quad[:, 1], "midedge")
+        across = edge[:, ::-1] ** 2 / np.sum(edge * edge, axis=1, keepdims=True)
+        limit = np.minimum(limit, np.sum(across * moments[rest.shell_of[faces[:, side]]], axis=1))
+        bends &= stiffness > 0.0
+    found, limit = bending.elements(rest, "midedge"), limit[bends]
+    rubs, data = limit > 0.0, dict(found.data)
+    data["k"] = limit * data["length"] / (GIVE * data["rest_height"])
+    return Elements(found.stencil[rubs], {name: values[rubs] for name, values in data.items()})
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> MidEdgeFriction:

@@ -109,8 +109,8 @@ def _rubs(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
     return any(max(coefficients(each)) > 0.0 for each in all_of_them if each is not None)
 
 
-def _slides_by(model: str) -> Need:
-    return lambda scene, shells: any(s.bends_by(model) and max(s.friction_moment) > 0.0 for s in shells)
+def _slides(scene: Scene, shells: Sequence[ShellMaterial]) -> bool:
+    return any(max(shell.friction_moment) > 0.0 for shell in shells)
 
 
 REGISTRY: list[Registration] = [
@@ -126,14 +126,13 @@ REGISTRY: list[Registration] = [
         edge_state=("frame",),
         coarse="bending",
     ),
-    Registration("hinge_friction", _slides_by("hinge"), Role.ELASTIC, "bending_energy", element_vertices=4),
     Registration(
         "midedge_friction",
-        _slides_by("midedge"),
+        _slides,
         Role.ELASTIC,
         "bending_energy",
         element_vertices=3,
-        coarse="hinge_friction",
+        coarse="bending",
     ),
     Registration(
         "shear_friction",

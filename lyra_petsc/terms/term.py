@@ -320,6 +320,12 @@ class Elastic(Term):
         """
         return None
 
+    def targets(self, x: Array, frozen: Any) -> tuple[Array, Array]:
+        """Of a term that moves and does not push, for this rank's elements: where its targets stand [m], and
+        the energy's gradient by them [N], (n, 3) each.
+        """
+        raise NotImplementedError
+
     def work(self, x: Array, at: float, start: float, end: float) -> float:
         """Work [J] that what moves does on this rank's elements on its way from one time [s] to another.
 

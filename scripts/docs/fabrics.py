@@ -30,6 +30,7 @@ COLUMNS = {
     "c [cm]": ("cantilever", "bending length c"),
     "B [µN·m]": ("cantilever", "B"),
     "B of KES [gf·cm²/cm]": ("bending", "B"),
+    "c of a loop [cm]": ("loop", "bending length c, by Peirce's formula"),
     "drape [%]": ("cusick", "drape coefficient"),
     "folds": ("cusick", "folds"),
 }
@@ -96,7 +97,7 @@ def page(folder: Path) -> None:
         "",
         f"The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, {drape}–",
         "where 500 gf/cm are not reached. The law of those that were measured is `measured`; aluminium",
-        "and paper were not. \\* is not that of the material: so stiff a membrane locks in flat triangles.",
+        "and paper were not. \\* is not that of the material, in numbers that are known.",
         "",
         "| cloth | " + " | ".join(columns) + " |",
         "| --- " * (len(columns) + 1) + "|",

@@ -10,6 +10,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import scene_of
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve
+from lyra_petsc.scene.text import parse_yaml
 
 pytestmark = pytest.mark.quick
 
@@ -24,20 +25,20 @@ def shell_of(**keys: Any) -> ShellMaterial:
 
 @pytest.mark.parametrize("model", ["hinge", "midedge"])
 def test_a_report_in_its_own_units(model: str) -> None:
-    shell = shell_of(**NUMBERS, bending_model=model, kes=REPORT)
+    kes = {name: value for name, value in REPORT.items() if name != "2HB" or model == "midedge"}
+    shell = shell_of(**NUMBERS, bending_model=model, kes=kes)
     assert shell.bending == pytest.approx((9.80665e-6, 9.80665e-6, 9.80665e-6))
-    assert shell.friction_moment == pytest.approx((0.025 * 9.80665e-3,) * 2)
     assert shell.c33 == pytest.approx(0.6 * 0.980665 * 57.29577951)
     assert shell.friction_force == pytest.approx(0.75 * 0.980665)
     if model == "midedge":
+        assert shell.friction_moment == pytest.approx((0.025 * 9.80665e-3,) * 2)
         assert shell.plate == pytest.approx((9.80665e-6, 0.0, 9.80665e-6, 0.5 * 9.80665e-6))
 
 
 def test_warp_and_weft() -> None:
-    kes = {"B": [0.2, 0.1], "2HB": [0.06, 0.02]}
-    hinge, midedge = (
-        shell_of(cloth="gray-interlock", bending_model=m, kes=kes) for m in ("hinge", "midedge")
-    )
+    kes = {"B": [0.2, 0.1]}
+    hinge = shell_of(cloth="gray-interlock", kes=kes)
+    midedge = shell_of(cloth="gray-interlock", kes=kes | {"2HB": [0.06, 0.02]})
     warp, weft = 0.2 * 9.80665e-5, 0.1 * 9.80665e-5
     assert hinge.bending == pytest.approx((weft, 0.5 * (warp + weft), warp))  # of hinges along the warp
     assert midedge.plate[:3] == pytest.approx((warp, 0.0, weft))
@@ -55,6 +56,18 @@ def test_it_is_scaled_as_what_it_acts_beside() -> None:
     )
     assert shell.friction_moment == (2e-4, 2e-4)
     assert shell.friction_force == 1.5
+
+
+@pytest.mark.parametrize(
+    ("moment", "model"), [(0, "hinge"), ([0, 0], "hinge"), (1e-4, "midedge"), ([0, 1], "midedge")]
+)
+def test_friction_bends_by_directors(moment: Any, model: str) -> None:
+    membrane = NUMBERS["membrane"] | {"c33": 1.0}  # type: ignore[operator]
+    scene = scene_of(
+        SCENE | {"material": NUMBERS | {"membrane": membrane, "bending": 1e-5, "friction_moment": moment}}
+    )
+    assert scene.material[0].bending_model == model
+    assert scene_of(parse_yaml(dump_scene(scene), file=None)).material == scene.material
 
 
 def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
@@ -75,6 +88,11 @@ def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
         ({"kes": {"G": 0.5, "2HB": 0.1}}, "friction acts beside a bending stiffness"),
         ({"kes": {"B": 0.0, "G": 1.0}}, "must be > 0"),
         ({"kes": {"HB": 0.1, "G": 1.0}}, "unknown key"),
+        ({"kes": REPORT, "bending_model": "hinge"}, "is for bending_model: midedge"),
+        (
+            {"kes": {"G": 1.0}, "bending": 1e-5, "friction_moment": [0, 1e-4], "bending_model": "hinge"},
+            "2HB of kes",
+        ),
         ({"bending": 1e-5, "friction_moment": -1.0, "kes": {"G": 1.0}}, "must be >= 0"),
     ],
 )

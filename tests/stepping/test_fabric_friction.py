@@ -44,7 +44,7 @@ def test_bending_to_and_fro_shows_the_loop_of_kes() -> None:
     share = 1.0 / (len(PATH) - 1)
     content = {
         "mesh": grid(LENGTH, WIDTH, 6, 1, "criss-cross"),
-        "material": FABRIC | {"bending_model": "midedge", "friction_moment": MOMENT},
+        "material": FABRIC | {"friction_moment": MOMENT},
         "handles": [
             {"group": "left", "clamp": True},
             {"group": "right", "clamp": True, "motion": "chuck", "interpolation": "linear"},
@@ -67,11 +67,10 @@ def test_bending_to_and_fro_shows_the_loop_of_kes() -> None:
     assert heats[13] - heats[1] == pytest.approx(2.0 * MOMENT * (500.0 - 4.0), rel=0.01)
 
 
-@pytest.mark.parametrize("model", ["hinge", "midedge"])
-def test_a_sheet_keeps_a_fold(model: str) -> None:
+def test_a_sheet_keeps_a_fold() -> None:
     content = {
         "mesh": grid(0.06, 0.01, 6, 1),
-        "material": FABRIC | {"bending_model": model, "friction_moment": MOMENT},
+        "material": FABRIC | {"friction_moment": MOMENT},
         "handles": [
             {"group": "left", "clamp": True},
             {"group": "right", "motion": "lift", "until": 0.5, "interpolation": "linear"},
@@ -116,12 +115,12 @@ def test_shear_to_and_fro() -> None:
     assert f[9] == pytest.approx(SHEAR * 0.02 + FORCE, rel=2e-2)
 
 
-def falling(model: str, integrator: str, step: float = 0.002) -> dict[str, Any]:
+def falling(integrator: str, step: float = 0.002) -> dict[str, Any]:
     return {
         "mesh": grid(0.1, 0.03, 5, 2, "alternating"),
-        "material": FABRIC | {"bending_model": model, "friction_moment": MOMENT, "friction_force": FORCE},
+        "material": FABRIC | {"friction_moment": MOMENT, "friction_force": FORCE},
         "gravity": [0.0, 0.0, -9.81],
-        "handles": [{"group": "left", "clamp": model == "midedge"}],
+        "handles": [{"group": "left", "clamp": True}],
         "time": {"end": 0.08, "step": step, "integrator": integrator},
         "solver": {"force_tolerance": 1e-11, "step_tolerance": 1e-10},
         "petsc": {"ksp_rtol": 1e-10},
@@ -129,11 +128,10 @@ def falling(model: str, integrator: str, step: float = 0.002) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
-@pytest.mark.parametrize("model", ["hinge", "midedge"])
-def test_the_energy_balance_closes(model: str, integrator: str) -> None:
+def test_the_energy_balance_closes(integrator: str) -> None:
     lost = []
     for step in (0.002, 0.001):
-        simulation = SteppedScene(MPI.COMM_SELF, scene_of(falling(model, integrator, step)))
+        simulation = SteppedScene(MPI.COMM_SELF, scene_of(falling(integrator, step)))
         start = simulation.ledger.budget.total
         while not simulation.finished:
             simulation.step()
@@ -145,11 +143,8 @@ def test_the_energy_balance_closes(model: str, integrator: str) -> None:
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("model", ["hinge", "midedge"])
-def test_a_run_goes_on_with_it_on_another_number_of_ranks(
-    comm: MPI.Comm, shared_tmp: Path, model: str
-) -> None:
-    scene = scene_of(falling(model, "beuler"))
+def test_a_run_goes_on_with_it_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    scene = scene_of(falling("beuler"))
     simulation = SteppedScene(comm, scene)
     while not simulation.finished:
         simulation.step()

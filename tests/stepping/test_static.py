@@ -137,6 +137,27 @@ def test_work_of_moved_handles_is_the_energy_stored(comm: MPI.Comm) -> None:
         assert budget.external_work == pytest.approx(budget.membrane + budget.bending, rel=1e-3)
 
 
+@pytest.mark.parametrize("model", ["hinge", "midedge"])
+def test_work_of_clamps_that_turn_is_the_energy_stored(model: str, comm: MPI.Comm) -> None:
+    turn = {"rotate": {"axis": [0, 1, 0], "degrees": -60}, "translate": [0.035, 0, 0.02]}
+    content = {
+        "mesh": grid(0.1, 0.02, 8, 2, "alternating"),
+        "material": CLOTH | {"bending": 1e-3, "bending_model": model},
+        "gravity": [0, 0, 0],
+        "handles": [{"group": "left", "clamp": True}, {"group": "right", "clamp": True, "motion": "turn"}],
+        "motions": {"turn": [{"time": 0}, {"time": 1, **turn}]},
+    }
+    off = []
+    for steps in (10, 20):
+        time, petsc = {"analysis": "static", "step": 1.0 / steps}, {"ts_adapt_dt_max": 1.0 / steps}
+        with at_rest(comm, **content, time=time, petsc=petsc) as simulation:
+            assert simulation.step_number == steps
+            budget = simulation.budget
+            off.append(budget.external_work / (budget.membrane + budget.bending) - 1.0)
+    assert 0.0 < off[1] < 0.01
+    assert off[0] / off[1] == pytest.approx(4.0, rel=0.1)  # of second order
+
+
 def test_load_steps_grow_while_they_are_easy(comm: MPI.Comm) -> None:
     with motion(comm, time={"analysis": "static", "step": 0.05}) as simulation:
         factors = []

@@ -18,10 +18,7 @@ FRAGMENTS: dict[str, dict[str, Any]] = {
     "membrane": {},
     "bending": {},
     "midedge": {"material": BENDING | {"bending_model": "midedge"}},
-    "hinge_friction": {"material": BENDING | {"friction_moment": [3.0e-3, 1.0e-3]}},
-    "midedge_friction": {
-        "material": BENDING | {"bending_model": "midedge", "friction_moment": [3.0e-3, 1.0e-3]}
-    },
+    "midedge_friction": {"material": BENDING | {"friction_moment": [3.0e-3, 1.0e-3]}},
     "shear_friction": {"material": BENDING | {"friction_force": 2.0}},
     "clamp": {"handles": [{"nodes": [0, 1, 2, 3], "clamp": True}]},
     "spring": {"handles": [{"nodes": [1, 5, 9], "stiffness": 300.0}, {"nodes": [9, 10], "stiffness": 50.0}]},

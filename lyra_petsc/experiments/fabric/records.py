@@ -207,6 +207,8 @@ def pictures(outcome: FabricOutcome, *, small: bool = False) -> list[Drawing]:
         for number, line in enumerate(lines):
             axes.plot(line.x, line.y, color=colour(number), label=line.name, lw=1.4, marker=".", ms=3)
         axes.grid(True, color="#dfe3e8", lw=0.8)
+        if all(label.endswith("[cm]") for label in (record.curves[0].x_label, record.curves[0].y_label)):
+            axes.set_aspect("equal", adjustable="datalim")  # the shape of a strip
         if len(lines) > 1:
             axes.legend(fontsize=8)
         found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))

@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
 """Blocks of a scene whose numbers can be found."""
 
+CHOICES = frozenset({"group", "nodes", "box", "from", "until", "fade", "seed", "law"})
+"""Keys below which numbers choose points, times or curves: nothing changes smoothly with them."""
+
 WHOLE_RUNS = 1e-3
 """Change over the number's size of runs whose difference is a derivative, with contact or friction."""
 
@@ -230,6 +233,13 @@ def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
                 file=scene.source,
                 key=f"{at}.{key}",
             )
+        chosen = [part for part in key.replace("[", ".").split(".") if part in CHOICES]
+        if chosen:
+            raise InputError(
+                f"cannot be varied: nothing depends smoothly on what {chosen[0]} names",
+                file=scene.source,
+                key=f"{at}.{key}",
+            )
 
 
 def value_of(scene: Scene, key: str, *, at: str) -> float:
@@ -253,6 +263,8 @@ def value_of(scene: Scene, key: str, *, at: str) -> float:
             target = target.get(part)
         else:
             target = getattr(target, part, None)
+    if isinstance(target, tuple) and len(set(target)) == 1:  # one number for all directions
+        target = target[0]
     if isinstance(target, bool) or not isinstance(target, (int, float)) or not math.isfinite(target):
         raise InputError(
             "is no number that the scene gives; write it into the scene", file=scene.source, key=f"{at}.{key}"

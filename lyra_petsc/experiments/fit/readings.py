@@ -6,7 +6,6 @@ Each reading sums something over the ranks and makes its values of the sums.
 from __future__ import annotations
 
 import csv
-import io
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -316,8 +315,14 @@ class _Table:
             raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)
         heading = kept[0][1]
         sign = next((sign for sign in ";\t" if sign in heading), ",")
-        rows = list(csv.reader(io.StringIO("\n".join(line for _, line in kept)), delimiter=sign))
+        try:  # each line by itself: quotes do not reach beyond it
+            rows = [next(csv.reader([line], delimiter=sign)) for _, line in kept]
+        except csv.Error as error:
+            raise InputError(f"is no table: {error}", file=path) from None
         self.names = [name.strip().lower() for name in rows[0]]
+        twice = [name for name in self.names if self.names.count(name) > 1]
+        if twice:
+            raise InputError(f"has two columns {twice[0]!r}; leave one out", file=path)
         self.lines = [number for number, _ in kept[1:]]
         self.rows = [[cell.strip() for cell in row] for row in rows[1:]]
         for line, row in zip(self.lines, self.rows, strict=True):

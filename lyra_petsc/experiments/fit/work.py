@@ -158,8 +158,9 @@ def unknowns_of(scene: Scene) -> list[Unknown]:
             try:
                 scene.changed({key: value})
             except InputError as error:
+                at = "" if error.key is None or error.key.startswith(key) else f"{error.key}: "
                 raise InputError(
-                    f"{value:g} cannot be taken there: {error.message}",
+                    f"{value:g} cannot be taken there: {at}{error.message}",
                     file=scene.source,
                     key=f"fit.parameters.{key}",
                 ) from None

@@ -158,6 +158,8 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"fit": None}, "has no block fit"),
         ({"parameters": {"material.bendig": {"start": 1, "bounds": [0, 2]}}}, "did you mean 'bending'"),
         ({"parameters": {"time.end": {"start": 1, "bounds": [0.5, 2]}}}, "no number that can be varied"),
+        ({"parameters": {"handles[0].box[0][0]": {"start": 0, "bounds": [-1, 1]}}}, "what box names"),
+        ({"parameters": {"handles[0].from": {"start": 0, "bounds": [-1, 1]}}}, "what from names"),
         ({"parameters": {"material.bending": {"start": 1, "bounds": [2, 0]}}}, "lowest number first"),
         ({"parameters": {"material.bending": {"start": 3, "bounds": [0, 2]}}}, "within the bounds"),
         ({"parameters": {"material.bending": {"start": 1, "bounds": [-1, 2]}}}, "-1 cannot be taken"),
@@ -175,6 +177,9 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"table": "vertex,x,uncertainty\n1,zero,1\n"}, "line 2: x must be a number"),
         ({"table": "vertex,x,uncertainty\n1,0\n"}, "line 2 has 2 columns"),
         ({"table": "vertex,x,uncertainty\n1,0,0\n"}, "uncertainty must be > 0"),
+        ({"table": "vertex,x,x,uncertainty\n1,0,0,1\n"}, "two columns 'x'"),
+        ({"table": 'vertex,x,uncertainty\n"1,0,1\n2,0,1\n'}, "line 2 has 1 columns"),
+        ({"table": "vertex,x,uncertainty\n1,nan,1\n"}, "x must be a number"),
     ],
 )
 def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
