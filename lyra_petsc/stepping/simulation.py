@@ -35,7 +35,7 @@ from lyra_petsc.stepping.problem import Problem, build_problem, events, refuse_c
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
 from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl, ToleranceControl
-from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.stepping.stepper import MEETS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
 from lyra_petsc.terms.term import Elastic
 
@@ -267,7 +267,9 @@ class SteppedScene:
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
-                self._recover(attempt, end)
+                blocked = attempt.words.startswith(MEETS) and system.integrator is self._usual
+                if not (blocked and self._take_impact(end - self.time, "finds no way")):
+                    self._recover(attempt, end)
             else:
                 accurate = self._accurate(v_before[:n], end - self.time)
                 if accurate and self._keeps_energy(x_before, v_before, end):
@@ -279,7 +281,10 @@ class SteppedScene:
                     self.estimated_error = past_error
                     if self.local_error is not None and past_slope is not None:
                         self.local_error.restore(*past_slope)
-                    if not self._take_impact(end - self.time):
+                    assert self.guard is not None
+                    # not under the midpoint rule, which keeps angular momentum
+                    impact = not self._usual.by_stage and self._take_impact(end - self.time, self.guard.words)
+                    if not impact:
                         self._lessen(end - self.time, halvings)
                         halvings += 1
             rejected += 1
@@ -378,24 +383,22 @@ class SteppedScene:
                 self.ledger.take_back(kept)
             return stands
 
-    def _take_impact(self, dt: float) -> bool:
-        """Let backward Euler repeat a short step of second order that made energy where something touches, as
-        no formula for smooth motions holds over an impact; whether it does. Not under the midpoint rule,
-        which keeps angular momentum.
+    def _take_impact(self, dt: float, why: str) -> bool:
+        """Let backward Euler repeat a short step of second order that failed where something touches, as no
+        formula for smooth motions holds over an impact; whether it does.
         """
         system, usual = self.problem.system, self._usual
         long = self.scene.time.adaptive or dt > FINER * self.control.step
-        if long or usual.order == 1 or usual.by_stage or not system.touches:
+        if long or usual.order == 1 or not system.touches:
             return False
         if system.integrator is not usual:
             system.integrator = usual  # nor did that help
             return False
-        assert self.guard is not None
         system.integrator = BackwardEuler()
         if "impact" not in self._told:
             self._told.add("impact")
             self.notes.append(
-                f"step {self.step_number + 1} ({self._now()}): {usual.name} {self.guard.words} where "
+                f"step {self.step_number + 1} ({self._now()}): {usual.name} {why} where "
                 "something touches; such steps are repeated by backward Euler"
             )
         return True

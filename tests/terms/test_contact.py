@@ -191,6 +191,25 @@ def test_sheets_thrown_fast_with_large_steps(comm: MPI.Comm, speed: float) -> No
         assert (x[36:, 2] > under).all()
 
 
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
+def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: str) -> None:
+    """All vertices at once; a formula for smooth motions finds no way, backward Euler does."""
+    scene = {
+        "mesh": grid(0.4, 0.4, 4, 4) | {"transform": {"translate": [0.0, 0.0, 0.05]}},
+        "material": CLOTH | {"bending": 1e-5, "damping": 0.01},
+        "initial": {"velocity": [3.0, 0.0, -100.0]},
+        "contact": {"gap": 0.0125},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}},
+        "time": {"end": 0.02, "step": 0.005, "integrator": integrator},
+    }
+    with Watched(comm, scene) as run:
+        before = run.simulation.budget.total
+        run.run()
+        assert (run.x[:, 2] > 0.0).all()
+        assert run.simulation.budget.total <= before
+        assert "repeated by backward Euler" in " ".join(run.simulation.notes)
+
+
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     def end(on: MPI.Comm) -> Array:
         with Watched(on, two_sheets()) as run:
