@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.near import near
 from lyra_petsc.mesh.topology import edge_table
@@ -194,7 +194,7 @@ def _outside(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
     return apart if apart > 0.0 else 0.0
 
 
-@kernel()
+@leaf()
 def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def]
     """What is left of reach² of boxes lo to hi of others (7, m) around one of around (7, n), into out."""
     x0, y0, z0, x1, y1, z1 = around[0, a], around[1, a], around[2, a], around[3, a], around[4, a], around[5, a]
