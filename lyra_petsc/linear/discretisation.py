@@ -44,7 +44,7 @@ def _far(x, origin, i, square):  # type: ignore[no-untyped-def]
 
 @cached()
 def _leaves(x, to, start, end, reach):  # type: ignore[no-untyped-def]
-    """Whether some x are farther than ``reach`` from start, ``to`` from end, ``to`` from start, x from end."""
+    """Whether x are farther than ``reach`` from start, ``to`` from end, ``to`` from start, x from end."""
     square, far = reach * reach, np.zeros(4, dtype=np.int64)
     s = e = m = n = 0
     for row in range(len(x)):  # without a way out, so that several are looked at together

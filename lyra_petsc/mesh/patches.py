@@ -229,8 +229,8 @@ def gradients(x, way, triangles, order, first, inverse, each, mean, spread, leas
 def distances_kept(met, reach, least_reach, pairs, around, height, reached, mean, spread, least, out):  # type: ignore[no-untyped-def]
     """Distances (n,) [m] that simplices of pairs of patches met (n, 2), the smaller first, surely keep.
 
-    Of simplices without a common vertex. Where it may be less than ``least_reach`` [m] it is 0, and any of
-    more than ``reach`` [m] may stand for another. ``mean``, ``spread`` and ``least`` as `gradients` gives them.
+    Of simplices without a common vertex. Where it may be less than ``least_reach`` [m] it is 0, and ``reach``
+    [m] stands for any that are more. ``mean``, ``spread`` and ``least`` as `gradients` gives them.
     """
     for n in range(len(met)):
         out[n] = 0.0

@@ -115,9 +115,8 @@ class Meeting(NamedTuple):
     felt: Array
 
 
-NOTHING = Meeting(
-    np.empty(0), np.empty(0, dtype=np.int64), *np.empty((2, 0)), np.empty((0, 4)), np.empty(0), np.empty((0, 5))
-)
+_NONE = np.empty(0)
+NOTHING = Meeting(_NONE, np.empty(0, dtype=np.int64), _NONE, _NONE, np.empty((0, 4)), _NONE, np.empty((0, 5)))
 """Where there are no pairs."""
 
 

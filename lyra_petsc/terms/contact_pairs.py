@@ -596,10 +596,9 @@ def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, met,
                     pull[Index(~points[e, i]), k] += force
 
 
-@kernel()
-def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, h):  # type: ignore[no-untyped-def]
+@leaf()
+def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, slope, h):  # type: ignore[no-untyped-def]
     """Let the Hessian h (4, 4, 3, 3) of two edges whose energy does not fade be that where it does."""
-    slope = np.zeros(12)
     part, once, twice = _mollifier(p, parallel, slope)
     if part == 1.0:
         return
@@ -648,77 +647,88 @@ def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met,
     ``met`` as of `add_gradient`; ``offsets`` (E, 10) as of `kernels.scatter`. No rows for obstacles.
     ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
     """
-    p, gamma, h = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3))
-    e, c, a_c = np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3))
+    p, gamma, h, slope = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3)), np.zeros(12)
+    room = p, gamma, h, np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3)), slope
+    for n in range(len(met[0])):
+        _add_hessian(
+            n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
+        )
+
+
+@leaf()
+def _add_hessian(  # type: ignore[no-untyped-def]
+    n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
+):  # fmt: skip
+    """Add that of row n of what was found; what ``room`` holds is of no use later."""
     at, weight, beta, felt = met
-    for n in range(len(at)):
-        pair, b, g = at[n], beta[n], felt[n]
-        factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
-        if factor == 0.0 or not abs(g[3]) < np.inf:
-            continue
-        square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
-        first, second = (1.0 - blend) * g[3], g[4]
-        along = second - first / square
-        free = _free(kind[pair], b, gamma) if first != 0.0 else 0
-        edges = kind[pair] == EDGE_EDGE
-        if free > 0 or edges:
-            _load(x, others, points, pair, p)
-        if free > 0 and kind[pair] == VERTEX_PLANE:
-            _around_foot(p)
-        for f in range(free):
-            for k in range(3):
-                e[f, k] = 0.0
-                for i in range(4):
-                    e[f, k] += gamma[f, i] * p[i, k]
-        # A⁻¹
-        a00 = a01 = a11 = 0.0
-        if free == 1:
-            a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
-        elif free == 2:
-            u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
-            v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
-            w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
-            det = u * w - v * v
-            a00, a01, a11 = w / det, -v / det, u / det
-        if free > 0:
-            c[1], a_c[1] = 0.0, 0.0
+    pair, b, g = at[n], beta[n], felt[n]
+    factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
+    if factor == 0.0 or not abs(g[3]) < np.inf:
+        return
+    p, gamma, h, e, c, a_c, slope = room
+    square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
+    first, second = (1.0 - blend) * g[3], g[4]
+    along = second - first / square
+    free = _free(kind[pair], b, gamma) if first != 0.0 else 0
+    edges = kind[pair] == EDGE_EDGE
+    if free > 0 or edges:
+        _load(x, others, points, pair, p)
+    if free > 0 and kind[pair] == VERTEX_PLANE:
+        _around_foot(p)
+    for f in range(free):
+        for k in range(3):
+            e[f, k] = 0.0
             for i in range(4):
-                for k in range(3):
-                    for f in range(free):
-                        c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
-                    a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
-                    a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
-        fades = edges and _fades(p, parallel)
-        if fades:
-            h[:] = 0.0
+                e[f, k] += gamma[f, i] * p[i, k]
+    # A⁻¹
+    a00 = a01 = a11 = 0.0
+    if free == 1:
+        a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
+    elif free == 2:
+        u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
+        v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+        w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
+        det = u * w - v * v
+        a00, a01, a11 = w / det, -v / det, u / det
+    if free > 0:
+        c[1], a_c[1] = 0.0, 0.0
         for i in range(4):
-            for j in range(i, 4):
-                if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
-                    continue
-                to = offsets[pair, (7 - i) * i // 2 + j]
-                if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
-                    continue
-                both = b[i] * b[j]
-                for k in range(3):
-                    for m in range(3):
-                        value = along * both * g[k] * g[m]
-                        if k == m:
-                            value += first * both
-                        if free > 0:
-                            value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
-                        if fades:
-                            h[i, j, k, m] = h[j, i, m, k] = value
-                        elif to & 1:
-                            values[to >> 1, m, k] += factor * value
-                        else:
-                            values[to >> 1, k, m] += factor * value
-        if fades:
-            delta, force = math.sqrt(square) - offset[pair], g[3]
-            _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, h)
-            for i in range(4):
-                if points[pair, i] < 0:
-                    h[i], h[:, i] = 0.0, 0.0
-            add_element(factor, h, offsets[pair], values)
+            for k in range(3):
+                for f in range(free):
+                    c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
+                a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
+                a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
+    fades = edges and _fades(p, parallel)
+    if fades:
+        h[:] = 0.0
+    for i in range(4):
+        for j in range(i, 4):
+            if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
+                continue
+            to = offsets[pair, (7 - i) * i // 2 + j]
+            if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
+                continue
+            both = b[i] * b[j]
+            for k in range(3):
+                for m in range(3):
+                    value = along * both * g[k] * g[m]
+                    if k == m:
+                        value += first * both
+                    if free > 0:
+                        value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
+                    if fades:
+                        h[i, j, k, m] = h[j, i, m, k] = value
+                    elif to & 1:
+                        values[to >> 1, m, k] += factor * value
+                    else:
+                        values[to >> 1, k, m] += factor * value
+    if fades:
+        delta, force = math.sqrt(square) - offset[pair], g[3]
+        _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, slope, h)
+        for i in range(4):
+            if points[pair, i] < 0:
+                h[i], h[:, i] = 0.0, 0.0
+        add_element(factor, h, offsets[pair], values)
 
 
 @leaf()

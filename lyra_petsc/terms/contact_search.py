@@ -197,7 +197,8 @@ def _outside(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
 @leaf()
 def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def]
     """What is left of reach² of boxes lo to hi of others (7, m) around one of around (7, n), into out."""
-    x0, y0, z0, x1, y1, z1 = around[0, a], around[1, a], around[2, a], around[3, a], around[4, a], around[5, a]
+    x0, y0, z0 = around[0, a], around[1, a], around[2, a]
+    x1, y1, z1 = around[3, a], around[4, a], around[5, a]
     x2, y2, z2, x3, y3, z3, way = others[0], others[1], others[2], others[3], others[4], others[5], others[6]
     for n in range(hi - lo):
         b = Index(lo + n)
@@ -207,11 +208,14 @@ def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def
 
 
 @kernel()
-def _pairs(x, way, met, kept, mean, whole, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out):  # type: ignore[no-untyped-def]  # fmt: skip
+def _pairs(  # type: ignore[no-untyped-def]
+    x, way, met, kept, mean, whole, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out
+):  # fmt: skip
     """Rows of the near simplices of pairs of patches, as many as fit; how many there are.
 
-    No patch has more than ``most`` vertices, edges or triangles. Of pairs of patches whose simplices keep
-    (n,) [m] more than their reach none is looked at.
+    No patch has more than ``most`` vertices, edges or triangles. Simplices of a pair of patches ``kept`` (n,)
+    [m] apart, as `SheetSearch.kept` has it, are looked at where that is less than their reach. ``mean`` and
+    ``whole`` as of `_means` and `_around`.
     """
     found = 0
     left, p, w = np.empty(most), np.empty((4, 3)), np.empty((4, 3))

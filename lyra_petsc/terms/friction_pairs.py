@@ -21,11 +21,11 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
 
-@kernel()
+@leaf()
 def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped-def]
     """u of pair e into u (3,); |u|."""
     along = 0.0
@@ -107,11 +107,13 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
             slip[e, k] = u[k]
 
 
-@kernel(inline="always")
-def _alike(one, other):  # type: ignore[no-untyped-def]
-    """How alike two pairs with these keys (10,) and the same first vertex are; −1: one does not go on in the
-    other. Between a vertex of a sheet and triangles it does if these have a nearest vertex in common.
+@leaf()
+def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
+    """How alike two pairs with keys (10,) in rows a and b and the same first vertex are; −1: one does not go
+    on in the other. Between a vertex of a sheet and triangles it does if these have a nearest vertex in
+    common.
     """
+    one, other = keys[a], among[b]
     if one[4] != other[4] or one[5] != other[5]:
         return -1
     if one[4] != VERTEX_TRIANGLE or one[6] != 0:
@@ -155,7 +157,7 @@ def find(keys, among, slip, place):  # type: ignore[no-untyped-def]
         b = first[Index(keys[a, 0] & (room - 1))]
         while b >= 0:
             if among[b, 0] == keys[a, 0]:
-                fits, length = _alike(keys[a], among[b]), 0.0
+                fits, length = _alike(keys, a, among, b), 0.0
                 for k in range(3):
                     length += slip[b, k] * slip[b, k]
                 if fits >= 0 and (fits > best or (fits == best and length > longest)):
