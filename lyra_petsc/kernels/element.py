@@ -11,3 +11,8 @@ from typing import Any
 from lyra_petsc.kernels.cache import cached
 
 kernel: Any = partial(cached, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+
+leaf: Any = partial(kernel, _nrt=False)
+"""Kernels for others to call that make no arrays, and do not count references to those they are given: numba
+does so in a whole function, and atomic counting takes several times as long as a few sums.
+"""

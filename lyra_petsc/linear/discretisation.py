@@ -17,7 +17,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.kernels.cache import cached
+from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import MISSING, BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
@@ -35,25 +35,40 @@ FEW = 0.1
 """Blocks that are of no use any longer, over all of fixed stencils, up to which they are kept."""
 
 
+@cached(inline="always")
+def _far(x, origin, i, square):  # type: ignore[no-untyped-def]
+    """1 where point i is farther than the root of a square [m²] from its origin, or no number; else 0."""
+    a, b, c = x[i, 0] - origin[i, 0], x[i, 1] - origin[i, 1], x[i, 2] - origin[i, 2]
+    return 0 if a * a + b * b + c * c <= square else 1
+
+
 @cached()
 def _leaves(x, to, start, end, reach):  # type: ignore[no-untyped-def]
-    """Bits: 1 where some x are farther than ``reach`` from start, 2: ``to`` from end, 4: ``to`` from start,
-    8: x from end.
-    """
-    square, found = reach * reach, 0
-    for i in range(len(x)):
-        s = e = m = n = 0.0
-        for k in range(3):
-            s += (x[i, k] - start[i, k]) ** 2
-            e += (to[i, k] - end[i, k]) ** 2
-            m += (to[i, k] - start[i, k]) ** 2
-            n += (x[i, k] - end[i, k]) ** 2
-        # or no number
-        found |= (0 if s <= square else 1) | (0 if e <= square else 2)
-        found |= (0 if m <= square else 4) | (0 if n <= square else 8)
-        if found == 15:
-            break
-    return found
+    """Whether x are farther than ``reach`` from start, ``to`` from end, ``to`` from start, x from end."""
+    square, far = reach * reach, np.zeros(4, dtype=np.int64)
+    s = e = m = n = 0
+    for row in range(len(x)):  # without a way out, so that several are looked at together
+        i = Index(row)
+        s |= _far(x, start, i, square)
+        e |= _far(to, end, i, square)
+        m |= _far(to, start, i, square)
+        n |= _far(x, end, i, square)
+    far[0], far[1], far[2], far[3] = s, e, m, n
+    return far
+
+
+@cached()
+def _leaves_at(x, start, end, reach):  # type: ignore[no-untyped-def]
+    """The same where x and ``to`` are one."""
+    square, far = reach * reach, np.zeros(4, dtype=np.int64)
+    s = e = 0
+    for row in range(len(x)):
+        i = Index(row)
+        s |= _far(x, start, i, square)
+        e |= _far(x, end, i, square)
+    far[0] = far[2] = s
+    far[1] = far[3] = e
+    return far
 
 
 @cached()
@@ -185,8 +200,8 @@ class Discretisation:
         way that was searched: x from its start, ``to`` from its end, ``to`` from its start, x from its end.
         """
         assert self._way is not None
-        bits = _leaves(x, to, *self._way, reach)
-        return [bool(bits & bit) for bit in (1, 2, 4, 8)]
+        far = _leaves_at(x, *self._way, reach) if x is to else _leaves(x, to, *self._way, reach)
+        return [bool(leaves) for leaves in far]
 
     @property
     def guards(self) -> bool:

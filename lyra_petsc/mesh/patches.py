@@ -214,6 +214,11 @@ def gradients(x, way, triangles, order, first, inverse, each, mean, spread, leas
             for at in range(first[p], first[p + 1]):
                 f = each[end, at]
                 off = f[0] - q[0], f[1] - q[1], f[2] - q[2], f[3] - q[3], f[4] - q[4], f[5] - q[5]
+                square = 0.0  # of the Frobenius norm, which is no less than the other
+                for k in range(6):
+                    square += off[k] * off[k]
+                if square <= most * most:
+                    continue
                 apart = _singular(off)[0]
                 if not apart <= most:  # or no number
                     most = apart
@@ -221,13 +226,14 @@ def gradients(x, way, triangles, order, first, inverse, each, mean, spread, leas
 
 
 @cached()
-def keep_apart(met, reach, pairs, around, height, reached, mean, spread, least, out):  # type: ignore[no-untyped-def]
-    """Whether simplices of pairs of patches met (n, 2), the smaller first, surely stay ``reach`` [m] apart.
+def distances_kept(met, reach, least_reach, pairs, around, height, reached, mean, spread, least, out):  # type: ignore[no-untyped-def]
+    """Distances (n,) [m] that simplices of pairs of patches met (n, 2), the smaller first, surely keep.
 
-    Of simplices without a common vertex. ``mean``, ``spread`` and ``least`` as `gradients` gives them.
+    Of simplices without a common vertex. Where it may be less than ``least_reach`` [m] it is 0, and ``reach``
+    [m] stands for any that are more. ``mean``, ``spread`` and ``least`` as `gradients` gives them.
     """
     for n in range(len(met)):
-        out[n] = False
+        out[n] = 0.0
         i, j = met[n]
         lo, hi = 0, len(pairs)
         while lo < hi:
@@ -238,19 +244,20 @@ def keep_apart(met, reach, pairs, around, height, reached, mean, spread, least, 
                 hi = at
         if lo == len(pairs) or pairs[lo, 0] != i or pairs[lo, 1] != j:
             continue
-        q, most = mean[i], least[i] - reach / height[lo]
-        out[n] = most > 0.0
+        q, most, enough = mean[i], least[i] - reach / height[lo], least[i] - least_reach / height[lo]
+        worst = 0.0
         for at in range(around[lo], around[lo + 1]):
-            f, left = mean[reached[at]], most - spread[reached[at]]
-            if not left >= 0.0:
-                out[n] = False
-                break
+            f, near = mean[reached[at]], spread[reached[at]]
             square = 0.0  # of the Frobenius norm, which is no less than the other
             for k in range(6):
                 square += (f[k] - q[k]) ** 2
-            if square <= left * left:
+            if near <= most and square <= (most - near) ** 2:
                 continue
             off = f[0] - q[0], f[1] - q[1], f[2] - q[2], f[3] - q[3], f[4] - q[4], f[5] - q[5]
-            if not _singular(off)[0] <= left:
-                out[n] = False
+            apart = near + _singular(off)[0]
+            if not apart <= worst:  # or no number
+                worst = apart
+            if not worst <= enough:
                 break
+        if worst <= enough:
+            out[n] = reach if worst <= most else height[lo] * (least[i] - worst)

@@ -115,6 +115,11 @@ class Meeting(NamedTuple):
     felt: Array
 
 
+_NONE = np.empty(0)
+NOTHING = Meeting(_NONE, np.empty(0, dtype=np.int64), _NONE, _NONE, np.empty((0, 4)), _NONE, np.empty((0, 5)))
+"""Where there are no pairs."""
+
+
 class Obstacles:
     """The points of all obstacles in one array, and the simplices that they make.
 
@@ -227,6 +232,7 @@ class ContactBarrier(Elastic):
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
         self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
+        self.stale = False
         self._bulge = np.zeros(1)
 
     def take(self, elements: Elements) -> None:
@@ -246,6 +252,8 @@ class ContactBarrier(Elastic):
     def freeze(self, step: UpcomingStep) -> Places:
         before, now, after = (self.obstacles.at(time) for time in (step.start, step.at, step.end))
         self._swept = np.stack([before, now, after])
+        moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
+        self.stale = bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
         self._bulge = self.obstacles.bulges(step.start, step.end) if self.moving else np.zeros(1)
         return Places(before, now, after, self.obstacles.moved(step.start, step.at))
 
@@ -253,15 +261,10 @@ class ContactBarrier(Elastic):
     def moving(self) -> bool:
         return any(obstacle.motion is not None for obstacle in self.obstacles.each)
 
-    @property
-    def stale(self) -> bool:  # type: ignore[override]
-        moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
-        return bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
-
     # -- search ------------------------------------------------------------------------------------
 
     def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
-        self._places = self._swept
+        self._places, self.stale = self._swept, False
         self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
         found = [np.empty((0, 7), dtype=np.int64), *self._at_obstacles(x, way)]
         if self.itself:
@@ -298,7 +301,10 @@ class ContactBarrier(Elastic):
             places = self._places[:, others[:, :size]]
             reach = (self.search_distance + of.radius[others[:, 3]] + self._bulge.max())[:, None]
             boxes = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
-            corners = sheet.of(np.unique(near(patches, boxes)[:, 0]))
+            met = near(patches, boxes)
+            if not len(met):
+                return
+            corners = sheet.of(np.unique(met[:, 0]))
             pairs = near(swept_boxes(x, way, corners), boxes)
             mine, theirs = corners[pairs[:, 0]], ~others[pairs[:, 1], :size]
             points = np.concatenate([mine, theirs] if sheet_first else [theirs, mine], axis=1)
@@ -328,6 +334,8 @@ class ContactBarrier(Elastic):
 
     def meeting(self, x: Array, places: Array) -> Meeting:
         """What is nearer than the gap at positions x (n_local, 3) [m] and obstacles' points (m, 3) [m]."""
+        if not self.n_elements:
+            return NOTHING
         return Meeting(*self._meeting(np.concatenate([x, places])))
 
     def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
@@ -383,6 +391,8 @@ class ContactBarrier(Elastic):
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
 
     def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
+        if not self.n_elements:
+            return 1.0
         still = np.zeros_like(frozen.now)
         left, nearer = self.meeting(x, frozen.now).least, contact_pairs.approach(way, still)
         at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
@@ -390,6 +400,8 @@ class ContactBarrier(Elastic):
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
     def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
+        if not self.n_elements:
+            return True
         bent = np.flatnonzero(self._bulge > BULGE * self.barrier.gap)
         if len(bent) and np.isin(self.obstacle, bent).any():
             return False

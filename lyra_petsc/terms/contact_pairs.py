@@ -37,7 +37,7 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.kernels.scatter import add_element
 from lyra_petsc.terms.hinge import cross, dot, minus
 
@@ -59,16 +59,6 @@ ADVANCES = 1000
 
 PARALLEL = 1e-12
 """Squared sine of the angle of two edges, or sides of a triangle, below which they count as parallel."""
-
-
-@kernel(inline="always")
-def _at(x, others, number):  # type: ignore[no-untyped-def]
-    """A vertex of the sheets, or a point of an obstacle."""
-    if number >= 0:
-        i = Index(number)
-        return x[i, 0], x[i, 1], x[i, 2]
-    i = Index(~number)
-    return others[i, 0], others[i, 1], others[i, 2]
 
 
 @kernel(inline="always")
@@ -159,7 +149,7 @@ def _on_edges(a, b, c, d):  # type: ignore[no-untyped-def]
     return s, t
 
 
-@kernel()
+@leaf()
 def _weights(kind, p):  # type: ignore[no-untyped-def]
     """β of the nearest points of p (4, 3)."""
     a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
@@ -174,7 +164,7 @@ def _weights(kind, p):  # type: ignore[no-untyped-def]
     return 1.0, v + w - 1.0, -v, -w
 
 
-@kernel(inline="always")
+@leaf()
 def _length(p, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     """|g|."""
     square = 0.0
@@ -184,7 +174,7 @@ def _length(p, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     return math.sqrt(square)
 
 
-@kernel()
+@leaf()
 def distance(kind, p):  # type: ignore[no-untyped-def]
     """Distance of points p (4, 3): |g|, or −|g| inside.
 
@@ -198,7 +188,7 @@ def distance(kind, p):  # type: ignore[no-untyped-def]
     return -length if behind else length
 
 
-@kernel(inline="always")
+@leaf()
 def _free(kind, beta, gamma):  # type: ignore[no-untyped-def]
     """γ (2, 4) of the nearest points with β (4,); how many coordinates are free."""
     gamma[:] = 0.0
@@ -220,7 +210,7 @@ def _free(kind, beta, gamma):  # type: ignore[no-untyped-def]
     return free
 
 
-@kernel()
+@leaf()
 def at_least(p, kind):  # type: ignore[no-untyped-def]
     """What the distance of a pair at p (4, 3) is not below: that of the boxes around both; −∞ of others
     than simplices.
@@ -240,7 +230,7 @@ def at_least(p, kind):  # type: ignore[no-untyped-def]
     return math.sqrt(square)
 
 
-@kernel()
+@leaf()
 def _around_foot(p):  # type: ignore[no-untyped-def]
     """Let p1 p2 p3 be a triangle around the foot of p0 in the plane of point p1 and normal p2; whether p0
     lies behind it.
@@ -261,10 +251,17 @@ def _around_foot(p):  # type: ignore[no-untyped-def]
     return height < 0.0
 
 
-@kernel(inline="always")
+@leaf()
 def _load(x, others, points, e, p):  # type: ignore[no-untyped-def]
+    """Vertices of the sheets and points of obstacles of pair e into p (4, 3)."""
     for i in range(4):
-        p[i, 0], p[i, 1], p[i, 2] = _at(x, others, points[e, i])
+        number = points[e, i]
+        if number >= 0:
+            n = Index(number)
+            p[i, 0], p[i, 1], p[i, 2] = x[n, 0], x[n, 1], x[n, 2]
+        else:
+            n = Index(~number)
+            p[i, 0], p[i, 1], p[i, 2] = others[n, 0], others[n, 1], others[n, 2]
 
 
 @kernel(inline="always")
@@ -274,7 +271,7 @@ def barrier(delta, gap):  # type: ignore[no-untyped-def]
     return left**3 / delta, left * left * (-2.0 - part) / delta, 2.0 * (part**3 - 1.0)
 
 
-@kernel(inline="always")
+@leaf()
 def _of_edges(p):  # type: ignore[no-untyped-def]
     """u·u, u·v and v·v of edges p0 p1 and p2 p3."""
     uu = uv = vv = 0.0
@@ -284,7 +281,7 @@ def _of_edges(p):  # type: ignore[no-untyped-def]
     return uu, uv, vv
 
 
-@kernel()
+@leaf()
 def _mollifier(p, parallel, slope):  # type: ignore[no-untyped-def]
     """m of edges p0 p1 and p2 p3, m′, m″ with respect to sin² θ, whose gradient goes to slope (12,)."""
     uu, uv, vv = _of_edges(p)
@@ -311,7 +308,7 @@ def distances(x, others, kind, points, out):  # type: ignore[no-untyped-def]
         out[e] = distance(kind[e], p)
 
 
-@kernel(inline="always")
+@leaf()
 def _ends(kind, points, e, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     """The nearest parts of a pair with β (4,): a vertex, and the ends of an edge or twice another vertex.
 
@@ -328,7 +325,7 @@ def _ends(kind, points, e, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     return points[e, 0], lo, hi
 
 
-@kernel(inline="always")
+@leaf()
 def _note(number, ends, at, count, apart, beta, e, one, other, share, delta, b1, b2, b3):  # type: ignore[no-untyped-def]  # fmt: skip
     """Count a nearest point on an edge, or twice a vertex, ``share`` times; how many there are."""
     both, place = (min(one, other) << 32) | max(one, other), 0
@@ -342,7 +339,7 @@ def _note(number, ends, at, count, apart, beta, e, one, other, share, delta, b1,
     return number + 1
 
 
-@kernel(forceinline=True)
+@leaf()
 def _around(p, points, e, offset, gap, shares, number, ends, at, count, apart, beta):  # type: ignore[no-untyped-def]
     """Note what is nearest to a vertex in triangle e, on its sides and at its corners; δ and how many."""
     a, b = (p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2])
@@ -404,7 +401,7 @@ def _around(p, points, e, offset, gap, shares, number, ends, at, count, apart, b
     return delta, number
 
 
-@kernel(inline="always")
+@leaf()
 def _write(  # type: ignore[no-untyped-def]
     n, at, often, ours, share, energies, felt,
     e, weight, counted, b0, b1, b2, b3, p, delta, d, gap, stiffness, part,
@@ -424,7 +421,7 @@ def _write(  # type: ignore[no-untyped-def]
     return n + 1
 
 
-@kernel()
+@leaf()
 def _write_near(  # type: ignore[no-untyped-def]
     x, others, points, number, at, count, apart, beta, n_counted, offset, gap, stiffness, n, found, p
 ):
@@ -553,7 +550,7 @@ def _longer(alike, following, n):  # type: ignore[no-untyped-def]
     return more, after
 
 
-@kernel(inline="always")
+@leaf()
 def _between(x, others, kind, points, beta, e, n, p, g):  # type: ignore[no-untyped-def]
     """Points of pair e into p (4, 3) and Σ β_ni p_i into g (3,); the distance, as `distance` gives it."""
     _load(x, others, points, e, p)
@@ -599,10 +596,9 @@ def add_gradient(x, others, kind, points, offset, gap, stiffness, parallel, met,
                     pull[Index(~points[e, i]), k] += force
 
 
-@kernel()
-def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, h):  # type: ignore[no-untyped-def]
+@leaf()
+def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, slope, h):  # type: ignore[no-untyped-def]
     """Let the Hessian h (4, 4, 3, 3) of two edges whose energy does not fade be that where it does."""
-    slope = np.zeros(12)
     part, once, twice = _mollifier(p, parallel, slope)
     if part == 1.0:
         return
@@ -617,7 +613,7 @@ def _add_fading(p, beta, g, gap, delta, stiffness, force, blend, parallel, h):  
     _add_turn(p, energy * once, h)
 
 
-@kernel()
+@leaf()
 def _add_turn(p, factor, h):  # type: ignore[no-untyped-def]
     """Add factor times the Hessian of sin² θ to h (4, 4, 3, 3)."""
     uu, uv, vv = _of_edges(p)
@@ -651,101 +647,116 @@ def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met,
     ``met`` as of `add_gradient`; ``offsets`` (E, 10) as of `kernels.scatter`. No rows for obstacles.
     ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
     """
-    p, gamma, h = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3))
-    e, c, a_c = np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3))
+    p, gamma, h, slope = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3)), np.zeros(12)
+    room = p, gamma, h, np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3)), slope
+    for n in range(len(met[0])):
+        _add_hessian(
+            n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
+        )
+
+
+@leaf()
+def _add_hessian(  # type: ignore[no-untyped-def]
+    n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
+):  # fmt: skip
+    """Add that of row n of what was found; what ``room`` holds is of no use later."""
     at, weight, beta, felt = met
-    for n in range(len(at)):
-        pair, b, g = at[n], beta[n], felt[n]
-        factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
-        if factor == 0.0 or not abs(g[3]) < np.inf:
-            continue
-        square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
-        first, second = (1.0 - blend) * g[3], g[4]
-        along = second - first / square
-        free = _free(kind[pair], b, gamma) if first != 0.0 else 0
-        edges = kind[pair] == EDGE_EDGE
-        if free > 0 or edges:
-            _load(x, others, points, pair, p)
-        if free > 0 and kind[pair] == VERTEX_PLANE:
-            _around_foot(p)
-        for f in range(free):
-            for k in range(3):
-                e[f, k] = 0.0
-                for i in range(4):
-                    e[f, k] += gamma[f, i] * p[i, k]
-        # A⁻¹
-        a00 = a01 = a11 = 0.0
-        if free == 1:
-            a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
-        elif free == 2:
-            u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
-            v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
-            w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
-            det = u * w - v * v
-            a00, a01, a11 = w / det, -v / det, u / det
-        if free > 0:
-            c[1], a_c[1] = 0.0, 0.0
+    pair, b, g = at[n], beta[n], felt[n]
+    factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
+    if factor == 0.0 or not abs(g[3]) < np.inf:
+        return
+    p, gamma, h, e, c, a_c, slope = room
+    square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
+    first, second = (1.0 - blend) * g[3], g[4]
+    along = second - first / square
+    free = _free(kind[pair], b, gamma) if first != 0.0 else 0
+    edges = kind[pair] == EDGE_EDGE
+    if free > 0 or edges:
+        _load(x, others, points, pair, p)
+    if free > 0 and kind[pair] == VERTEX_PLANE:
+        _around_foot(p)
+    for f in range(free):
+        for k in range(3):
+            e[f, k] = 0.0
             for i in range(4):
-                for k in range(3):
-                    for f in range(free):
-                        c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
-                    a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
-                    a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
-        fades = edges and _fades(p, parallel)
-        if fades:
-            h[:] = 0.0
+                e[f, k] += gamma[f, i] * p[i, k]
+    # A⁻¹
+    a00 = a01 = a11 = 0.0
+    if free == 1:
+        a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
+    elif free == 2:
+        u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
+        v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+        w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
+        det = u * w - v * v
+        a00, a01, a11 = w / det, -v / det, u / det
+    if free > 0:
+        c[1], a_c[1] = 0.0, 0.0
         for i in range(4):
-            for j in range(i, 4):
-                if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
-                    continue
-                to = offsets[pair, (7 - i) * i // 2 + j]
-                if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
-                    continue
-                both = b[i] * b[j]
-                for k in range(3):
-                    for m in range(3):
-                        value = along * both * g[k] * g[m]
-                        if k == m:
-                            value += first * both
-                        if free > 0:
-                            value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
-                        if fades:
-                            h[i, j, k, m] = h[j, i, m, k] = value
-                        elif to & 1:
-                            values[to >> 1, m, k] += factor * value
-                        else:
-                            values[to >> 1, k, m] += factor * value
-        if fades:
-            delta, force = math.sqrt(square) - offset[pair], g[3]
-            _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, h)
-            for i in range(4):
-                if points[pair, i] < 0:
-                    h[i], h[:, i] = 0.0, 0.0
-            add_element(factor, h, offsets[pair], values)
+            for k in range(3):
+                for f in range(free):
+                    c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
+                a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
+                a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
+    fades = edges and _fades(p, parallel)
+    if fades:
+        h[:] = 0.0
+    for i in range(4):
+        for j in range(i, 4):
+            if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
+                continue
+            to = offsets[pair, (7 - i) * i // 2 + j]
+            if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
+                continue
+            both = b[i] * b[j]
+            for k in range(3):
+                for m in range(3):
+                    value = along * both * g[k] * g[m]
+                    if k == m:
+                        value += first * both
+                    if free > 0:
+                        value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
+                    if fades:
+                        h[i, j, k, m] = h[j, i, m, k] = value
+                    elif to & 1:
+                        values[to >> 1, m, k] += factor * value
+                    else:
+                        values[to >> 1, k, m] += factor * value
+    if fades:
+        delta, force = math.sqrt(square) - offset[pair], g[3]
+        _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, slope, h)
+        for i in range(4):
+            if points[pair, i] < 0:
+                h[i], h[:, i] = 0.0, 0.0
+        add_element(factor, h, offsets[pair], values)
 
 
-@kernel(inline="always")
+@leaf()
 def _fades(p, parallel):  # type: ignore[no-untyped-def]
     """Whether the energy of two edges does."""
     uu, uv, vv = _of_edges(p)
     return not uu * vv - uv * uv >= uu * vv * parallel
 
 
-@kernel()
+@leaf()
 def speed(kind, w):  # type: ignore[no-untyped-def]
     """How much the distance of a pair changes at most on the ways w (4, 3) [m], without what is common."""
-    longest = np.zeros(4)
     for k in range(3):
         mean = 0.25 * (w[0, k] + w[1, k] + w[2, k] + w[3, k])
         for i in range(4):
             w[i, k] -= mean
-            longest[i] += w[i, k] * w[i, k]
-    if kind == EDGE_EDGE:
-        return math.sqrt(max(longest[0], longest[1])) + math.sqrt(max(longest[2], longest[3]))
-    return math.sqrt(longest[0]) + math.sqrt(max(longest[1], longest[2], longest[3]))
+    one = other = 0.0
+    begins = 2 if kind == EDGE_EDGE else 1
+    for i in range(4):
+        square = w[i, 0] * w[i, 0] + w[i, 1] * w[i, 1] + w[i, 2] * w[i, 2]
+        if i < begins:
+            one = max(one, square)
+        else:
+            other = max(other, square)
+    return math.sqrt(one) + math.sqrt(other)
 
 
-@kernel()
+@leaf()
 def _plane_speed(p, w, most):  # type: ignore[no-untyped-def]
     """The same of a vertex and a plane, up to a fraction ``most`` of the ways."""
     way = arm = turn = 0.0
@@ -762,7 +773,7 @@ def _plane_speed(p, w, most):  # type: ignore[no-untyped-def]
     return way + turn * (math.sqrt(arm) + most * way)
 
 
-@kernel()
+@leaf()
 def _longest(w, lo, hi):  # type: ignore[no-untyped-def]
     square = 0.0
     for i in range(lo, hi):
@@ -793,7 +804,7 @@ def approaches(x, others, way, others_way, kind, points, reach, out):  # type: i
         out[e] = d - nearer
 
 
-@kernel()
+@leaf()
 def _farthest(ways):  # type: ignore[no-untyped-def]
     """Length [m] of the longest of ways (n, 3)."""
     most = 0.0
@@ -804,7 +815,7 @@ def _farthest(ways):  # type: ignore[no-untyped-def]
     return math.sqrt(most)
 
 
-@kernel()
+@leaf()
 def approach(way, others_way):  # type: ignore[no-untyped-def]
     """By how much [m] two points, one of them of a sheet, come nearer at most."""
     farthest = _farthest(way)
@@ -858,7 +869,7 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, mo
     return most
 
 
-@kernel(inline="always")
+@leaf()
 def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-untyped-def]
     """Normal force [N] of a pair; 0 out of the barrier's reach."""
     if not 0.0 < delta < gap:
@@ -867,7 +878,7 @@ def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-
     return force * _mollifier(p, parallel, slope)[0] if kind == EDGE_EDGE else force
 
 
-@kernel(inline="always")
+@leaf()
 def alone(kind, points, e):  # type: ignore[no-untyped-def]
     """Whether what touches is told pair by pair: not of a vertex of a sheet before something."""
     return kind[e] == EDGE_EDGE or points[e, 0] < 0

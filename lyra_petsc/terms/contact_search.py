@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.mesh import patches
 from lyra_petsc.mesh.near import near
 from lyra_petsc.mesh.topology import edge_table
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, at_least, distance, speed
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distance, speed
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -96,25 +99,40 @@ class SheetSearch:
         """
         way = way - way.mean(axis=0)  # what all of them go together brings none nearer
         met = near(self.boxes(x, way), reach=reach)
-        every = np.repeat(np.arange(len(self.triangles.first) - 1)[:, None], 2, axis=1)
-        met = np.concatenate([every, met])
-        met = met[~self.apart(x, way, met, reach)]
-        given = tuple((of.corners, of.first) for of in (self.vertices, self.edges, self.triangles))
+        n = len(self.triangles.first) - 1
+        met = np.concatenate([np.repeat(np.arange(n)[:, None], 2, axis=1), met])
+        reaches = reach, reach if edges is None else edges
+        kept = self.kept(x, way, met, *reaches)
+        some = kept < reach
+        met, kept = met[some], kept[some]
+        if not len(met):
+            return np.empty((0, 7), dtype=np.int64)
+        mean, whole = np.empty((n, 3)), np.empty((n, 7))
+        _means(way, self.triangles.corners, self.triangles.first, mean)
+        given = []
+        for of in (self.vertices, self.edges, self.triangles):
+            around = np.empty((7, len(of.corners)))
+            _around(x, way, of.corners, of.first, mean, around, whole)  # last of the triangles, all of it
+            given.append((of.corners, of.first, around))
         while True:
             out = np.empty((self._room, 7), dtype=np.int64)
-            reaches = reach, reach if edges is None else edges
-            found = _pairs(x, way, met, *given, numbers, *reaches, 3 * patches.SIZE, self._rings, out)
+            most = 3 * patches.SIZE
+            found = _pairs(x, way, met, kept, mean, whole, *given, numbers, *reaches, most, self._rings, out)
             if found <= self._room:
                 return out[:found]
             self._room = found + found // 4
 
-    def apart(self, x: Array, way: Array, met: Ints, reach: float) -> NDArray[np.bool_]:
+    def kept(self, x: Array, way: Array, met: Ints, reach: float, least: float) -> Array:
+        """Distances (n,) [m] that simplices of pairs of patches met (n, 2) surely keep, without those that
+        have a vertex in common: 0 where it may be less than ``least`` [m], any of more than ``reach`` [m].
+        """
         flat, n = self._flat, self._n
         found: tuple[Array, Array, Array] = np.empty((n, 6)), np.empty(n), np.empty(n)
         each = np.empty((2, len(flat.order), 6))
         patches.gradients(x, way, self._given, flat.order, flat.first, flat.inverse, each, *found)
-        out = np.empty(len(met), dtype=np.bool_)
-        patches.keep_apart(met, reach, flat.pairs, flat.around, flat.height, flat.reached, *found, out)
+        out = np.empty(len(met))
+        flats = flat.pairs, flat.around, flat.height, flat.reached
+        patches.distances_kept(met, reach, least, *flats, *found, out)
         return out
 
 
@@ -123,44 +141,85 @@ def _boxes(x, way, corners, first, low, high):  # type: ignore[no-untyped-def]
     for p in range(len(low)):
         low[p], high[p] = np.inf, -np.inf
         for at in range(first[p], first[p + 1]):
-            _enclose(x, way, corners[at], low[p], high[p])
+            for i in corners[at]:
+                for k in range(3):
+                    here = x[i, k]
+                    to = here + way[i, k]
+                    low[p, k], high[p, k] = min(low[p, k], here, to), max(high[p, k], here, to)
 
 
 @kernel()
-def _enclose(x, way, corners, low, high):  # type: ignore[no-untyped-def]
-    for i in corners:
+def _means(way, corners, first, out):  # type: ignore[no-untyped-def]
+    """The mean way (P, 3) [m] of each patch."""
+    for p in range(len(out)):
+        out[p] = 0.0
+        for at in range(first[p], first[p + 1]):
+            for i in corners[at]:
+                for k in range(3):
+                    out[p, k] += way[i, k]
+        n = first[p + 1] - first[p]
         for k in range(3):
-            at = x[i, k]
-            to = at + way[i, k]
-            low[k], high[k] = min(low[k], at, to), max(high[k], at, to)
+            out[p, k] /= max(n, 1) * corners.shape[1]
 
 
 @kernel()
-def _each_box(x, way, corners, lo, hi, box):  # type: ignore[no-untyped-def]
-    """Low and high corners of simplices lo to hi into box (n, 2, 3)."""
-    for n in range(hi - lo):
-        box[n, 0], box[n, 1] = np.inf, -np.inf
-        _enclose(x, way, corners[lo + n], box[n, 0], box[n, 1])
+def _around(x, way, corners, first, mean, out, whole):  # type: ignore[no-untyped-def]
+    """Low and high corners [m] of simplices, and how far [m] they go at most beside the mean of their patch,
+    into out (7, n); the same of all of a patch into whole (P, 7).
+    """
+    for p in range(len(whole)):
+        whole[p, :3], whole[p, 3:6], whole[p, 6] = np.inf, -np.inf, 0.0
+        for at in range(first[p], first[p + 1]):
+            farthest = 0.0
+            for k in range(3):
+                out[k, at], out[3 + k, at] = np.inf, -np.inf
+            for i in corners[at]:
+                square = 0.0
+                for k in range(3):
+                    out[k, at], out[3 + k, at] = min(out[k, at], x[i, k]), max(out[3 + k, at], x[i, k])
+                    square += (way[i, k] - mean[p, k]) ** 2
+                farthest = max(farthest, square)
+            out[6, at] = math.sqrt(farthest)
+            for k in range(3):
+                whole[p, k] = min(whole[p, k], out[k, at])
+                whole[p, 3 + k] = max(whole[p, 3 + k], out[3 + k, at])
+            whole[p, 6] = max(whole[p, 6], out[6, at])
 
 
 @kernel(inline="always")
-def _far(one, other, square):  # type: ignore[no-untyped-def]
-    left = square
-    for k in range(3):
-        apart = max(other[0, k] - one[1, k], one[0, k] - other[1, k], 0.0)
-        left -= apart * apart
-    return left < 0.0
+def _outside(low, high, other_low, other_high):  # type: ignore[no-untyped-def]
+    """How far two intervals are from each other."""
+    one, other = other_low - high, low - other_high
+    apart = one if one > other else other
+    return apart if apart > 0.0 else 0.0
+
+
+@leaf()
+def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def]
+    """What is left of reach² of boxes lo to hi of others (7, m) around one of around (7, n), into out."""
+    x0, y0, z0 = around[0, a], around[1, a], around[2, a]
+    x1, y1, z1 = around[3, a], around[4, a], around[5, a]
+    x2, y2, z2, x3, y3, z3, way = others[0], others[1], others[2], others[3], others[4], others[5], others[6]
+    for n in range(hi - lo):
+        b = Index(lo + n)
+        x, y = _outside(x0, x1, x2[b], x3[b]), _outside(y0, y1, y2[b], y3[b])
+        z, within = _outside(z0, z1, z2[b], z3[b]), reach + way[b]
+        out[Index(n)] = within * within - x * x - y * y - z * z
 
 
 @kernel()
-def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out):  # type: ignore[no-untyped-def]  # fmt: skip
+def _pairs(  # type: ignore[no-untyped-def]
+    x, way, met, kept, mean, whole, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out
+):  # fmt: skip
     """Rows of the near simplices of pairs of patches, as many as fit; how many there are.
 
-    No patch has more than ``most`` vertices, edges or triangles.
+    No patch has more than ``most`` vertices, edges or triangles. Simplices of a pair of patches ``kept`` (n,)
+    [m] apart, as `SheetSearch.kept` has it, are looked at where that is less than their reach. ``mean`` and
+    ``whole`` as of `_means` and `_around`.
     """
     found = 0
-    one, other, whole = np.empty((most, 2, 3)), np.empty((most, 2, 3)), np.empty((2, 3))
-    p, w, points = np.empty((4, 3)), np.empty((4, 3)), np.empty(4, np.int64)
+    left, p, w = np.empty(most), np.empty((4, 3)), np.empty((4, 3))
+    points, hits = np.empty(4, np.int64), np.empty(most, np.int64)
     for n in range(len(met)):
         for part in range(3):
             i, j = met[n]
@@ -170,42 +229,55 @@ def _pairs(x, way, met, vertices, edges, triangles, numbers, reach, edges_reach,
                     continue
             kind, size = (EDGE_EDGE, 2) if part == 2 else (VERTEX_TRIANGLE, 1)
             within = edges_reach if part == 2 else reach
-            square = within * within
-            mine, first = edges if part == 2 else vertices
-            theirs, begin = edges if part == 2 else triangles
-            _each_box(x, way, mine, first[i], first[i + 1], one)
-            _each_box(x, way, theirs, begin[j], begin[j + 1], other)
-            whole[0], whole[1] = np.inf, -np.inf
-            for b in range(begin[j + 1] - begin[j]):
-                for k in range(3):
-                    whole[0, k] = min(whole[0, k], other[b, 0, k])
-                    whole[1, k] = max(whole[1, k], other[b, 1, k])
-            for a in range(first[i + 1] - first[i]):
-                if _far(one[a], whole, square):
+            if kept[n] >= within:
+                continue
+            mine, first, around = edges if part == 2 else vertices
+            theirs, begin, others = edges if part == 2 else triangles
+            square = 0.0
+            for k in range(3):
+                square += (mean[i, k] - mean[j, k]) ** 2
+            together = within + math.sqrt(square)
+            for a in range(first[i], first[i + 1]):
+                start = a + 1 if part == 2 and i == j else begin[j]
+                end = begin[j + 1]
+                if start == end:
                     continue
-                start = a + 1 if part == 2 and i == j else 0
-                for b in range(start, begin[j + 1] - begin[j]):
-                    if _far(one[a], other[b], square):
-                        continue
+                nearer = together + around[6, a]
+                far = (nearer + whole[j, 6]) ** 2
+                for k in range(3):
+                    far -= _outside(around[k, a], around[3 + k, a], whole[j, k], whole[j, 3 + k]) ** 2
+                if far < 0.0:
+                    continue
+                _near(around, a, others, start, end, nearer, left)
+                close = 0
+                for b in range(end - start):  # written so that no branch is guessed
+                    hits[close] = start + b
+                    close += 0 if left[b] < 0.0 else 1
+                for b in hits[:close]:
                     common = False
                     for k in range(size):
-                        points[k] = mine[first[i] + a, k]
+                        points[k] = mine[a, k]
                     for k in range(4 - size):
-                        points[size + k] = theirs[begin[j] + b, k]
+                        points[size + k] = theirs[b, k]
                         for m in range(size):
                             common |= points[m] == points[size + k]
                     if common:
                         continue
                     for m in range(4):
                         for k in range(3):
-                            p[m, k], w[m, k] = x[points[m], k], way[points[m], k]
-                    left = within + speed(kind, w)
-                    if at_least(p, kind) >= left or distance(kind, p) >= left:
+                            w[m, k] = way[points[m], k]
+                    longest = within + speed(kind, w)
+                    if (nearer + others[6, b]) ** 2 - left[b - start] >= longest * longest:
+                        continue
+                    for m in range(4):
+                        for k in range(3):
+                            p[m, k] = x[points[m], k]
+                    if distance(kind, p) >= longest:
                         continue
                     if found < len(out):
                         turned = part == 2 and numbers[points[0]] > numbers[points[2]]
                         out[found, 0], out[found, 1] = kind, -1
-                        out[found, 6] = 0 if part == 2 else rings[begin[j] + b]
+                        out[found, 6] = 0 if part == 2 else rings[b]
                         for m in range(4):
                             out[found, 2 + m] = points[(m + 2) % 4 if turned else m]
                     found += 1

@@ -19,7 +19,7 @@ from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, UpcomingStep
+from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -204,8 +204,18 @@ class CoulombFriction(Elastic):
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
         friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
 
-    def hessians(self, x: Array, frozen: ObstacleMoves, lo: int, hi: int, blend: float, out: Array) -> None:
-        friction_pairs.hessians(x, *self._state(frozen.stage), lo, blend, out)
+    def add_hessian(
+        self,
+        x: Array,
+        frozen: ObstacleMoves,
+        blend: float,
+        weight: Array,
+        offsets: Mapping[str, Offsets],
+        values: Array,
+        predicted: tuple[Array, Array] | None = None,
+    ) -> None:
+        state = self._state(frozen.stage)
+        friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
 
     def force_scale(self, size: float) -> Array:
         return self._spring * size

@@ -21,11 +21,11 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
 
-@kernel()
+@leaf()
 def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped-def]
     """u of pair e into u (3,); |u|."""
     along = 0.0
@@ -65,30 +65,39 @@ def add_gradient(x, stencil, beta, normal, start, slip, stiffness, limit, out): 
 
 
 @kernel()
-def hessians(x, stencil, beta, normal, start, slip, stiffness, limit, lo, blend, out):  # type: ignore[no-untyped-def]
-    """Hessians [N/m] of pairs lo, lo + 1, … into out (n, 4, 4, 3, 3): all positive semidefinite.
+def add_hessians(  # type: ignore[no-untyped-def]
+    x, stencil, beta, normal, start, slip, stiffness, limit, weight, blend, offsets, values
+):  # fmt: skip
+    """Add weight (E,) times the Hessians [N/m], all positive semidefinite, to block rows values (n, 3, 3).
 
-    ``blend`` 0 is exact; 1 takes a spring of the stiffness μ N / |u| for what slides, whose energy is nowhere
-    less.
+    ``offsets`` (E, 10) as of `kernels.scatter`. ``blend`` 0 is exact; 1 takes a spring of the stiffness
+    μ N / |u| for what slides, whose energy is nowhere less.
     """
-    u = np.empty(3)
-    for n in range(len(out)):
-        e = lo + n
+    u, block = np.empty(3), np.empty((3, 3))
+    for e in range(len(stencil)):
         m = way(x, e, stencil, beta, normal, start, slip, u)
-        sticks = stiffness[e] * m <= limit[e]
-        factor = stiffness[e] if sticks else limit[e] / m
-        less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
-        out[n] = 0.0
-        for a in range(4):
-            for b in range(a, 4):
-                both = beta[e, a] * beta[e, b]
-                if both == 0.0:
-                    continue
-                for k in range(3):
-                    for j in range(3):
-                        same = 1.0 if k == j else 0.0
-                        block = factor * (same - normal[e, k] * normal[e, j]) - less * u[k] * u[j]
-                        out[n, a, b, k, j] = out[n, b, a, k, j] = both * block
+        _add_hessian(e, m, u, beta, normal, stiffness[e], limit[e], weight[e], blend, offsets, block, values)
+
+
+@leaf()
+def _add_hessian(e, m, u, beta, normal, stiffness, limit, weight, blend, offsets, block, values):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add that of pair e with the way u (3,), of length m, by way of ``block`` (3, 3)."""
+    sticks = stiffness * m <= limit
+    factor = stiffness if sticks else limit / m
+    less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
+    for k in range(3):
+        for j in range(3):
+            same = 1.0 if k == j else 0.0
+            block[k, j] = factor * (same - normal[e, k] * normal[e, j]) - less * u[k] * u[j]
+    for a in range(4):
+        for b in range(a, 4):
+            both, at = weight * beta[e, a] * beta[e, b], offsets[e, (7 - a) * a // 2 + b]
+            if both == 0.0 or at < 0:
+                continue
+            to = Index(at >> 1)
+            for k in range(3):
+                for j in range(3):
+                    values[to, k, j] += both * block[k, j]  # which is symmetric
 
 
 @kernel()
@@ -107,11 +116,13 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
             slip[e, k] = u[k]
 
 
-@kernel(inline="always")
-def _alike(one, other):  # type: ignore[no-untyped-def]
-    """How alike two pairs with these keys (10,) and the same first vertex are; −1: one does not go on in the
-    other. Between a vertex of a sheet and triangles it does if these have a nearest vertex in common.
+@leaf()
+def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
+    """How alike two pairs with keys (10,) in rows a and b and the same first vertex are; −1: one does not go
+    on in the other. Between a vertex of a sheet and triangles it does if these have a nearest vertex in
+    common.
     """
+    one, other = keys[a], among[b]
     if one[4] != other[4] or one[5] != other[5]:
         return -1
     if one[4] != VERTEX_TRIANGLE or one[6] != 0:
@@ -155,7 +166,7 @@ def find(keys, among, slip, place):  # type: ignore[no-untyped-def]
         b = first[Index(keys[a, 0] & (room - 1))]
         while b >= 0:
             if among[b, 0] == keys[a, 0]:
-                fits, length = _alike(keys[a], among[b]), 0.0
+                fits, length = _alike(keys, a, among, b), 0.0
                 for k in range(3):
                     length += slip[b, k] * slip[b, k]
                 if fits >= 0 and (fits > best or (fits == best and length > longest)):

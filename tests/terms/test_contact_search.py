@@ -146,6 +146,7 @@ def test_parts_of_a_sheet_that_hardly_bends_are_not_compared(which: str) -> None
     search.take(x, np.arange(len(x)), triangles)
     n = len(search.triangles.first) - 1
     alone = np.repeat(np.arange(n)[:, None], 2, axis=1)
-    apart = search.apart(turned, 0.02 * x, alone, 0.1)
-    assert apart.all()
-    assert not search.apart(np.random.default_rng(1).normal(size=x.shape), 0.0 * x, alone, 0.1).any()
+    kept = search.kept(turned, 0.02 * x, alone, 0.1, 0.05)
+    assert (kept >= 0.1).all()
+    crumpled = np.random.default_rng(1).normal(size=x.shape)
+    assert not search.kept(crumpled, 0.0 * x, alone, 0.1, 0.05).any()
