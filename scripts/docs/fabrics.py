@@ -1,6 +1,6 @@
 """Writes docs/reference/fabrics.md: the library's cloths in the tests of ``fabric``.
 
-``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: an hour of one core, most of it drapes). FOLDER keeps what came
+``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: an hour of one core). FOLDER keeps what came
 of each test, which is not run again; the page has what is there.
 """
 
