@@ -84,7 +84,13 @@ def fit(
 
     loaded = on_root(comm, read)
     choice = choose(comm, scene.stem, out, force=force, resume=resume, kind=FIT)
-    watch = watched(comm, lambda: f"; evaluations are kept in {choice.path}, fit --resume goes on")
+
+    def kept() -> str:
+        if not FIT.resumable(choice.path):
+            return " in the first evaluation, nothing is kept"
+        return f"; evaluations are kept in {choice.path}, fit --resume goes on"
+
+    watch = watched(comm, kept)
     view = Fit(f"Fit of {loaded.title or scene.stem}")
     with RunDirectory(comm, choice) as directory:
         folder = directory.path

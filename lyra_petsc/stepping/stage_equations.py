@@ -241,7 +241,7 @@ class StageEquations:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
         x = self._frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
-        if self.active.edged:  # frames have followed, by which forces on vertices are others
+        if self.active.edged and self.integrator.moves:  # by frames that have followed, forces are others
             self.forget_forces()
         self.objective.begin_step()
         if self.integrator.moves or self.applied.given is None:

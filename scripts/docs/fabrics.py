@@ -1,6 +1,6 @@
 """Writes docs/reference/fabrics.md: the library's cloths in the tests of ``fabric``.
 
-``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: ten minutes of one core). FOLDER keeps what came
+``python scripts/docs/fabrics.py FOLDER [TEST…]`` (all tests: an hour of one core). FOLDER keeps what came
 of each test, which is not run again; the page has what is there.
 """
 
@@ -97,7 +97,8 @@ def page(folder: Path) -> None:
         "",
         f"The library's cloths in the tests of [`fabric`](../howto/kes.md): warp / weft, {drape}–",
         "where 500 gf/cm are not reached. The law of those that were measured is `measured`; aluminium",
-        "and paper were not. \\* is not that of the material, in numbers that are known.",
+        "and paper were not, and so stiff sheets drape too slowly for this page. Numbers that are known and",
+        "did not come back would have a \\*.",
         "",
         "| cloth | " + " | ".join(columns) + " |",
         "| --- " * (len(columns) + 1) + "|",
