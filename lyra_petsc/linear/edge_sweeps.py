@@ -5,8 +5,8 @@ first sweep leaves of it coarser levels see through the vertices alone: beside t
 one of its own, by the diagonal. What both add between the sweeps is symmetric and positive semidefinite, so
 that the cycle stays positive definite, and conjugate gradients take a fifth fewer iterations.
 
-Bending is of fourth order, so that a sweep leaves much of it: vertices are swept more than once. The edges,
-whose block is well conditioned, are not.
+Bending is of fourth order, so that a sweep leaves much of it. Where it is stiff beside inertia vertices are
+swept more than once, and edges before every second of these sweeps.
 """
 
 from __future__ import annotations
@@ -34,6 +34,15 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
+
+
+STIFF_FROM = 0.1
+"""Stiffness of an edge's unknown over that of a vertex in its softest direction, from which on bending is
+stiff beside inertia. Where bending is all there is it is 0.2."""
+
+SWEEPS = {False: (1, 1), True: (3, 2)}
+"""Of the mesh and of coarser levels, where bending is stiff or not: of those that take equally long, the ones
+with which iterations grow least with the mesh."""
 
 
 @cached()
@@ -203,6 +212,8 @@ class SweepsWithEdges:
         Residual of vertices, and numbers without a meaning.
     of_edges : (n_local, 3)
         Residual of edges.
+    flops : float
+        Of a sweep.
     """
 
     def __init__(
@@ -216,7 +227,7 @@ class SweepsWithEdges:
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
         self._values = couplings.empty(np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
-        self._moved = np.empty((n, 3), dtype=np.float32)
+        self._moved = np.zeros((n_local, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         self.r = np.zeros((n_local, 4), dtype=np.float32)
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
@@ -227,6 +238,13 @@ class SweepsWithEdges:
         found: Array = values[self._indptr[rows]]
         found[rows >= len(self._inverse)] *= np.eye(3).ravel()
         return found
+
+    def stiffness(self) -> Array:
+        """Sum of owned edges' stiffness and their number; the same of vertices, in their softest way."""
+        edges = self._inverse_of_edges[self._inverse_of_edges > 0.0]
+        softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
+        softness = softness[softness > 0.0]
+        return np.array([np.sum(1.0 / edges), len(edges), np.sum(1.0 / softness), len(softness)])
 
     def set(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""
@@ -261,8 +279,13 @@ class SweepsWithEdges:
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
-    def backward_again(self, x: Floats) -> None:
-        """Sweep over the vertices once more."""
+    def backward_again(self, x: Floats, *, edges: bool) -> None:
+        """Sweep over the edges, if so, and over the vertices once more."""
+        if edges:
+            self._moved[:] = 0.0
+            self.backward(self._moved)
+            x += self._moved
+            return
         blocks, groups, _ = self._values
         rows = *self._rows, *self._groups, blocks, groups
         backward_again(*rows, self._inverse, self._moved, x, self.r, self.of_edges)
