@@ -36,9 +36,8 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
-STIFF_FROM = 0.1
-"""Stiffness of an edge's unknown over that of a vertex in its softest direction, from which on bending is
-stiff beside inertia. Where bending is all there is it is 0.2."""
+STIFF_UNTIL = 0.03
+"""Inertia over what all resists a vertex in its softest direction, up to which bending is stiff beside it."""
 
 SWEEPS = {False: (1, 1), True: (3, 2)}
 """Of the mesh and of coarser levels, where bending is stiff or not: of those that take equally long, the ones
@@ -225,6 +224,7 @@ class SweepsWithEdges:
         n, n_local = couplings.n_vertices, pattern.n_local
         beside = np.flatnonzero(self._rows.ends < self._rows.indptr[1:])
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
+        self._weight = self._of_all_alike(pattern, n)
         self._values = couplings.empty(np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._moved = np.zeros((n_local, 3), dtype=np.float32)
@@ -233,18 +233,32 @@ class SweepsWithEdges:
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
         self.flops = 2.0 * couplings.n_numbers
 
+    def _of_all_alike(self, pattern: BlockPattern, n: int) -> Array:
+        """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
+        of_edges = np.zeros(pattern.n_local, dtype=bool)
+        for part in pattern.edges:
+            of_edges[part.edges // 3] = True
+        begin = self._rows.indptr[: n + 1]
+        columns = self._rows.columns[: begin[-1]]
+        weight = np.where(columns < n, 2.0, np.where(of_edges[columns], 0.0, 1.0))
+        weight[begin[:-1]] = 1.0
+        return weight
+
     def diagonal(self, values: Array, rows: Ints) -> Array:
         """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9): of edges the diagonal alone."""
         found: Array = values[self._indptr[rows]]
         found[rows >= len(self._inverse)] *= np.eye(3).ravel()
         return found
 
-    def stiffness(self) -> Array:
-        """Sum of owned edges' stiffness and their number; the same of vertices, in their softest way."""
-        edges = self._inverse_of_edges[self._inverse_of_edges > 0.0]
+    def inertia(self) -> Array:
+        """Sums (2,) over owned vertices: inertia, and what all resists them in their softest direction.
+
+        Moving all vertices alike meets nothing else than inertia.
+        """
+        blocks = self._values.blocks[: len(self._weight)]
+        together = sum(np.dot(self._weight, blocks[:, i].astype(np.float64)) for i in (0, 4, 8))
         softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
-        softness = softness[softness > 0.0]
-        return np.array([np.sum(1.0 / edges), len(edges), np.sum(1.0 / softness), len(softness)])
+        return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
     def set(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""

@@ -106,10 +106,10 @@ class Smoother:
 
     def _choose_sweeps(self, of_mesh: SweepsWithEdges) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import STIFF_FROM, SWEEPS  # of use for nothing else
+        from lyra_petsc.linear.edge_sweeps import STIFF_UNTIL, SWEEPS  # of use for nothing else
 
-        edge, n_edges, vertex, n = self.points.comm.allreduce(of_mesh.stiffness())
-        worth, self.n_coarse_sweeps = SWEEPS[bool(edge * n > STIFF_FROM * vertex * n_edges)]
+        inertia, resistance = self.points.comm.allreduce(of_mesh.inertia())
+        worth, self.n_coarse_sweeps = SWEEPS[bool(inertia < STIFF_UNTIL * resistance)]
         self.n_sweeps = self._asked_sweeps or worth
 
     def _increase_diagonal(self, values: Array) -> None:

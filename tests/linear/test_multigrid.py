@@ -158,7 +158,7 @@ def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
 ) -> None:
     content = hanging(40)
     content["material"]["bending_model"] = "midedge"
-    content["material"]["bending_scale"] = 100.0
+    content["material"]["bending_scale"] = 1000.0
     once, counts = stepped(comm, content, 3, "python", pc_mg_vertex_sweeps=1)
     assert "3 of each" not in capfd.readouterr().out
     often, fewer = stepped(comm, content, 3, "python", ksp_view="")
