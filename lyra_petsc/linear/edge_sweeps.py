@@ -5,8 +5,8 @@ first sweep leaves of it coarser levels see through the vertices alone: beside t
 one of its own, by the diagonal. What both add between the sweeps is symmetric and positive semidefinite, so
 that the cycle stays positive definite, and conjugate gradients take a fifth fewer iterations.
 
-Bending is of fourth order, so that a sweep leaves much of it: vertices are swept more than once. The edges,
-whose block is well conditioned, are not.
+Bending is of fourth order, so that a sweep leaves much of it. Where it is stiff beside inertia vertices are
+swept more than once, and edges before every second of these sweeps.
 """
 
 from __future__ import annotations
@@ -34,6 +34,14 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
+
+
+STIFF_UNTIL = 0.03
+"""Inertia over what all resists a vertex in its softest direction, up to which bending is stiff beside it."""
+
+SWEEPS = {False: (1, 1), True: (3, 2)}
+"""Of the mesh and of coarser levels, where bending is stiff or not: of those that take equally long, the ones
+with which iterations grow least with the mesh."""
 
 
 @cached()
@@ -203,6 +211,8 @@ class SweepsWithEdges:
         Residual of vertices, and numbers without a meaning.
     of_edges : (n_local, 3)
         Residual of edges.
+    flops : float
+        Of a sweep.
     """
 
     def __init__(
@@ -214,19 +224,41 @@ class SweepsWithEdges:
         n, n_local = couplings.n_vertices, pattern.n_local
         beside = np.flatnonzero(self._rows.ends < self._rows.indptr[1:])
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
+        self._weight = self._of_all_alike(pattern, n)
         self._values = couplings.empty(np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
-        self._moved = np.empty((n, 3), dtype=np.float32)
+        self._moved = np.zeros((n_local, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         self.r = np.zeros((n_local, 4), dtype=np.float32)
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
         self.flops = 2.0 * couplings.n_numbers
+
+    def _of_all_alike(self, pattern: BlockPattern, n: int) -> Array:
+        """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
+        of_edges = np.zeros(pattern.n_local, dtype=bool)
+        for part in pattern.edges:
+            of_edges[part.edges // 3] = True
+        begin = self._rows.indptr[: n + 1]
+        columns = self._rows.columns[: begin[-1]]
+        weight = np.where(columns < n, 2.0, np.where(of_edges[columns], 0.0, 1.0))
+        weight[begin[:-1]] = 1.0
+        return weight
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
         """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9): of edges the diagonal alone."""
         found: Array = values[self._indptr[rows]]
         found[rows >= len(self._inverse)] *= np.eye(3).ravel()
         return found
+
+    def inertia(self) -> Array:
+        """Sums (2,) over owned vertices: inertia, and what all resists them in their softest direction.
+
+        Moving all vertices alike meets nothing else than inertia.
+        """
+        blocks = self._values.blocks[: len(self._weight)]
+        together = sum(np.dot(self._weight, blocks[:, i].astype(np.float64)) for i in (0, 4, 8))
+        softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
+        return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
     def set(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""
@@ -261,8 +293,13 @@ class SweepsWithEdges:
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
-    def backward_again(self, x: Floats) -> None:
-        """Sweep over the vertices once more."""
+    def backward_again(self, x: Floats, *, edges: bool) -> None:
+        """Sweep over the edges, if so, and over the vertices once more."""
+        if edges:
+            self._moved[:] = 0.0
+            self.backward(self._moved)
+            x += self._moved
+            return
         blocks, groups, _ = self._values
         rows = *self._rows, *self._groups, blocks, groups
         backward_again(*rows, self._inverse, self._moved, x, self.r, self.of_edges)

@@ -243,6 +243,7 @@ class BlockSweeps:
         self._beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
+        self._moved: Floats | None = None  # of use for more than one sweep
         self.r = np.zeros((n, 4), dtype=np.float32)
         self.flops = 18.0 * pattern.n_couplings
 
@@ -271,6 +272,14 @@ class BlockSweeps:
     def backward(self, x: Floats) -> None:
         """Sweep; see the function."""
         backward(*self._rows, self._blocks, self._inverse, x, self.r)
+
+    def backward_again(self, x: Floats) -> None:
+        """Sweep once more, from where the residual is that of x, b − A x."""
+        if self._moved is None:
+            self._moved = np.zeros_like(x)
+        self._moved[:] = 0.0
+        backward(*self._rows, self._blocks, self._inverse, self._moved, self.r)
+        x += self._moved
 
     def subtract_ghosts(self, x: Floats) -> None:
         """See the function."""

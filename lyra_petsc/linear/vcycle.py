@@ -3,7 +3,8 @@
 A V cycle with one backward sweep of Gauss-Seidel before and one forward sweep after the coarser level, which
 is symmetric; from the level ``-pc_mg_w_from`` on (1: the next coarser than the mesh) three are visited twice,
 as in a W cycle. The matrix is stored by half and in single precision, and read twice a cycle. Where edges
-carry unknowns the vertices of the mesh are swept ``-pc_mg_vertex_sweeps`` times before and after.
+carry unknowns the vertices of the mesh are swept ``-pc_mg_vertex_sweeps`` times before and after; unless that
+is given, as often as their bending is worth (``edge_sweeps``).
 
 Between ranks the sweeps are Jacobi's, which diverge where three or more ranks meet in strongly coupled
 unknowns. There the diagonal is increased as in the l1 smoothers of Baker, Falgout, Kolev and Yang
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-VERTEX_SWEEPS = 2
-"""Where edges carry unknowns."""
+EDGES_EVERY = 2
+"""Sweeps over the vertices for one over the edges."""
 
 TWICE = 3
 """Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
@@ -63,10 +64,12 @@ class Smoother:
     ----------
     level : Level
     vertex_sweeps : int
-        Over the vertices, where edges carry unknowns.
+        Over the vertices, where edges carry unknowns; 0: as many as are worth it.
 
     Attributes
     ----------
+    n_sweeps, n_coarse_sweeps : int
+        Before and after the coarser level, on this level and on coarser ones.
     b, x : (n_local, 3)
         Right-hand side and solution.
     """
@@ -79,7 +82,7 @@ class Smoother:
         self.x = np.zeros((points.n_local, 3), dtype=np.float32)
         self.b = np.zeros_like(self.x)
         self._turns, self._sweeps = level.turns, _sweeps_of(level)
-        self.more_sweeps = vertex_sweeps - 1 if pattern.edge_couplings is not None else 0
+        self._asked_sweeps, self.n_sweeps, self.n_coarse_sweeps = vertex_sweeps, 1, 1
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
@@ -95,9 +98,19 @@ class Smoother:
         """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
         values = values.reshape(-1, 9)
         self._sweeps.set(values)
+        if not isinstance(self._sweeps, sweeps.BlockSweeps):
+            self._choose_sweeps(self._sweeps)
         self._increase_diagonal(values)
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
+
+    def _choose_sweeps(self, of_mesh: SweepsWithEdges) -> None:
+        """Sweep more often where bending is stiff beside inertia; collective."""
+        from lyra_petsc.linear.edge_sweeps import STIFF_UNTIL, SWEEPS  # of use for nothing else
+
+        inertia, resistance = self.points.comm.allreduce(of_mesh.inertia())
+        worth, self.n_coarse_sweeps = SWEEPS[bool(inertia < STIFF_UNTIL * resistance)]
+        self.n_sweeps = self._asked_sweeps or worth
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
@@ -137,11 +150,13 @@ class Smoother:
             self._sweeps.backward(self.x)
             PETSc.Log.logFlops(self._sweeps.flops)
         self._subtract_ghosts(seen)
-        for _ in range(self.more_sweeps):
-            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+        for number in range(1, self.n_sweeps):
             seen = self.x[self.points.n_owned :].copy()
             with PETSc.Log.Event(SWEEP):
-                self._sweeps.backward_again(self.x)
+                if isinstance(self._sweeps, sweeps.BlockSweeps):
+                    self._sweeps.backward_again(self.x)
+                else:
+                    self._sweeps.backward_again(self.x, edges=number % EDGES_EVERY == 0)
                 PETSc.Log.logFlops(self._sweeps.flops)
             self._subtract_ghosts(seen)
         with PETSc.Log.Event(TRANSFER):
@@ -177,9 +192,11 @@ class Smoother:
             self._coarse.update_ghosts(coarse)
             self._add_interpolated(coarse)
             PETSc.Log.logFlops(self._transfer_flops)
-        for _ in range(self.more_sweeps):
-            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
-            self._sweep_after(self._sweeps.forward_ahead)
+        for number in range(self.n_sweeps - 1, 0, -1):
+            if isinstance(self._sweeps, sweeps.BlockSweeps) or number % EDGES_EVERY == 0:
+                self._sweep_after(self._sweeps.forward)
+            else:
+                self._sweep_after(self._sweeps.forward_ahead)
             self.points.update_ghosts(self.x)
         self._sweep_after(self._sweeps.forward)
 
@@ -247,13 +264,13 @@ class VCycle:
     def __init__(self) -> None:
         self._levels: list[Smoother | Coarsest] = []
         self._renew: Callable[[], Iterator[tuple[Array, Array]]] | None = None
-        self._twice_from, self._vertex_sweeps = 0, VERTEX_SWEEPS
+        self._twice_from = self._vertex_sweeps = 0
 
     def setFromOptions(self, pc: PETSc.PC) -> None:
         """Read ``-pc_mg_w_from`` and ``-pc_mg_vertex_sweeps``."""
         options = PETSc.Options(pc.getOptionsPrefix())
         self._twice_from = options.getInt("pc_mg_w_from", 0)
-        self._vertex_sweeps = max(1, options.getInt("pc_mg_vertex_sweeps", VERTEX_SWEEPS))
+        self._vertex_sweeps = max(0, options.getInt("pc_mg_vertex_sweeps", 0))
 
     def attach(self, hierarchy: Hierarchy, renew: Callable[[], Iterator[tuple[Array, Array]]]) -> None:
         """Work on these levels, whose present block rows ``renew`` makes; collective."""
@@ -272,8 +289,11 @@ class VCycle:
         if self._renew is None:
             prefix = pc.getOptionsPrefix() or ""
             raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
+        finest = self._levels[0]
         for level, rows in zip(self._levels, self._renew(), strict=True):
             level.set(*rows)
+            if isinstance(level, Smoother) and isinstance(finest, Smoother) and level is not finest:
+                level.n_sweeps = finest.n_coarse_sweeps
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one cycle on b; collective."""
@@ -322,7 +342,7 @@ class VCycle:
             if isinstance(level, Smoother):
                 lines += [
                     "  down: one backward sweep of block Gauss-Seidel, up: one forward sweep" + between,
-                    *([f"  over the vertices {level.more_sweeps + 1} each"] if level.more_sweeps else []),
+                    *([f"  {level.n_sweeps} of each"] if level.n_sweeps > 1 else []),
                     "  one half of the matrix in single precision",
                 ]
         for line in lines:

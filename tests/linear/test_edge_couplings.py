@@ -137,10 +137,17 @@ def test_more_sweeps_over_the_vertices() -> None:
     sweeps.backward(x)
     expected = x[:N_OWNED].astype(float).ravel()
     expected[:n] += np.linalg.solve(upper[:n, :n], (right - owned @ expected)[:n])
-    sweeps.backward_again(x)
-    np.testing.assert_allclose(x[:N_OWNED].ravel(), expected, rtol=1e-4, atol=1e-5)
-    residual = np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]])
-    np.testing.assert_allclose(residual.ravel(), right - owned @ expected, rtol=1e-4, atol=1e-4)
+    sweeps.backward_again(x, edges=False)
+
+    def check() -> None:
+        np.testing.assert_allclose(x[:N_OWNED].ravel(), expected, rtol=1e-4, atol=1e-5)
+        residual = np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]])
+        np.testing.assert_allclose(residual.ravel(), right - owned @ expected, rtol=1e-4, atol=1e-4)
+
+    check()
+    expected += np.linalg.solve(upper, right - owned @ expected)
+    sweeps.backward_again(x, edges=True)
+    check()
 
     x[:] = RNG.normal(size=x.shape)
     expected = x.astype(float).ravel()

@@ -158,14 +158,14 @@ def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
 ) -> None:
     content = hanging(40)
     content["material"]["bending_model"] = "midedge"
-    content["material"]["bending_scale"] = 100.0
+    content["material"]["bending_scale"] = 1000.0
     once, counts = stepped(comm, content, 3, "python", pc_mg_vertex_sweeps=1)
-    assert "over the vertices" not in capfd.readouterr().out
-    twice, fewer = stepped(comm, content, 3, "python", ksp_view="")
-    assert sum(fewer) < sum(counts)
-    assert np.abs(once - twice).max() < 1e-6
+    assert "3 of each" not in capfd.readouterr().out
+    often, fewer = stepped(comm, content, 3, "python", ksp_view="")
+    assert sum(fewer) < 0.8 * sum(counts)
+    assert np.abs(once - often).max() < 1e-6
     if comm.rank == 0:
-        assert "over the vertices 2 each" in capfd.readouterr().out
+        assert "  3 of each" in capfd.readouterr().out
 
 
 def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.linear import gauss_seidel as sweeps
+from lyra_petsc.linear.pattern import BlockPattern
 
 N, GHOSTS = 40, 6
 
@@ -132,3 +133,22 @@ def test_restriction_is_the_transpose_of_interpolation() -> None:
     assert abs(np.vdot(up, fine) - np.vdot(coarse, down)) < 1e-5
     assert up[1, 2] == up[3, 0] == 0.0
     assert up[3, 1] != 0.0
+
+
+def test_more_sweeps_before() -> None:
+    indptr, columns, blocks, dense = system()
+    couplings = [(row, k) for row in range(N) for k in range(indptr[row], indptr[row + 1])]
+    keys = np.array([row * (N + GHOSTS) + columns[k] for row, k in couplings])
+    sweep = sweeps.BlockSweeps(BlockPattern.of_keys(keys, N, N + GHOSTS))
+    sweep.set(blocks.reshape(-1, 9))
+    b = np.random.default_rng(6).standard_normal((N, 3)).astype(np.float32)
+    x = np.zeros((N + GHOSTS, 3), dtype=np.float32)
+    sweep.begin(b)
+    sweep.backward(x)
+    sweep.backward_again(x)
+    owned, upper = dense[:, : 3 * N], triangle(dense, upper=True)
+    expected = np.linalg.solve(upper, b.ravel())
+    expected += np.linalg.solve(upper, b.ravel() - owned @ expected)
+    np.testing.assert_allclose(x[:N].ravel(), expected, rtol=1e-4, atol=1e-5)
+    residual = b.ravel() - owned @ expected
+    np.testing.assert_allclose(sweep.r[:, :3].ravel(), residual, rtol=1e-4, atol=1e-5)
