@@ -117,8 +117,8 @@ CHANGES: list[Change] = [
     # -- resuming
     Change(
         STEPPING + "energy_balance.py",
-        'self._pull = arrays.get("pull", self._pull)',
-        "self._pull = 0.0 * self._pull",
+        'self._pull, self._targets = arrays.get("pull", self._pull)',
+        "self._pull, self._targets = 0.0 * self._pull",
         (RESUME + "[static-2]",),
     ),
     Change(
