@@ -67,7 +67,9 @@ def main(job: dict[str, Any], outcome: int, mesh: int) -> None:
                 *_SYSTEM,
                 sys.prefix,
                 sys.base_prefix,
+                # other environments may hold these; gmsh reads parts of numpy when it hands over meshes
                 os.path.dirname(gmsh.__file__ or ""),
+                os.path.dirname(os.path.dirname(np.__file__)),
                 job["folder"],
             ]
             tell(fence=raise_fence(None if job["folder"] is None else readable))
