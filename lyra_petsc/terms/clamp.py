@@ -44,14 +44,22 @@ def energies(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
         out[e] = hinge_energy(theta, square1, square2, k[e], rest[e], (limit[e], NO_LIMIT))
 
 
+@kernel(inline="always")
+def _gradient(x, s, mirror, k, rest, limit, e, g):  # type: ignore[no-untyped-def]
+    """A moment [N·m] by which g (4, 3) [1/m] is to be multiplied: the gradient [N] of the energy of edge e by
+    its three vertices and the mirror image.
+    """
+    x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
+    theta = angle(x0, x1, x2, x3)[0]
+    return hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
+
+
 @kernel()
 def add_gradient(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Add the energy's gradient [N] to out (n_local, 3)."""
     g = np.empty((4, 3))
     for e in range(s.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        theta = angle(x0, x1, x2, x3)[0]
-        moment = hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
+        moment = _gradient(x, s, mirror, k, rest, limit, e, g)
         for a in range(3):
             for i in range(3):
                 out[s[e, a], i] += moment * g[a, i]
@@ -73,9 +81,7 @@ def pulls(x, s, mirror, k, rest, limit, out):  # type: ignore[no-untyped-def]
     """Gradient [N] by the mirror images of the first len(out) edges, (n, 3)."""
     g = np.empty((4, 3))
     for e in range(out.shape[0]):
-        x0, x1, x2, x3 = point(x, s[e, 0]), point(x, s[e, 1]), point(x, s[e, 2]), point(mirror, e)
-        theta = angle(x0, x1, x2, x3)[0]
-        moment = hinge_gradient(x0, x1, x2, x3, theta, k[e], rest[e], (limit[e], NO_LIMIT), g)
+        moment = _gradient(x, s, mirror, k, rest, limit, e, g)
         for i in range(3):
             out[e, i] = moment * g[3, i]
 
