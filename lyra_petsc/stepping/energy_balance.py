@@ -142,11 +142,11 @@ class Ledger:
         system = self._system
         parts = system.forces_at_stage()
         external = self._external(parts)
-        if self._pull is not None:  # the way to an equilibrium has no stage in its middle
-            external, self._pull = 0.5 * (external + self._pull), external
         # targets that move with a handle let it work on the sheet
-        turned = system.moving_energy_before - self._moving
-        if self._pull is not None:
+        if self._pull is None:
+            turned = system.moving_energy_before - self._moving
+        else:  # the way to an equilibrium has no stage in its middle
+            external, self._pull = 0.5 * (external + self._pull), external
             before, self._targets = self._targets, self._turning()
             turned = sum(
                 0.5 * float(np.vdot(pull + pull0, at - at0))
