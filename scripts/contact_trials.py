@@ -127,6 +127,11 @@ class Multipliers(ContactBarrier):
         super().take(elements)
         self._alone = (self.kind == EDGE_EDGE) | (self.points[:, 0] < 0)
 
+    def _distance(self, at: Ints, felt: Array) -> Array:
+        """Distances (m,) [m] of pairs, below 0 of what is inside of an obstacle."""
+        inside = self.kind[at] == VERTEX_INSIDE
+        return np.where(inside, -1.0, 1.0) * np.linalg.norm(felt[:, :3], axis=1)
+
     def _meet(self, points: Array) -> tuple[NDArray[Any], ...]:
         least, at, weight, _, beta, _, felt = super()._meet(points)
         # pairs of vertices are what they are; of others, each pair has its own multiplier
@@ -137,7 +142,7 @@ class Multipliers(ContactBarrier):
         at = np.concatenate([at[vertices], pairs])
         weight = np.concatenate([weight[vertices], more[2]])
         beta, felt = (np.concatenate([a[vertices], b]) for a, b in ((beta, more[0]), (felt, more[1])))
-        d = np.linalg.norm(felt[:, :3], axis=1) * np.where(self.kind[at] == VERTEX_INSIDE, -1.0, 1.0)
+        d = self._distance(at, felt)
         over = d - self.offset[at] - LEVEL * self.gap[at]
         pull = np.maximum(self._kept(self._key(at, felt[:, :3])) - self.r * over, 0.0)
         felt[:, 3], felt[:, 4] = -pull / d, np.where(pull > 0.0, self.r, 0.0) / (d * d)
@@ -150,14 +155,14 @@ class Multipliers(ContactBarrier):
         met = self.meeting(x, places)
         rows = np.flatnonzero((met.weight > 0.0) & (met.felt[:, 3] != 0.0))
         at, felt = met.at[rows], met.felt[rows]
-        d = np.linalg.norm(felt[:, :3], axis=1) * np.where(self.kind[at] == VERTEX_INSIDE, -1.0, 1.0)
+        d = self._distance(at, felt)
         return met.beta[rows], felt[:, :3] / d[:, None], -met.weight[rows] * felt[:, 3] * d, at
 
     def renew(self, x: Array, frozen: Places) -> bool:
         """Take the multipliers that positions x (n, 3) give; whether they and the distances will do."""
         met = self.meeting(x, frozen.now)
         at = met.at
-        d = np.linalg.norm(met.felt[:, :3], axis=1) * np.where(self.kind[at] == VERTEX_INSIDE, -1.0, 1.0)
+        d = self._distance(at, met.felt)
         level, pull = LEVEL * self.gap[at], -met.felt[:, 3] * d
         delta = np.where(met.weight > 0.0, (d - self.offset[at]) / level, np.inf)
         key = self._key(at, met.felt[:, :3])
