@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.parallel import on_root
 
 Ints = NDArray[np.int64]
 Graph = tuple[Ints, Ints]
 
 PREFERRED = ("ptscotch", "parmetis", "chaco", "party")
+PARTS = "mat_partitioning_nparts"
 
 
 def vertex_graph(stencils: list[Ints], n_vertices: int) -> Graph:
@@ -31,17 +33,17 @@ def vertex_graph(stencils: list[Ints], n_vertices: int) -> Graph:
     return offsets, columns
 
 
-def _matrix(comm: MPI.Comm, graph: Graph, n_columns: int) -> PETSc.Mat:
+def _matrix(graph: Graph) -> PETSc.Mat:
     offsets, neighbours = (part.astype(PETSc.IntType) for part in graph)
     rows = len(offsets) - 1
-    size = ((rows, n_columns), (rows, n_columns)) if comm.size > 1 else (rows, n_columns)
-    return PETSc.Mat().createAIJ(size, csr=(offsets, neighbours, np.ones(len(neighbours))), comm=comm)
+    csr = (offsets, neighbours, np.ones(len(neighbours)))
+    return PETSc.Mat().createAIJ((rows, rows), csr=csr, comm=PETSc.COMM_SELF)
 
 
 def locality_order(graph: Graph) -> Ints:
     """Reverse Cuthill-McKee: position of each vertex in an order that keeps neighbours near."""
     n = len(graph[0]) - 1
-    matrix = _matrix(MPI.COMM_SELF, graph, n)
+    matrix = _matrix(graph)
     permutation, other = matrix.getOrdering("rcm")
     order = permutation.getIndices().astype(np.int64)
     for item in (permutation, other, matrix):
@@ -55,7 +57,8 @@ def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Int
     """Owning rank of each vertex; collective.
 
     The partitioner is the best that this PETSc has (PT-Scotch, ParMETIS, …), or what
-    ``-mat_partitioning_type`` says.
+    ``-mat_partitioning_type`` says. It works on rank 0, where the mesh is: on several ranks the answer of
+    PT-Scotch would depend on the order in which messages arrive, here it is the same in every run.
 
     Parameters
     ----------
@@ -78,48 +81,42 @@ def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Int
     """
     if comm.size == 1:
         return np.zeros(n_vertices, dtype=np.int64), "none (one rank)"
-    bounds = n_vertices * np.arange(comm.size + 1, dtype=np.int64) // comm.size
-    mine = _scatter_rows(comm, graph, bounds)
-    matrix = _matrix(comm, mine, n_vertices)
-    partitioning = PETSc.MatPartitioning().create(comm)
-    partitioning.setAdjacency(matrix)
-    name = _choose(partitioning)
-    parts = PETSc.IS()
-    partitioning.apply(parts)
-    pieces = comm.gather(parts.getIndices().astype(np.int64), root=0)
-    for item in (parts, partitioning, matrix):
-        item.destroy()
-    return (np.concatenate(pieces) if pieces is not None else None), name
+    owner: Ints | None = None
 
-
-def _choose(partitioning: PETSc.MatPartitioning) -> str:
-    asked = PETSc.Options().getString("mat_partitioning_type", "")
-    for name in (asked,) if asked else PREFERRED:
-        try:
-            partitioning.setType(name)
-        except PETSc.Error:
-            continue
-        partitioning.setFromOptions()
-        return str(partitioning.getType())
-    if asked:
-        raise InputError(
-            f"this PETSc has no partitioner '{asked}'; leave it out or try {', '.join(PREFERRED)}, average",
-            key="-mat_partitioning_type",
-        )
-    # "average" cuts the numbering into equal pieces, which the locality order makes compact
-    partitioning.setType("average")
-    return "average"
-
-
-def _scatter_rows(comm: MPI.Comm, graph: Graph | None, bounds: Ints) -> Graph:
-    if comm.rank == 0:
+    def on_rank_0() -> str:
+        nonlocal owner
         assert graph is not None
-        offsets, neighbours = graph
-        for rank in range(comm.size - 1, -1, -1):
-            lo, hi = bounds[rank], bounds[rank + 1]
-            piece = offsets[lo : hi + 1] - offsets[lo], neighbours[offsets[lo] : offsets[hi]]
-            if rank:
-                comm.send(piece, dest=rank)
-        return piece
-    received: Graph = comm.recv(source=0)
-    return received
+        matrix, parts = _matrix(graph), PETSc.IS()
+        partitioning = PETSc.MatPartitioning().create(PETSc.COMM_SELF)
+        partitioning.setAdjacency(matrix)
+        name = _choose(partitioning, comm.size)
+        partitioning.apply(parts)
+        owner = parts.getIndices().astype(np.int64)
+        for item in (parts, partitioning, matrix):
+            item.destroy()
+        return name
+
+    name = on_root(comm, on_rank_0)
+    return owner, name
+
+
+def _choose(partitioning: PETSc.MatPartitioning, n_ranks: int) -> str:
+    database = PETSc.Options()
+    asked = database.getString("mat_partitioning_type", "")
+    # petsc4py has no other way to say how many parts there are to be
+    database.setValue(PARTS, n_ranks)
+    try:
+        # "average" cuts the numbering into equal pieces, which the locality order makes compact
+        for name in (asked,) if asked else (*PREFERRED, "average"):
+            try:
+                partitioning.setType(name)
+            except PETSc.Error:
+                continue
+            partitioning.setFromOptions()
+            return str(partitioning.getType())
+    finally:
+        database.delValue(PARTS)
+    raise InputError(
+        f"this PETSc has no partitioner '{asked}'; leave it out or try {', '.join(PREFERRED)}, average",
+        key="-mat_partitioning_type",
+    )

@@ -10,7 +10,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -83,24 +82,17 @@ class Places(Reading):
 
     wanted: list[tuple[str | int, tuple[int, ...]]] = field(default_factory=list)
 
-    @cached_property
-    def _by_problem(self) -> dict[int, list[Ints]]:
-        return {}
-
     def _rows(self, problem: Problem) -> list[Ints]:
-        found = self._by_problem.get(id(problem))
-        if found is None:
-            original = problem.points.original
-            order = np.argsort(original)
-            found = []
-            for what, _ in self.wanted:
-                if isinstance(what, str):
-                    found.append(problem.probes[what])
-                    continue
-                at = np.searchsorted(original, what, sorter=order)
-                here = at < len(original) and original[order[at]] == what
-                found.append(order[at : at + 1] if here else np.empty(0, dtype=np.int64))
-            self._by_problem[id(problem)] = found
+        original = problem.points.original
+        order = np.argsort(original)
+        found = []
+        for what, _ in self.wanted:
+            if isinstance(what, str):
+                found.append(problem.probes[what])
+                continue
+            at = np.searchsorted(original, what, sorter=order)
+            here = at < len(original) and original[order[at]] == what
+            found.append(order[at : at + 1] if here else np.empty(0, dtype=np.int64))
         return found
 
     def sums(self, problem: Problem, ledger: Ledger | None) -> Array:
