@@ -38,6 +38,12 @@ Swept = tuple[Ints, tuple[Array, Array]]
 KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""
 
+TOUCHES = 0.7
+"""Part of the gap at which pairs that meet in a Newton iteration shall be after it."""
+
+SHORT = 0.05
+"""Part of the gap that they, and those which touch, may lack there."""
+
 PARALLEL = 1e-3
 """Squared sine of the angle of two edges below which they count as nearly parallel."""
 
@@ -398,6 +404,18 @@ class ContactBarrier(Elastic):
         at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
         pairs = self.kind[at], self.points[at], self.offset[at]
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
+
+    def aims(self, x: Array, way: Array, frozen: Places) -> tuple[Array, Array]:
+        aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
+        pairs = self.kind, self.points, self.offset, self.gap
+        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, aim, before)
+        return aim, before
+
+    def push_apart(
+        self, x: Array, way: Array, frozen: Places, aims: tuple[Array, Array], out: Array, count: Array
+    ) -> bool:
+        pairs = self.kind, self.points, self.offset, self.gap
+        return bool(contact_pairs.push_apart(x, frozen.now, way, *pairs, *aims, SHORT, out, count))
 
     def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
         if not self.n_elements:

@@ -313,6 +313,21 @@ def test_a_sheet_falls_on_a_mesh(comm: MPI.Comm, shared_tmp: Path) -> None:
         assert run.x[:, 2].max() > -0.05
 
 
+@pytest.mark.parametrize("gap", [1e-3, 1e-5])
+def test_small_gaps_take_few_iterations(comm: MPI.Comm, gap: float) -> None:
+    """Half a millimetre above a sphere at first, which one pair after another meets."""
+    mesh = SHEET | {"transform": {"translate": [-0.3, -0.29, 0.0005]}}
+    ball = {"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}
+    scene = {"mesh": mesh, "contact": {"gap": gap}, "obstacles": {"it": ball}, "solver": {}}
+    with Watched(comm, scene | GRAVITY | {"time": {"end": 0.1, "step": 0.005}}) as run:
+        steps: list[int] = []
+        while not run.simulation.finished:
+            steps.append(run.simulation.step().newton_iterations)
+            run.look()
+        assert run.forces()[1] > 0.01
+        assert np.median(steps) <= 12
+
+
 def test_weight_at_rest(comm: MPI.Comm) -> None:
     """Statics: a plane carries the sheet's weight."""
     with Watched(comm, dropped("plane", time={"analysis": "static", "step": 1.0})) as run:
