@@ -54,8 +54,9 @@ HALFWAY = 14.0
 """b″ / k in the middle of the gap."""
 
 EDGES = 0.3
-"""Part of the gap below which two edges of sheets feel each other. Sheets that lie on each other are held by
-pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to what these do not.
+"""Part of the gap below which two edges feel each other, and corners of obstacles sheets. Sheets that lie on
+each other are held by pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to
+what these do not. On obstacles' triangles a sheet's vertices lie, alike wherever the edges of these are.
 """
 
 SKIN = 0.5
@@ -136,6 +137,8 @@ class Obstacles:
         Planes are a point and a normal.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
+    faced : (obstacles + 1,)
+        Which have triangles, that vertices of sheets lie on; the last are sheets.
     """
 
     def __init__(self, obstacles: Sequence[Solid | Container]) -> None:
@@ -144,6 +147,7 @@ class Obstacles:
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
         }
         radius, first = np.zeros(len(obstacles) + 1), 0
+        self.faced = np.ones(len(obstacles) + 1, dtype=np.bool_)
         for number, obstacle in enumerate(obstacles):
             n = len(obstacle.points)
 
@@ -154,6 +158,7 @@ class Obstacles:
 
             if isinstance(obstacle, Solid):
                 radius[number] = obstacle.radius
+                self.faced[number] = len(obstacle.triangles) > 0
                 parts["triangles"].append(rows(obstacle.triangles))
                 parts["edges"].append(rows(obstacle.edges))
                 parts["points"].append(rows(np.arange(n)[:, None]))
@@ -249,8 +254,8 @@ class ContactBarrier(Elastic):
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
-        between = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
-        self.gap = np.where(between, EDGES, 1.0) * self.barrier.gap
+        others = (self.kind == EDGE_EDGE) | ((self.kind == VERTEX_TRIANGLE) & (self.points[:, 0] < 0))
+        self.gap = np.where(others & self.obstacles.faced[self.obstacle], EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
 
     # -- obstacles ---------------------------------------------------------------------------------

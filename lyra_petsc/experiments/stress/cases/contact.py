@@ -267,6 +267,6 @@ contact = family(
     _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
     _case(
         "contact-many", "a stack with 100,000 contacts", _stack,
-        steps=10, level=FULL, observe=_contacts, judge=_judged_many,
+        steps=4, level=FULL, observe=_contacts, judge=_judged_many,
     ),
 )  # fmt: skip
