@@ -17,6 +17,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import beyond_planes, in_ball, out_of_ball
+from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier
 
@@ -208,6 +209,25 @@ def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: 
         assert (run.x[:, 2] > 0.0).all()
         assert run.simulation.budget.total <= before
         assert "repeated by backward Euler" in " ".join(run.simulation.notes)
+
+
+@pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "alpha2"])
+def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
+    """Two sheets that a third hits; nothing else works on them, and none dampens."""
+    third = grid(0.3, 0.3, 3, 3) | {"transform": {"translate": [0.1, 0.05, 0.1]}}
+    time = {"end": 0.08, "step": 0.002, "integrator": integrator}
+    scene = {"mesh": [LOWER, UPPER, third], "material": MATERIAL | {"damping": 0.0}, "time": time}
+    with Watched(comm, scene) as run:
+        run.throw(lambda x: np.where(x[:, 2:] > 0.08, [0.3, 0.0, -4.0], 0.0))
+        first, most = run.simulation.budget.total, 0.0
+
+        def watch(simulation: SteppedScene) -> None:
+            nonlocal most
+            most = max(most, run.forces()[1])
+            assert simulation.budget.total <= (1.0 + LARGEST_SUM) * first
+
+        run.run(watch)
+        assert most > 0.1
 
 
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
