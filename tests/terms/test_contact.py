@@ -414,3 +414,71 @@ def test_what_moves_far_in_a_step_is_not_held_up(comm: MPI.Comm, handled: bool) 
             assert run.simulation.step().rejected == 0
             run.look()
         assert run.x[:, 2].max() > 0.2
+
+
+def turned(mesh: dict[str, Any], degrees: float, place: list[float]) -> dict[str, Any]:
+    turn = {"axis": [1.0, 0.0, 0.0], "degrees": degrees}
+    return mesh | {"transform": {"rotate": turn, "translate": place}}
+
+
+STRIP = grid(0.4, 0.02, 12, 1, "alternating")
+CORNERS = {"handles": [{"nodes": [0, 5, 24, 29]}]}
+DIRECTORS = MATERIAL | {"bending": 1e-3, "bending_model": "midedge"}
+WALL = {"w": {"mesh": {"file": "wall.obj"}}}
+SPIN = [{"time": 0.0}, {"time": 0.1, "rotate": {"axis": [1.0, 0.0, 0.0], "degrees": 400.0}}]
+HOSTILE: dict[str, dict[str, Any]] = {
+    "a strip edge-on": {
+        "mesh": [LOWER, turned(STRIP, 90.0, [0.05, 0.2, 0.04])],
+        "contact": {"gap": 0.008},
+        **CORNERS,
+    },
+    "a strip edge-on an open mesh": {
+        "mesh": turned(STRIP, 90.0, [-0.2, 0.01, 0.04]),
+        "contact": {"gap": 0.008},
+        "obstacles": WALL,
+    },
+    "an open mesh that spins": {
+        "mesh": turned(grid(0.4, 0.4, 5, 5), 0.0, [-0.2, -0.2, 0.02]),
+        "obstacles": {"w": WALL["w"] | {"motion": SPIN}},
+    },
+    "cells unlike each other": {
+        "mesh": [LOWER, turned(grid(0.1, 0.1, 12, 12), 10.0, [0.2, 0.1, 0.04])],
+        "contact": {"gap": 0.004, "thickness": 0.001, "friction": 0.3},
+        **CORNERS,
+    },
+    "directors and thickness": {
+        "mesh": [LOWER, turned(UPPER, 20.0, [0.05, 0.05, 0.05])],
+        "material": DIRECTORS,
+        "contact": {"gap": 0.01, "thickness": 0.01, "friction": 0.3},
+        **CORNERS,
+    },
+    "a plane of symmetry": {
+        "mesh": turned(LOWER, 0.0, [-0.2, 0.0, 0.02]),
+        "material": DIRECTORS,
+        "handles": [{"group": "left", "symmetry": "x"}],
+        "obstacles": {"ball": {"sphere": {"center": [-0.2, 0.2, -0.2], "radius": 0.2}}},
+    },
+}
+"""Each thrown downwards."""
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_nothing_crosses_with(comm: MPI.Comm, name: str, shared_tmp: Path) -> None:
+    if comm.rank == 0:
+        corners = [(-0.5, 0.0, 0.0), (0.5, 0.013, 0.0), (0.5, 0.0, -0.3), (-0.5, 0.0, -0.3)]
+        obj_file(shared_tmp / "wall.obj", corners, [(0, 1, 2), (0, 2, 3)])
+    comm.Barrier()
+    scene = {"solver": {}, "time": {"end": 0.06, "step": 0.004}} | GRAVITY | HOSTILE[name]
+    if "w" in scene.get("obstacles", {}):
+        wall = scene["obstacles"]["w"] | {"mesh": {"file": str(shared_tmp / "wall.obj")}}
+        scene |= {"obstacles": {"w": wall}}
+    most = 0.0
+    with Watched(comm, scene) as run:
+        run.throw(lambda x: np.where(x[:, 2:] > 1e-9, [0.0, 0.0, -3.0], 0.0))
+
+        def watch(simulation: SteppedScene) -> None:
+            nonlocal most
+            most = max(most, run.forces()[1])
+
+        run.run(watch)
+    assert most > 0.01
