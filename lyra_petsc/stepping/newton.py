@@ -126,9 +126,7 @@ class Newton:
         if self.globalisation.trusts:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps:
-            fraction = self._equations.largest_step(self._array(x), -self._array(y))
-            y.scale(fraction)
-            changed |= fraction < 1.0
+            changed |= self._limit(x, residual, y)
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
@@ -147,6 +145,25 @@ class Newton:
             before.copy(y)
         before.destroy()
         return downwards
+
+    def _limit(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Shorten a step y to what terms allow, or let it lead past what is near; whether it is another."""
+        equations, v = self._equations, self._array(x)
+        fraction = equations.largest_step(v, -self._array(y))
+        slow = self._snes.getIterationNumber() > 0 and not self.convergence.fell
+        past = equations.pushed_apart(v, -self._array(y)) if fraction < 1.0 or slow else None
+        if past is not None:
+            before = y.copy()
+            y.setArray(-past.ravel())
+            farther = equations.largest_step(v, past) if residual.dot(y) > 0.0 else 0.0
+            if farther > 0.0 and farther >= fraction:
+                fraction = farther
+            else:
+                before.copy(y)
+                past = None
+            before.destroy()
+        y.scale(fraction)
+        return past is not None or fraction < 1.0
 
     def _useless(self, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Whether the linear solve failed in a way that leaves no direction of descent."""

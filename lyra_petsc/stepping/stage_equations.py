@@ -48,6 +48,12 @@ FARTHEST_TURN = 0.5
 SEARCHES = 40
 """For what is near, at most, on the way of a Newton iteration or of handles in a step."""
 
+FEW = 0.3
+"""Part of a way that must be known for the rest to be searched bit by bit; else all of it is at once."""
+
+PUSHES = 8
+"""By which what has come too near is set aside, at most."""
+
 LEAST = 1e-10
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
 
@@ -470,6 +476,9 @@ class StageEquations:
         for _ in range(SEARCHES):
             x, ahead = self._ahead(v + gone * way, (most - gone) * way)
             seen = fraction = self.discretisation.largest_step(x, ahead)
+            if seen < FEW:
+                x, ahead = self._look(v + gone * way, (most - gone) * way)
+                seen = fraction = self.discretisation.largest_step(x, ahead)
             for term in self.active.limiting:
                 fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
             fraction = self._least_of(fraction)
@@ -479,6 +488,38 @@ class StageEquations:
             if fraction < seen:
                 break
         return gone
+
+    def _look(self, v: Array, way: Array) -> tuple[Array, Array]:
+        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `_ahead` gives;
+        collective.
+        """
+        self._follow(*self._ahead(v, way))
+        return self._ahead(v, way)
+
+    def pushed_apart(self, v: Array, way: Array) -> Array | None:
+        """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
+        if nothing is; collective.
+
+        On tangents sheets that turn come nearer to what they touch, or pass it, by the square of their turn.
+        (A second-order correction: Nocedal & Wright, Numerical Optimization, 2nd ed., sec. 15.6.)
+        """
+        if not self.active.limiting:
+            return None
+        x, ahead = self._ahead(v, way)
+        if self.discretisation.largest_step(x, ahead) < 1.0:
+            x, ahead = self._look(v, way)
+        n, frozen, pushed = len(way), self.active.frozen, False
+        aims = {term: term.aims(x, ahead, frozen[term]) for term in self.active.limiting}
+        for _ in range(PUSHES):
+            out, count = np.zeros_like(x), np.zeros((len(x), 1))
+            found = [term.push_apart(x, ahead, frozen[term], aims[term], out, count) for term in aims]
+            if not self.points.comm.allreduce(any(found), MPI.LOR):
+                break
+            aside = np.divide(out[:n], count[:n], out=np.zeros((n, 3)), where=count[:n] > 0.0)
+            ahead[:n] += np.where(self.prescribed.free, aside, 0.0)
+            self.points.update_ghosts(ahead)
+            pushed = True
+        return ahead[:n] / self.stage.reach if pushed else None
 
     def _farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""

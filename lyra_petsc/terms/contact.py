@@ -38,6 +38,12 @@ Swept = tuple[Ints, tuple[Array, Array]]
 KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""
 
+TOUCHES = 0.7
+"""Part of the gap at which pairs that meet in a Newton iteration shall be after it."""
+
+SHORT = 0.05
+"""Part of the gap that they, and those which touch, may lack there."""
+
 PARALLEL = 1e-3
 """Squared sine of the angle of two edges below which they count as nearly parallel."""
 
@@ -48,9 +54,13 @@ HALFWAY = 14.0
 """b″ / k in the middle of the gap."""
 
 EDGES = 0.3
-"""Part of the gap below which two edges of sheets feel each other. Sheets that lie on each other are held by
-pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to what these do not.
+"""Part of the gap below which two edges feel each other, but for sharp ones of obstacles. Sheets that lie on
+each other are held by pairs of vertices and triangles, two for a vertex; edges, ten times as many, see to
+what these do not. On obstacles' triangles a sheet's vertices lie, alike wherever the edges of these are.
 """
+
+SHARP = 0.5
+"""Angle [rad] between triangles of an obstacle above which the edge between them is felt as they are."""
 
 SKIN = 0.5
 """Over the gap, how far points may come nearer to each other between two searches."""
@@ -130,6 +140,11 @@ class Obstacles:
         Planes are a point and a normal.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
+    smooth_points : (n,) bool
+        Of all points: those at which triangles make no sharp edge.
+    smooth_edges : (m,) int64
+        Edges at which they make none, in order: the lower number of a point times ``n_points``, and the
+        higher.
     """
 
     def __init__(self, obstacles: Sequence[Solid | Container]) -> None:
@@ -138,6 +153,7 @@ class Obstacles:
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
         }
         radius, first = np.zeros(len(obstacles) + 1), 0
+        smooth_points, smooth_edges = [np.empty(0, dtype=np.bool_)], [np.empty((0, 2), dtype=np.int64)]
         for number, obstacle in enumerate(obstacles):
             n = len(obstacle.points)
 
@@ -148,6 +164,12 @@ class Obstacles:
 
             if isinstance(obstacle, Solid):
                 radius[number] = obstacle.radius
+                edges, sharp = _edges_of(obstacle)
+                smooth_edges.append(first + edges[~sharp])
+                points = np.zeros(n, dtype=np.bool_)
+                points[obstacle.triangles] = True
+                points[edges[sharp]] = False
+                smooth_points.append(points)
                 parts["triangles"].append(rows(obstacle.triangles))
                 parts["edges"].append(rows(obstacle.edges))
                 parts["points"].append(rows(np.arange(n)[:, None]))
@@ -157,7 +179,12 @@ class Obstacles:
             else:
                 radius[number] = -obstacle.radius
                 parts["segments"].append(rows(np.array([[0, n - 1]])))
+            if not isinstance(obstacle, Solid):
+                smooth_points.append(np.zeros(n, dtype=np.bool_))
             first += n
+        smooth = np.concatenate(smooth_edges)
+        self.smooth_points = np.concatenate(smooth_points)
+        self.smooth_edges = np.sort(smooth[:, 0] * first + smooth[:, 1])
         empty = np.empty((0, 5), dtype=np.int64)
         self.triangles, self.edges, self.points, self.planes, self.segments = (
             np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
@@ -243,9 +270,23 @@ class ContactBarrier(Elastic):
         self.points = np.where(what[:, 2:6] < 0, what[:, 2:6], self.stencil)
         self.offset = self.barrier.thickness + self.obstacles.radius[self.obstacle]
         self.shares = surface_shares.shares(what[:, 6])
-        between = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
-        self.gap = np.where(between, EDGES, 1.0) * self.barrier.gap
+        self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
+
+    def _between_others(self) -> NDArray[np.bool_]:
+        """Pairs (E,) that see to what vertices of sheets and triangles do not: edges of sheets, and edges and
+        points of obstacles where their triangles are smooth.
+        """
+        of, points = self.obstacles, self.points
+        out: NDArray[np.bool_] = (self.kind == EDGE_EDGE) & (self.obstacle < 0)
+        corners = np.flatnonzero((self.kind == VERTEX_TRIANGLE) & (points[:, 0] < 0))
+        out[corners] = of.smooth_points[~points[corners, 0]]
+        edges = np.flatnonzero((self.kind == EDGE_EDGE) & (self.obstacle >= 0))
+        ends = np.sort(~points[edges, 2:], axis=1)
+        keys = ends[:, 0] * of.n_points + ends[:, 1]
+        places = np.searchsorted(of.smooth_edges, keys), np.searchsorted(of.smooth_edges, keys, side="right")
+        out[edges] = places[0] < places[1]
+        return out
 
     # -- obstacles ---------------------------------------------------------------------------------
 
@@ -399,6 +440,18 @@ class ContactBarrier(Elastic):
         pairs = self.kind[at], self.points[at], self.offset[at]
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
+    def aims(self, x: Array, way: Array, frozen: Places) -> tuple[Array, Array]:
+        aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
+        pairs = self.kind, self.points, self.offset, self.gap
+        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, aim, before)
+        return aim, before
+
+    def push_apart(
+        self, x: Array, way: Array, frozen: Places, aims: tuple[Array, Array], out: Array, count: Array
+    ) -> bool:
+        pairs = self.kind, self.points, self.offset, self.gap
+        return bool(contact_pairs.push_apart(x, frozen.now, way, *pairs, *aims, SHORT, out, count))
+
     def lets_pass(self, x: Array, way: Array, frozen: Places, part: Part) -> bool:
         if not self.n_elements:
             return True
@@ -512,6 +565,23 @@ class ContactBarrier(Elastic):
             contact_pairs.distances(x, frozen.now, self.kind[may], self.points[may], left)
             smallest = min(smallest, (left - self.offset[may]).min())
         return {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
+
+
+def _edges_of(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
+    """Edges (n, 2) of an obstacle's triangles, lower numbers first, and which are sharp: borders, and those
+    with an angle of more than `SHARP`.
+    """
+    triangles = obstacle.triangles.astype(np.int64).reshape(-1, 3)
+    a, b, c = (obstacle.points[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    way = np.where(sides[:, :1] < sides[:, 1:], 1.0, -1.0) * np.tile(normal, (3, 1))
+    edges, number, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(edges), 3))
+    np.add.at(sums, number.ravel(), way)  # of two triangles turned alike: n − n'
+    apart = np.linalg.norm(sums, axis=1)
+    return edges, (count != 2) | (apart > 2.0 * np.sin(0.5 * SHARP))
 
 
 def _during(frozen: Places, part: Part, way: Array) -> tuple[Array, Array, Array]:

@@ -57,6 +57,9 @@ CLOSE = 0.1
 ADVANCES = 1000
 """Of it in one way, at most: where ways are long and go past each other, each advance is short."""
 
+BISECTIONS = 30
+"""In the search for the distance at which the barrier has a force."""
+
 PARALLEL = 1e-12
 """Squared sine of the angle of two edges, or sides of a triangle, below which they count as parallel."""
 
@@ -802,6 +805,108 @@ def approaches(x, others, way, others_way, kind, points, reach, out):  # type: i
             continue
         d = distance(kind[e], p)
         out[e] = d - nearer
+
+
+@leaf()
+def _ahead_of(p, kind, before, beta, n):  # type: ignore[no-untyped-def]
+    """Distance of a pair at p (4, 3), its β (4,), and the unit vector n (3,) in which it grows; the distance
+    is negative where the pair has passed what was on the side ``before`` (3,), unless that is 0.
+    """
+    behind = kind == VERTEX_INSIDE
+    if kind == VERTEX_PLANE:
+        behind = _around_foot(p)
+    beta[0], beta[1], beta[2], beta[3] = _weights(kind, p)
+    square = along = 0.0
+    for k in range(3):
+        n[k] = beta[0] * p[0, k] + beta[1] * p[1, k] + beta[2] * p[2, k] + beta[3] * p[3, k]
+        square, along = square + n[k] * n[k], along + n[k] * before[k]
+    d = -math.sqrt(square) if behind or along < 0.0 else math.sqrt(square)
+    for k in range(3):
+        n[k] = n[k] / d if d != 0.0 else 0.0
+    return d
+
+
+@leaf()
+def _where(force, gap):  # type: ignore[no-untyped-def]
+    """δ at which −b′ / k of the barrier is ``force`` [m] > 0, or a little less."""
+    # near 0 the force is below 2 gap³ / δ², and beyond that more than it would be there
+    low, high = min(0.5, 0.1 * math.sqrt(gap / (gap + force))) * gap, gap
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        if -barrier(middle, gap)[1] > force:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@kernel()
+def aims(x, others, way, kind, points, offset, gap, most, aim, before):  # type: ignore[no-untyped-def]
+    """Least distances less the offsets (E,) [m] that pairs should have after a ``way`` (n_local, 3) [m] of
+    Newton's.
+
+    Where the barrier's force is what it is in the linear model, and what does not touch yet at the part
+    ``most`` of the gap, which no aim is beyond; −∞ of pairs that stay apart. On which side (E, 3) parts are
+    that would pass each other; 0 where distances tell.
+    """
+    p, n, beta, none = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3)
+    nearer = 2.0 * _farthest(way)
+    for e in range(len(kind)):
+        aim[e] = -math.inf
+        _load(x, others, points, e, p)
+        if at_least(p, kind[e]) - offset[e] - nearer >= gap[e]:
+            continue
+        d = _ahead_of(p, kind[e], none, beta, n)
+        delta = d - offset[e]
+        if not 0.0 < delta < gap[e] + nearer:
+            continue
+        aim[e] = most * gap[e]
+        if kind[e] <= EDGE_EDGE:
+            for k in range(3):
+                before[e, k] = n[k]
+        if delta < gap[e]:
+            along = 0.0
+            for i in range(4):
+                if points[e, i] >= 0:
+                    for k in range(3):
+                        along += beta[i] * n[k] * way[Index(points[e, i]), k]
+            _, slope, second = barrier(delta, gap[e])
+            force = -slope - second * along
+            if force > 0.0:
+                aim[e] = min(aim[e], _where(force, gap[e]))
+
+
+@kernel()
+def push_apart(x, others, way, kind, points, offset, gap, aim, before, least, out, count):  # type: ignore[no-untyped-def]  # fmt: skip
+    """How pairs that are nearer than they should be after a way are to be pushed apart; how many there are.
+
+    Added to ``out`` (n_local, 3) [m], each push times what is added to ``count`` (n_local,), its weight.
+    ``aim`` and ``before`` as of `aims`; what is short by less than ``least`` times the gap stays.
+    """
+    p, n, beta, found = np.empty((4, 3)), np.empty(3), np.empty(4), 0
+    for e in range(len(kind)):
+        if not aim[e] > -math.inf:
+            continue
+        _load(x, others, points, e, p)
+        for i in range(4):
+            if points[e, i] >= 0:
+                for k in range(3):
+                    p[i, k] += way[Index(points[e, i]), k]
+        short = aim[e] + offset[e] - _ahead_of(p, kind[e], before[e], beta, n)
+        square = 0.0
+        for i in range(4):
+            if points[e, i] >= 0:
+                square += beta[i] * beta[i]
+        if not short > least * gap[e] or not square > 0.0:
+            continue
+        found += 1
+        for i in range(4):
+            if points[e, i] >= 0 and beta[i] != 0.0:
+                row, share = Index(points[e, i]), abs(beta[i])
+                count[row] += share
+                for k in range(3):
+                    out[row, k] += share * short * beta[i] / square * n[k]
+    return found
 
 
 @leaf()

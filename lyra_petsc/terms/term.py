@@ -291,6 +291,18 @@ class Elastic(Term):
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
 
+    def aims(self, x: Array, way: Array, frozen: Any) -> Any:
+        """What `push_apart` is to reach after a Newton iteration's way (n_local, 3) [m] from x."""
+        return None
+
+    def push_apart(self, x: Array, way: Array, frozen: Any, aims: Any, out: Array, count: Array) -> bool:
+        """Whether points are nearer after the way (n_local, 3) [m] from x than they should be.
+
+        Adds where they should go instead to ``out`` (n_local, 3) [m], of each element with a weight that is
+        added to ``count`` (n_local, 1).
+        """
+        return False
+
     def lets_pass(self, x: Array, way: Array, frozen: Any, part: Part) -> bool:
         """Whether points may go the way (n_local, 3) [m] from x while obstacles go theirs in a part of the
         step.

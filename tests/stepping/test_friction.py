@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from numpy.typing import NDArray
-from physics import CLOTH, end_on_one_rank, gathered, grid, scene_of
+from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
@@ -24,7 +25,12 @@ NORMAL = [math.sin(SLOPE), 0.0, math.cos(SLOPE)]
 DOWN = np.array([math.cos(SLOPE), 0.0, -math.sin(SLOPE)])
 
 
-def on_slope(comm: MPI.Comm, friction: float, end: float) -> tuple[float, float, Array, float, float]:
+PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}
+
+
+def on_slope(
+    comm: MPI.Comm, friction: float, end: float, slope: dict[str, Any] = PLANE
+) -> tuple[float, float, Array, float, float]:
     """Mean way and speed down the slope, force on it, weight and friction's work of a sheet let go."""
     place = [0.9 * GAP * component for component in NORMAL]
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
@@ -33,7 +39,7 @@ def on_slope(comm: MPI.Comm, friction: float, end: float) -> tuple[float, float,
         "material": CLOTH | {"bending": 1e-4, "damping": 0.0},
         "gravity": [0.0, 0.0, -G],
         "contact": {"gap": GAP, "friction": friction, "self": False},
-        "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},
+        "obstacles": {"slope": slope},
         "time": {"end": end, "step": 0.01},
     }
     simulation = SteppedScene(comm, scene_of(content))
@@ -61,6 +67,23 @@ def test_it_slides_by_coulombs_law(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(force[:3] @ NORMAL, -pressed, rtol=1e-3)
     np.testing.assert_allclose(force[:3] @ DOWN, friction * pressed, rtol=1e-3)
     assert work == pytest.approx(friction * pressed * way, rel=0.05)
+
+
+def test_a_slope_of_triangles_is_as_a_plane(comm: MPI.Comm, shared_tmp: Path) -> None:
+    """Over whose edges the sheet's vertices, edges and triangles slide."""
+    if comm.rank == 0:
+        along, across = np.meshgrid([-1.0, -0.13, 0.03, 0.25, 0.41, 0.57, 2.0], [-1.0, 0.11, 0.17, 0.29, 1.0])
+        flat = np.column_stack([along.ravel(), across.ravel()])
+        points = flat[:, :1] * DOWN + flat[:, 1:] * [0.0, 1.0, 0.0]
+        rows = [(i, i + 1, i + 7) for j in range(4) for i in range(7 * j, 7 * j + 6)]
+        sides = [*rows, *((b, c + 1, c) for _, b, c in rows)]
+        obj_file(shared_tmp / "slope.obj", points.tolist(), sides)
+    comm.Barrier()
+    friction, end = 0.5 * math.tan(SLOPE), 0.4
+    plane = on_slope(comm, friction, end)
+    triangles = on_slope(comm, friction, end, {"mesh": {"file": str(shared_tmp / "slope.obj")}})
+    for one, other in zip(plane, triangles, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9 * plane[3])
 
 
 def test_it_stands(comm: MPI.Comm) -> None:

@@ -17,6 +17,7 @@ from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.overlaps import beyond_planes, in_ball, out_of_ball
+from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier
 
@@ -80,7 +81,8 @@ class Watched:
         """Let velocities be those of positions."""
         n = self.system.points.n_owned
         x = self.system.x[:n].copy()
-        self.system.state.set(x, v(x))
+        vertices = np.arange(n)[:, None] < self.system.points.n_vertices
+        self.system.state.set(x, np.where(vertices, v(x), 0.0))
         self.simulation.ledger.measure()
         self.simulation.stepper.start(0.0, 0)
 
@@ -210,6 +212,25 @@ def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: 
         assert "repeated by backward Euler" in " ".join(run.simulation.notes)
 
 
+@pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "alpha2"])
+def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
+    """Two sheets that a third hits; nothing else works on them, and none dampens."""
+    third = grid(0.3, 0.3, 3, 3) | {"transform": {"translate": [0.1, 0.05, 0.1]}}
+    time = {"end": 0.08, "step": 0.002, "integrator": integrator}
+    scene = {"mesh": [LOWER, UPPER, third], "material": MATERIAL | {"damping": 0.0}, "time": time}
+    with Watched(comm, scene) as run:
+        run.throw(lambda x: np.where(x[:, 2:] > 0.08, [0.3, 0.0, -4.0], 0.0))
+        first, most = run.simulation.budget.total, 0.0
+
+        def watch(simulation: SteppedScene) -> None:
+            nonlocal most
+            most = max(most, run.forces()[1])
+            assert simulation.budget.total <= (1.0 + LARGEST_SUM) * first
+
+        run.run(watch)
+        assert most > 0.1
+
+
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     def end(on: MPI.Comm) -> Array:
         with Watched(on, two_sheets()) as run:
@@ -313,6 +334,21 @@ def test_a_sheet_falls_on_a_mesh(comm: MPI.Comm, shared_tmp: Path) -> None:
         assert run.x[:, 2].max() > -0.05
 
 
+@pytest.mark.parametrize("gap", [1e-3, 1e-5])
+def test_small_gaps_take_few_iterations(comm: MPI.Comm, gap: float) -> None:
+    """Half a millimetre above a sphere at first, which one pair after another meets."""
+    mesh = SHEET | {"transform": {"translate": [-0.3, -0.29, 0.0005]}}
+    ball = {"sphere": {"center": [0.0, 0.0, -0.25], "radius": 0.25}}
+    scene = {"mesh": mesh, "contact": {"gap": gap}, "obstacles": {"it": ball}, "solver": {}}
+    with Watched(comm, scene | GRAVITY | {"time": {"end": 0.1, "step": 0.005}}) as run:
+        steps: list[int] = []
+        while not run.simulation.finished:
+            steps.append(run.simulation.step().newton_iterations)
+            run.look()
+        assert run.forces()[1] > 0.01
+        assert np.median(steps) <= 12
+
+
 def test_weight_at_rest(comm: MPI.Comm) -> None:
     """Statics: a plane carries the sheet's weight."""
     with Watched(comm, dropped("plane", time={"analysis": "static", "step": 1.0})) as run:
@@ -379,3 +415,77 @@ def test_what_moves_far_in_a_step_is_not_held_up(comm: MPI.Comm, handled: bool) 
             assert run.simulation.step().rejected == 0
             run.look()
         assert run.x[:, 2].max() > 0.2
+
+
+def turned(mesh: dict[str, Any], degrees: float, place: list[float]) -> dict[str, Any]:
+    turn = {"axis": [1.0, 0.0, 0.0], "degrees": degrees}
+    return mesh | {"transform": {"rotate": turn, "translate": place}}
+
+
+STRIP = grid(0.4, 0.02, 12, 1, "alternating")
+CORNERS = {"handles": [{"nodes": [0, 5, 24, 29]}]}
+DIRECTORS = MATERIAL | {"bending": 1e-3, "bending_model": "midedge"}
+WALL = {"w": {"mesh": {"file": "wall.obj"}}}
+SPIN = [{"time": 0.0}, {"time": 0.1, "rotate": {"axis": [1.0, 0.0, 0.0], "degrees": 400.0}}]
+HOSTILE: dict[str, dict[str, Any]] = {
+    "a strip edge-on": {
+        "mesh": [LOWER, turned(STRIP, 90.0, [0.05, 0.2, 0.04])],
+        "contact": {"gap": 0.008},
+        **CORNERS,
+    },
+    "a strip edge-on an open mesh": {
+        "mesh": turned(STRIP, 90.0, [-0.2, 0.01, 0.04]),
+        "contact": {"gap": 0.008},
+        "obstacles": WALL,
+    },
+    "an open mesh that spins": {
+        "mesh": turned(grid(0.4, 0.4, 5, 5), 0.0, [-0.2, -0.2, 0.02]),
+        "obstacles": {"w": WALL["w"] | {"motion": SPIN}},
+    },
+    "cells unlike each other": {
+        "mesh": [LOWER, turned(grid(0.1, 0.1, 12, 12), 10.0, [0.2, 0.1, 0.04])],
+        "contact": {"gap": 0.004, "thickness": 0.001, "friction": 0.3},
+        **CORNERS,
+    },
+    "directors and thickness": {
+        "mesh": [LOWER, turned(UPPER, 20.0, [0.05, 0.05, 0.05])],
+        "material": DIRECTORS,
+        "contact": {"gap": 0.01, "thickness": 0.01, "friction": 0.3},
+        **CORNERS,
+    },
+    "a plane of symmetry": {
+        "mesh": turned(LOWER, 0.0, [-0.2, 0.0, 0.02]),
+        "material": DIRECTORS,
+        "handles": [{"group": "left", "symmetry": "x"}],
+        "obstacles": {"ball": {"sphere": {"center": [-0.2, 0.2, -0.2], "radius": 0.2}}},
+    },
+}
+"""Each thrown downwards."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.parallel(1)) if "material" in scene else name
+        for name, scene in HOSTILE.items()
+    ],
+)
+def test_nothing_crosses_with(comm: MPI.Comm, name: str, shared_tmp: Path) -> None:
+    if comm.rank == 0:
+        corners = [(-0.5, 0.0, 0.0), (0.5, 0.013, 0.0), (0.5, 0.0, -0.3), (-0.5, 0.0, -0.3)]
+        obj_file(shared_tmp / "wall.obj", corners, [(0, 1, 2), (0, 2, 3)])
+    comm.Barrier()
+    scene = {"solver": {}, "time": {"end": 0.06, "step": 0.004}} | GRAVITY | HOSTILE[name]
+    if "w" in scene.get("obstacles", {}):
+        wall = scene["obstacles"]["w"] | {"mesh": {"file": str(shared_tmp / "wall.obj")}}
+        scene |= {"obstacles": {"w": wall}}
+    most = 0.0
+    with Watched(comm, scene) as run:
+        run.throw(lambda x: np.where(x[:, 2:] > 1e-9, [0.0, 0.0, -3.0], 0.0))
+
+        def watch(simulation: SteppedScene) -> None:
+            nonlocal most
+            most = max(most, run.forces()[1])
+
+        run.run(watch)
+    assert most > 0.01

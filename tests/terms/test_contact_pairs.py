@@ -340,6 +340,44 @@ def test_free_ways(name: str, speed: float) -> None:
     assert pairs.free_way(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
 
 
+@pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
+def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: str) -> None:
+    pairs = KINDS[name][0]()
+    n, gap, most = len(pairs), np.full(len(pairs), GAP), 0.7
+    way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
+    numbers = pairs.kind, pairs.points, pairs.offset, gap
+    aim, before = np.empty(n), np.zeros((n, 3))
+    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, aim, before)
+
+    def slopes(delta: Array) -> Array:
+        return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])
+
+    left, step = pairs.distances() - pairs.offset, 1e-6
+    touch = (left > 0.0) & (left < GAP)
+    rate = (pairs.distances(pairs.x + step * way) - pairs.distances(pairs.x - step * way)) / (2.0 * step)
+    second = np.array([contact_pairs.barrier(each, GAP)[2] for each in left[touch]])
+    linear = slopes(left[touch]) + second * rate[touch]
+    pressed = linear < slopes(np.array([most * GAP]))
+    assert pressed.any()
+    alike = np.isclose(slopes(aim[touch][pressed]), linear[pressed], rtol=1e-4)
+    assert alike.mean() > 0.99  # nearest points of a few jump within the difference
+    assert (aim[touch][~pressed] == most * GAP).all()
+    # each pair alone, by as much as it lacks
+    x, others = pairs.x, pairs.others
+    room = pairs.kind != VERTEX_INSIDE
+    for e in np.flatnonzero(room | (aim + pairs.offset < 0.0))[::7]:
+        one, at = slice(e, e + 1), np.unique(pairs.points[e][pairs.points[e] >= 0])
+        of = tuple(part[one] for part in (*numbers, aim, before))
+        moved = way.copy()
+        for _ in range(50):
+            out, count = np.zeros_like(x), np.zeros((len(x), 1))
+            if not contact_pairs.push_apart(x, others, moved, *of, 1e-3, out, count):
+                break
+            moved[at] += out[at] / np.maximum(count[at], 1e-9)
+        else:
+            raise AssertionError("is not apart")
+
+
 def test_a_common_motion_of_both_is_free() -> None:
     for make in (lambda: among_sheets(VERTEX_TRIANGLE, 50), lambda: planes(50), lambda: balls(50)):
         pairs = make()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -46,6 +47,9 @@ PRESSURE, LAYERS, RAMP = 1e5, 10, 20
 KNOT, CUT, TAIL, STRAND, WIDE, PULLED = 0.04, 0.2, 3.0, 0.01, 2, 0.25
 """Size of the knot [m], angle from its cut [rad], tails over its size, edges [m] and how many are across, how
 far each end is pulled [m]"""
+
+MANY, MANY_LAYERS, MANY_CELLS = 100_000, 5, 107
+"""Contacts asked for, and the stack that has them: sheets and cells along a side"""
 
 
 def _scene(setting: Setting, mesh: Any, contact: Content, obstacles: Content, **more: Any) -> Content:
@@ -153,6 +157,34 @@ def _knot(setting: Setting, bench: Bench) -> Content:
     return _scene(setting, mesh, contact, {}) | {"handles": handles, "motions": motions}
 
 
+def _stack(setting: Setting, bench: Bench) -> Content:
+    """Sheets on each other on a plane, where each vertex but those of the lowest feels two others."""
+    gap = 0.2 / MANY_CELLS
+    # none has its vertices over those of the one below
+    shifts = [[0.3 * gap * (layer % 3), 0.4 * gap * (layer % 2)] for layer in range(MANY_LAYERS)]
+    places = [[*shift, gap * (layer + 0.9)] for layer, shift in enumerate(shifts)]
+    meshes = [
+        grid(1.0, 1.0, MANY_CELLS, MANY_CELLS, "alternating") | {"transform": {"translate": place}}
+        for place in places
+    ]
+    floor = {"floor": {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}}
+    return _scene(setting, meshes, {"gap": gap, "friction": 0.3}, floor)
+
+
+def _contacts(trial: Trial) -> tuple[int, float]:
+    """Crossings, and how many contacts there are."""
+    return _crossings(trial), trial.simulation.ledger.columns()["contacts"]
+
+
+def _judged_many(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
+    crossed, contacts = zip(*record.observed, strict=True)
+    most = max(contacts)
+    return {
+        **_judged(setting, bench, replace(record, observed=list(crossed))),
+        "contacts": Verdict(most >= MANY, f"{most:.6g} contacts at most, asked for {MANY}"),
+    }
+
+
 def _crossings(trial: Trial) -> int:
     """Number of pairs of triangles that cross now, plus parts that lie inside obstacles."""
     simulation, x = trial.simulation, trial.x
@@ -186,7 +218,7 @@ GAP = 0.01
 
 contact = family(
     "contact",
-    "contact: thickness, gap, Δt, stiffness, speed, friction, needles, a ring, a knot, ten layers",
+    "contact: thickness, gap, Δt, stiffness, speed, friction, needles, a ring, a knot, layers",
     _case("contact-plain", "over a ball", partial(_over_ball, contact={"gap": GAP}), level=QUICK),
     *(
         _case(
@@ -205,9 +237,9 @@ contact = family(
     *(
         _case(
             f"contact-{ms}ms", f"Δt {ms} ms", partial(_over_ball, contact={"gap": GAP}),
-            step=1e-3 * ms, steps=STEPS if ms < STEP * 1e3 else 20, level=level,
+            step=1e-3 * ms, steps=steps, level=level,
         )
-        for ms, level in ((1, FULL), (20, USUAL), (40, USUAL))
+        for ms, steps, level in ((1, 120, FULL), (20, 20, USUAL), (40, 20, USUAL))
     ),
     *(
         _case(f"contact-{factor}", f"membrane × {factor}",
@@ -233,4 +265,8 @@ contact = family(
     ),
     _case("contact-knot", "an overhand knot pulled tight", _knot, steps=80),
     _case("contact-pressed", "ten layers pressed with 1e5 Pa", _pressed, steps=2 * RAMP),
+    _case(
+        "contact-many", "a stack with 100,000 contacts", _stack,
+        steps=4, level=FULL, observe=_contacts, judge=_judged_many,
+    ),
 )  # fmt: skip

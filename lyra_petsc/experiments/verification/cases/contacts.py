@@ -62,6 +62,15 @@ def _slope(degrees: float, friction: float, cells: int, end: float) -> dict[str,
     }
 
 
+def _roof(bench: Bench, degrees: float) -> dict[str, Any]:
+    """The slope as a mesh of triangles that have nothing to do with the sheet's; collective."""
+    angle, way = math.radians(degrees), 14.0
+    flat, faces = rectangle(23, 5, way, 1.5)
+    flat = flat + np.random.default_rng(1).uniform(-0.1, 0.1, flat.shape) * [1.0, 1.0, 0.0]
+    x, y = flat[:, 0] - 1.0, flat[:, 1] - 0.5
+    return {"mesh": bench.mesh(np.column_stack([math.cos(angle) * x, y, -math.sin(angle) * x]), faces)}
+
+
 def _at(trial: Trial, time: float) -> Trial:
     """Steps to a time [s]; collective."""
     while trial.simulation.time < time - 0.5 * STEP:
@@ -71,32 +80,39 @@ def _at(trial: Trial, time: float) -> Trial:
 
 @case(
     "Sheet on a slope of 5, 30 and 60°: stands at 1.01 of the friction that holds it, slides with "
-    "g (sin α − μ cos α) at 0.99, 0.9 and 0.5 of it",
+    "g (sin α − μ cos α) at 0.99, 0.9 and 0.5 of it; on one of triangles, too; friction over the weight",
     source="Coulomb's law",
     resolutions=(2, 4),
     claim=Exact(1e-6),
-    claims={"acceleration": Exact(5e-3)},
+    claims={"acceleration": Exact(5e-3), "friction": Exact(1e-4)},
     counts="cells a side",
     quick=1,
 )
 def incline(bench: Bench, n: float) -> Sequence[Measured]:
-    creep, off = 0.0, (0.0, 1.0, 1.0)
-    for degrees in SLOPES:
+    creep, off, rubs = 0.0, (0.0, 1.0, 1.0), 0.0
+    for degrees, triangles in (*((degrees, False) for degrees in SLOPES), (SLOPES[1], True)):
         angle = math.radians(degrees)
         down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
-        with bench.simulation(_slope(degrees, STICKS * math.tan(angle), round(n), END)) as trial:
+        slope = {"obstacles": {"slope": _roof(bench, degrees)}} if triangles else {}
+        with bench.simulation(_slope(degrees, STICKS * math.tan(angle), round(n), END) | slope) as trial:
             settled = _at(trial, SETTLED).x
             creep = max(creep, float(np.abs((trial.run().x - settled) @ down).max()))
-        for part in SLIDING:
-            with bench.simulation(_slope(degrees, part * math.tan(angle), round(n), SLID)) as trial:
-                before = _at(trial, 0.5 * SLID).v
-                change = (trial.run().v - before) @ down
+        for part in SLIDING[1:2] if triangles else SLIDING:
+            friction = part * math.tan(angle)
+            with bench.simulation(_slope(degrees, friction, round(n), SLID) | slope) as trial:
+                before, weight = _at(trial, 0.5 * SLID).v, G * float(trial.mass.sum())
+                while not trial.simulation.finished:
+                    trial.step()
+                    along = float(trial.simulation.ledger.obstacle_forces(1)[0, :3] @ down)
+                    rubs = max(rubs, abs(along / weight - friction * math.cos(angle)))
+                change = (trial.v - before) @ down
             exact = G * (1.0 - part) * math.sin(angle)
             found = float(change.mean()) / (0.5 * SLID)
             off = max(off, (abs(found / exact - 1.0), found, exact))
     return [
         Measured("creep", creep, 0.0, "m", scale=1.0),
         Measured("acceleration", off[1], off[2], "m/s²"),
+        Measured("friction", rubs, 0.0, scale=1.0),
     ]
 
 
