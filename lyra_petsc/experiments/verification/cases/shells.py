@@ -347,6 +347,21 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
 # -- curved shells, large rotations --------------------------------------------------------------------
 
 
+def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, Any], Array, int]:
+    """The eighth with n cells around, its vertices (V, 3), and one in the middle of its side; collective."""
+    radius, half = 4.953, 5.175
+    cells = n, round(n * half / (0.5 * math.pi * radius))
+    flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
+    vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
+    made = scene(
+        bench.mesh(vertices, faces),
+        {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
+        handles=_symmetric("xyz", radius),
+        loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
+    )
+    return made, vertices, n
+
+
 @case(
     "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: ways of the load (A) "
     "and of the middle (B) and the end (C) of its side at 20 loads against the table",
@@ -356,22 +371,13 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
     quick=1,
 )
 def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
-    radius, half = 4.953, 5.175
-    cells = round(n), round(n * half / (0.5 * math.pi * radius))
     table = {round(row[0], 6): row[1:] for row in TABLES["open_cylinder"]["rows"]}
     for pattern in PATTERNS:
-        flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
-        vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
-        content = scene(
-            bench.mesh(vertices, faces),
-            {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
-            handles=_symmetric("xyz", radius),
-            loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
-        )
+        content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
         worst: list[Measured] = []
         for factor, trial in increments(bench, content, INCREMENT):
             way = trial.x - vertices
-            found = way[0, 2], -way[cells[0], 0], -way[-1, 0]
+            found = way[0, 2], -way[around, 0], -way[-1, 0]
             here = [
                 Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
                 for point, value, of in zip("ABC", found, table[round(factor, 6)], strict=True)
