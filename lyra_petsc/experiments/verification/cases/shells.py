@@ -130,6 +130,41 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
     return made, (edge[0], edge[-1])
 
 
+DISC = {3.0: 0.45884, 15.0: 1.30207}
+"""Deflection over thickness h, by q a⁴/(E h⁴) of a load q [Pa] on the radius a, for ν = 0.3."""
+
+
+@case(
+    "Round plate with a clamped rim that bends by more than its thickness under an even load, "
+    "bending_model: midedge: deflection in the middle",
+    source="von Kármán's equations of round plates, by collocation",
+    resolutions=(8, 16, 32),
+    claim=at_finest(5e-3),
+    counts="edges along the radius",
+    quick=2,
+)
+def clamped_disc(bench: Bench, n: float) -> Iterator[Measured]:
+    young, thickness = 1e7, 0.01
+    around = [(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)]
+    lines = [f"Point({k}) = {{{x}, {y}, 0, {1.0 / n!r}}};" for k, (x, y) in enumerate(around, 1)]
+    lines += [f"Circle({k}) = {{{k + 1}, 1, {k % 4 + 2}}};" for k in range(1, 5)]
+    lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};", "Point{1} In Surface{1};"]
+    lines += ['Physical Surface("plate") = {1};', 'Physical Curve("rim") = {1, 2, 3, 4};']
+    mesh = bench.script("\n".join(lines) + "\n")
+    for load, exact in DISC.items():
+        content = scene(
+            mesh,
+            {"young": young, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+            STATIC | {"step": 0.25},
+            gravity=[0.0, 0.0, load * young * thickness**4],
+            handles=[{"group": "rim", "clamp": True}],
+        )
+        with bench.simulation(content) as trial:
+            middle = int(np.argmin(np.linalg.norm(trial.start, axis=1)))
+            deflection = float(trial.run().x[middle, 2]) / thickness
+        yield Measured(f"deflection over thickness, load {load:g} E h⁴/a⁴", deflection, exact)
+
+
 @case(
     "Slit annular plate under a lifting line force, bending_model: midedge: height of the free slit's ends A "
     "(inner) and B at 20 loads against the table, and at full load against Kirchhoff-Love shells",
