@@ -51,7 +51,7 @@ EASY, FAIR = 6, 15
 
 GROW_FAST, GROW, SHRINK = 10.0, 3.0, 0.2
 
-LEAP, LEAP_ITERATIONS = 1e3, 20
+LEAP, LEAP_ITERATIONS = 1e3, 30
 """Further growth of Δτ, until such a solve has taken more iterations; so it is with what sufficed before."""
 
 BELOW, RISE = 0.5, 2.0

@@ -21,6 +21,9 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
 
+CORRECTED = 0.5
+"""Fraction of the residual at the end of a step below which a correction of it is taken."""
+
 
 class Newton:
     """Callbacks of one SNES.
@@ -59,6 +62,8 @@ class Newton:
         self._shape = (equations.points.n_owned, 3)
         self._from: PETSc.Vec | None = None
         self._began_convex = False
+        still = not (equations.integrator.moves or equations.discretisation.guards)
+        self._corrects = still and linear.factors and bool(equations.active.edged)
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
         self.forcing = Forcing(
             self._ksp, fixed=fixed, contact=equations.discretisation.guards, cycles=linear.cycles
@@ -127,11 +132,41 @@ class Newton:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps:
             changed |= self._limit(x, residual, y)
+        if self._corrects and self.globalisation.trusts:
+            changed |= self._correct(x, y)
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
         self.globalisation.search_along(residual.dot(y))
         return changed
+
+    def _correct(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Solve once more with the same matrix at the end of a step y that is taken in full; whether what
+        is left there becomes much less, and y is longer by that.
+
+        It takes back the stretch of a step along tangents, for a residual and a solve with factors at hand
+        (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order).
+        """
+        first = self._array(x) - self._array(y)
+        size, force = self._force(first)
+        left, correction = y.duplicate(), y.duplicate()
+        left.setArray(force.ravel())
+        self._ksp.solve(left, correction)
+        self.more_linear += self._ksp.getIterationNumber()
+        better = self._force(first - self._array(correction))[0] < CORRECTED * size
+        if better:
+            y.axpy(1.0, correction)
+            self._equations.linearise_to(first)
+        left.destroy()
+        correction.destroy()
+        return better
+
+    def _force(self, v: Array) -> tuple[float, Array]:
+        """F (n_owned, 3) [N] at velocities v and its norm; collective."""
+        equations, force = self._equations, np.empty(self._shape)
+        equations.residual(v, equations.stage.sigma * (v - equations.history), force)
+        (square,) = equations.points.summed(float(np.vdot(force, force)))
+        return float(np.sqrt(square)), force
 
     def _follow_triangles(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let directors follow their triangles in a step y that is taken in full; whether any does."""

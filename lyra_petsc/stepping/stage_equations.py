@@ -42,7 +42,7 @@ from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, Upcom
 
 Array = NDArray[np.float64]
 
-FARTHEST_TURN = 0.5
+FARTHEST_TURN = 0.25
 """Angle [rad] by which a Newton iteration of a static analysis may turn a director."""
 
 SEARCHES = 40
@@ -157,6 +157,7 @@ class StageEquations:
         self._iterate: Array | None = None
         self._predicted: tuple[Array, Array] | None = None
         self._leaps = False
+        self._uncorrected: Array | None = None
         self._last_parts: dict[str, Array] = {}
 
     @property
@@ -692,8 +693,14 @@ class StageEquations:
         before, self._predicted = self._iterate, None
         self._iterate = None if v is None else self.evaluate_at(v)[0].copy()
         if before is not None and self._iterate is not None:
-            self._predicted = before, before if self._leaps else self._iterate
+            there = self._iterate if self._uncorrected is None else self._uncorrected
+            self._predicted = before, before if self._leaps else there
+        self._uncorrected = None
         self._leaps = False
+
+    def linearise_to(self, v: Array) -> None:
+        """Let the next Jacobian be linearised to velocities v (n_owned, 3), whatever corrected them."""
+        self._uncorrected = self.evaluate_at(v)[0].copy()
 
     def leap(self) -> None:
         """Newton's method starts far from the state, whose stress the first Jacobian takes."""

@@ -30,6 +30,7 @@ CASES: Registry[VerificationCase] = Registry(
         "plate": "plates",
         "sze-end-shear": "shells",
         "sze-end-moment": "shells",
+        "clamped-disc": "shells",
         "slit-annulus": "shells",
         "scordelis-lo-roof": "shells",
         "pinched-cylinder": "shells",

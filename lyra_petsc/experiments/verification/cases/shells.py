@@ -130,6 +130,41 @@ def slit_annulus_scene(bench: Bench, n: int) -> tuple[dict[str, Any], tuple[int,
     return made, (edge[0], edge[-1])
 
 
+DISC = {3.0: 0.45884, 15.0: 1.30207}
+"""Deflection over thickness h, by q a⁴/(E h⁴) of a load q [Pa] on the radius a, for ν = 0.3."""
+
+
+@case(
+    "Round plate with a clamped rim that bends by more than its thickness under an even load, "
+    "bending_model: midedge: deflection in the middle",
+    source="von Kármán's equations of round plates, by collocation",
+    resolutions=(8, 16, 32),
+    claim=at_finest(5e-3),
+    counts="edges along the radius",
+    quick=2,
+)
+def clamped_disc(bench: Bench, n: float) -> Iterator[Measured]:
+    young, thickness = 1e7, 0.01
+    around = [(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)]
+    lines = [f"Point({k}) = {{{x}, {y}, 0, {1.0 / n!r}}};" for k, (x, y) in enumerate(around, 1)]
+    lines += [f"Circle({k}) = {{{k + 1}, 1, {k % 4 + 2}}};" for k in range(1, 5)]
+    lines += ["Curve Loop(1) = {1, 2, 3, 4};", "Plane Surface(1) = {1};", "Point{1} In Surface{1};"]
+    lines += ['Physical Surface("plate") = {1};', 'Physical Curve("rim") = {1, 2, 3, 4};']
+    mesh = bench.script("\n".join(lines) + "\n")
+    for load, exact in DISC.items():
+        content = scene(
+            mesh,
+            {"young": young, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+            STATIC | {"step": 0.25},
+            gravity=[0.0, 0.0, load * young * thickness**4],
+            handles=[{"group": "rim", "clamp": True}],
+        )
+        with bench.simulation(content) as trial:
+            middle = int(np.argmin(np.linalg.norm(trial.start, axis=1)))
+            deflection = float(trial.run().x[middle, 2]) / thickness
+        yield Measured(f"deflection over thickness, load {load:g} E h⁴/a⁴", deflection, exact)
+
+
 @case(
     "Slit annular plate under a lifting line force, bending_model: midedge: height of the free slit's ends A "
     "(inner) and B at 20 loads against the table, and at full load against Kirchhoff-Love shells",
@@ -347,6 +382,21 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
 # -- curved shells, large rotations --------------------------------------------------------------------
 
 
+def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, Any], Array, int]:
+    """The eighth with n cells around, its vertices (V, 3), and one in the middle of its side; collective."""
+    radius, half = 4.953, 5.175
+    cells = n, round(n * half / (0.5 * math.pi * radius))
+    flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
+    vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
+    made = scene(
+        bench.mesh(vertices, faces),
+        {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
+        handles=_symmetric("xyz", radius),
+        loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
+    )
+    return made, vertices, n
+
+
 @case(
     "Open cylinder pulled apart by two forces, an eighth of it, bending_model: midedge: ways of the load (A) "
     "and of the middle (B) and the end (C) of its side at 20 loads against the table",
@@ -356,22 +406,13 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
     quick=1,
 )
 def open_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
-    radius, half = 4.953, 5.175
-    cells = round(n), round(n * half / (0.5 * math.pi * radius))
     table = {round(row[0], 6): row[1:] for row in TABLES["open_cylinder"]["rows"]}
     for pattern in PATTERNS:
-        flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
-        vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
-        content = scene(
-            bench.mesh(vertices, faces),
-            {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
-            handles=_symmetric("xyz", radius),
-            loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
-        )
+        content, vertices, around = open_cylinder_scene(bench, round(n), pattern)
         worst: list[Measured] = []
         for factor, trial in increments(bench, content, INCREMENT):
             way = trial.x - vertices
-            found = way[0, 2], -way[cells[0], 0], -way[-1, 0]
+            found = way[0, 2], -way[around, 0], -way[-1, 0]
             here = [
                 Measured(f"way of {point}, worst load of the table, {pattern}", float(value), of, "in")
                 for point, value, of in zip("ABC", found, table[round(factor, 6)], strict=True)
