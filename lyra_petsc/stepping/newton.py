@@ -41,6 +41,8 @@ class Newton:
     globalisation : Globalisation
     more_linear : int
         Linear iterations of directions that were solved for again.
+    allowed : float
+        Fraction of the last direction that terms allowed to go.
     """
 
     def __init__(
@@ -66,7 +68,7 @@ class Newton:
 
     def begin_step(self) -> None:
         """Forget the step before."""
-        self.more_linear, self._length = 0, 0.0
+        self.more_linear, self._length, self.allowed = 0, 0.0, 1.0
         # a step begins as the one before did
         self._convex = self._began_convex
         self._linear.begin()
@@ -126,9 +128,9 @@ class Newton:
         if self.globalisation.trusts:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps:
-            fraction = self._equations.largest_step(self._array(x), -self._array(y))
-            y.scale(fraction)
-            changed |= fraction < 1.0
+            self.allowed = self._equations.largest_step(self._array(x), -self._array(y))
+            y.scale(self.allowed)
+            changed |= self.allowed < 1.0
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
