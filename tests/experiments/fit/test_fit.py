@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from mpi4py import MPI
 import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.fit.estimate import Trial, Unknown, conclude, search
+from lyra_petsc.experiments.fit.readings import Places
 from lyra_petsc.experiments.fit.work import FIT, Observer, fit_scene
 
 TRUE = 4.2e-5
@@ -204,6 +206,20 @@ def test_refuses_a_key_without_a_number() -> None:
     content = STRIP | {"material": {"cloth": "gray-interlock"}}
     with pytest.raises(InputError, match="no number that the scene gives"):
         lyra_petsc.gradient(content, "tip", ["material.bending"])
+
+
+def test_each_simulation_has_its_own_rows() -> None:
+    """Another partition may come at the address that the last one had."""
+    rng = np.random.default_rng(1)
+    tip = Places("", "tip", 1.0, ("z", "x"), "m", wanted=[("tip", (2,)), (7, (0,))])
+    for _ in range(20):
+        original, rows = rng.permutation(12), rng.permutation(12)[:3]
+        x = rng.normal(size=(12, 3))
+        problem = SimpleNamespace(
+            points=SimpleNamespace(original=original), probes={"tip": rows}, system=SimpleNamespace(x=x)
+        )
+        values = tip.values(tip.sums(problem, None))
+        np.testing.assert_allclose(values, [x[rows, 2].mean(), x[original == 7, 0][0]])
 
 
 @pytest.mark.parallel(2)

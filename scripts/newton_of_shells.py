@@ -1,0 +1,147 @@
+"""Counts Newton iterations of published shells in fifteen load steps.
+
+    python scripts/newton_of_shells.py [NAME[:CELLS,CELLS…]] …
+
+NAME is annulus, hemisphere, open-cylinder, half-cylinder or diaphragms; without names all of them. The table
+has the cells along a side, Newton and linear iterations, CPU time [s] and the longest way of a vertex [m].
+All
+but the annulus are meshes of pattern `alternating`.
+
+Source of the shells: Sze, Liu & Lo, Finite Elements in Analysis and Design 40 (2004) 1551-1569.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.verification.answers import STATIC, scene
+from lyra_petsc.experiments.verification.cases.shells import slit_annulus_scene
+
+Array = NDArray[np.float64]
+
+LOAD_STEPS = 15
+NEAR = 1e-6
+"""Of the size: what counts as on a plane"""
+
+
+def _on(axis: int, at: float, size: float) -> list[list[float]]:
+    low, high = [-2.0 * size] * 3, [2.0 * size] * 3
+    low[axis], high[axis] = at - NEAR * size, at + NEAR * size
+    return [low, high]
+
+
+def _symmetric(axes: str, size: float) -> list[dict[str, Any]]:
+    return [{"box": _on("xyz".index(axis), 0.0, size), "symmetry": axis} for axis in axes]
+
+
+def _part_of_cylinder(
+    bench: Bench, cells: tuple[int, int], radius: float, length: float
+) -> tuple[dict[str, Any], Array]:
+    """A quarter of its circumference, from the crown (x = 0) on: mesh, vertices (V, 3)."""
+    flat, faces = rectangle(*cells, 1.0, 1.0, alternating=True)
+    angle = 0.5 * math.pi * flat[:, 0]
+    vertices = np.column_stack([radius * np.sin(angle), length * flat[:, 1], radius * np.cos(angle)])
+    return bench.mesh(vertices, faces), vertices
+
+
+def annulus(bench: Bench, n: int) -> dict[str, Any]:
+    """Slit annular plate, lifted at one side of the slit."""
+    return slit_annulus_scene(bench, n)[0]
+
+
+def hemisphere(bench: Bench, n: int) -> dict[str, Any]:
+    """With a hole of 18 degrees, pulled and pushed with 400 N at its edge; a quarter."""
+    flat, faces = rectangle(n, n, 1.0, 1.0, alternating=True)
+    along, up = 0.5 * math.pi * flat[:, 0], math.radians(72.0) * flat[:, 1]
+    vertices = 10.0 * np.column_stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.sin(up)])
+    return scene(
+        bench.mesh(vertices, faces),
+        {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0},
+        handles=[*_symmetric("xy", 10.0), {"nodes": [n // 2], "axes": ["z"]}],
+        loads=[{"nodes": [0], "force": [200.0, 0, 0]}, {"nodes": [n], "force": [0, -200.0, 0]}],
+    )
+
+
+def open_cylinder(bench: Bench, n: int) -> dict[str, Any]:
+    """Pulled apart in the middle with 40 kN; an eighth."""
+    radius, half = 4.953, 5.175
+    mesh, _ = _part_of_cylinder(bench, (n, round(n * half / (0.5 * math.pi * radius))), radius, half)
+    return scene(
+        mesh,
+        {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
+        handles=_symmetric("xyz", radius),
+        loads=[{"nodes": [0], "force": [0, 0, 1e4]}],
+    )
+
+
+def half_cylinder(bench: Bench, n: int) -> dict[str, Any]:
+    """Clamped at one end, pinched at the other with 2 kN; a half."""
+    radius, length = 1.016, 3.048
+    mesh, _ = _part_of_cylinder(bench, (n, round(n * length / (0.5 * math.pi * radius))), radius, length)
+    return scene(
+        mesh,
+        {"young": 2.0685e7, "poisson": 0.3, "thickness": 0.03, "density": 1.0},
+        handles=[{"box": _on(1, length, radius), "clamp": True}, *_symmetric("xz", radius)],
+        loads=[{"nodes": [0], "force": [0, 0, -1000.0]}],
+    )
+
+
+def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
+    """Cylinder between rigid diaphragms, pinched in the middle with 12 kN; an eighth."""
+    mesh, _ = _part_of_cylinder(bench, (n, n), 100.0, 100.0)
+    return scene(
+        mesh,
+        {"young": 30e3, "poisson": 0.3, "thickness": 1.0, "density": 1.0},
+        handles=[{"box": _on(1, 100.0, 100.0), "axes": ["x", "z"]}, *_symmetric("xyz", 100.0)],
+        loads=[{"nodes": [0], "force": [0, 0, -3000.0]}],
+    )
+
+
+SHELLS: dict[str, tuple[Callable[[Bench, int], dict[str, Any]], tuple[int, ...]]] = {
+    "annulus": (annulus, (6, 12)),
+    "hemisphere": (hemisphere, (16,)),
+    "open-cylinder": (open_cylinder, (16, 24)),
+    "half-cylinder": (half_cylinder, (12, 16, 24)),
+    "diaphragms": (diaphragms, (16, 24)),
+}
+
+
+def main(arguments: list[str]) -> None:
+    bench, step = Bench(MPI.COMM_WORLD, exact=False), 1.0 / LOAD_STEPS
+    print("| shell | cells | Newton | linear | CPU [s] | way [m] |\n| --- | --- | --- | --- | --- | --- |")
+    for argument in arguments or SHELLS:
+        name, _, sizes = argument.partition(":")
+        if name not in SHELLS:
+            sys.exit(f"no such shell '{name}'; there are {', '.join(SHELLS)}")
+        make, usual = SHELLS[name]
+        for n in map(int, sizes.split(",")) if sizes else usual:
+            content = make(bench, n) | {
+                "gravity": [0, 0, 0],
+                "time": STATIC | {"step": step},
+                "solver": {"force_tolerance": 1e-6},
+                "petsc": {"ts_adapt_dt_max": step},
+            }
+            begin, newton, linear = time.process_time(), 0, 0
+            with bench.simulation(content) as trial:
+                first = trial.x
+                while not trial.simulation.finished:
+                    taken = trial.step()
+                    newton += taken.newton_iterations
+                    linear += taken.linear_iterations
+                way = float(np.linalg.norm(trial.x - first, axis=1).max())
+            spent = time.process_time() - begin
+            print(f"| {name} | {n} | {newton} | {linear} | {spent:.1f} | {way:.3f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
