@@ -20,38 +20,26 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import STATIC, scene
-from lyra_petsc.experiments.verification.cases.shells import slit_annulus_scene
-
-Array = NDArray[np.float64]
+from lyra_petsc.experiments.verification.cases.shells import (
+    _cylinder,
+    _on,
+    _symmetric,
+    open_cylinder_scene,
+    slit_annulus_scene,
+)
 
 LOAD_STEPS = 15
-NEAR = 1e-6
-"""Of the size: what counts as on a plane"""
 
 
-def _on(axis: int, at: float, size: float) -> list[list[float]]:
-    low, high = [-2.0 * size] * 3, [2.0 * size] * 3
-    low[axis], high[axis] = at - NEAR * size, at + NEAR * size
-    return [low, high]
-
-
-def _symmetric(axes: str, size: float) -> list[dict[str, Any]]:
-    return [{"box": _on("xyz".index(axis), 0.0, size), "symmetry": axis} for axis in axes]
-
-
-def _part_of_cylinder(
-    bench: Bench, cells: tuple[int, int], radius: float, length: float
-) -> tuple[dict[str, Any], Array]:
-    """A quarter of its circumference, from the crown (x = 0) on: mesh, vertices (V, 3)."""
+def _part_of_cylinder(bench: Bench, cells: tuple[int, int], radius: float, length: float) -> dict[str, Any]:
+    """The mesh of a quarter of its circumference, from the crown (x = 0) on."""
     flat, faces = rectangle(*cells, 1.0, 1.0, alternating=True)
-    angle = 0.5 * math.pi * flat[:, 0]
-    vertices = np.column_stack([radius * np.sin(angle), length * flat[:, 1], radius * np.cos(angle)])
-    return bench.mesh(vertices, faces), vertices
+    vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, length)(flat[:, 0], flat[:, 1]))
+    return bench.mesh(vertices, faces)
 
 
 def annulus(bench: Bench, n: int) -> dict[str, Any]:
@@ -74,35 +62,28 @@ def hemisphere(bench: Bench, n: int) -> dict[str, Any]:
 
 def open_cylinder(bench: Bench, n: int) -> dict[str, Any]:
     """Pulled apart in the middle with 40 kN; an eighth."""
-    radius, half = 4.953, 5.175
-    mesh, _ = _part_of_cylinder(bench, (n, round(n * half / (0.5 * math.pi * radius))), radius, half)
-    return scene(
-        mesh,
-        {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
-        handles=_symmetric("xyz", radius),
-        loads=[{"nodes": [0], "force": [0, 0, 1e4]}],
-    )
+    return open_cylinder_scene(bench, n, "alternating")[0]
 
 
 def half_cylinder(bench: Bench, n: int) -> dict[str, Any]:
     """Clamped at one end, pinched at the other with 2 kN; a half."""
     radius, length = 1.016, 3.048
-    mesh, _ = _part_of_cylinder(bench, (n, round(n * length / (0.5 * math.pi * radius))), radius, length)
+    mesh = _part_of_cylinder(bench, (n, round(n * length / (0.5 * math.pi * radius))), radius, length)
     return scene(
         mesh,
         {"young": 2.0685e7, "poisson": 0.3, "thickness": 0.03, "density": 1.0},
-        handles=[{"box": _on(1, length, radius), "clamp": True}, *_symmetric("xz", radius)],
+        handles=[{"box": _on("y", length, radius), "clamp": True}, *_symmetric("xz", radius)],
         loads=[{"nodes": [0], "force": [0, 0, -1000.0]}],
     )
 
 
 def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
     """Cylinder between rigid diaphragms, pinched in the middle with 12 kN; an eighth."""
-    mesh, _ = _part_of_cylinder(bench, (n, n), 100.0, 100.0)
+    mesh = _part_of_cylinder(bench, (n, n), 100.0, 100.0)
     return scene(
         mesh,
         {"young": 30e3, "poisson": 0.3, "thickness": 1.0, "density": 1.0},
-        handles=[{"box": _on(1, 100.0, 100.0), "axes": ["x", "z"]}, *_symmetric("xyz", 100.0)],
+        handles=[{"box": _on("y", 100.0, 100.0), "axes": ["x", "z"]}, *_symmetric("xyz", 100.0)],
         loads=[{"nodes": [0], "force": [0, 0, -3000.0]}],
     )
 
