@@ -366,8 +366,9 @@ class Sensitivities:
         tangent.memory = {name: _combined(beside, step, partial(_remembered, name)) for name in names}
 
     def _to_frames(self, system: StageEquations) -> None:
-        """Measure a neighbour's directors from the frames in which the simulation's now are."""
-        changed = False
+        """Measure a neighbour's directors, past ones too, from the frames in which the simulation's now are."""
+        change = np.zeros((system.points.n_owned, 3))
+        turns = False
         for mine, theirs in zip(_edged(system), _edged(self._system), strict=True):
             places, ends, length, _ = mine.of_edges
             old: Frames = system.active.frozen[mine]
@@ -380,10 +381,12 @@ class Sensitivities:
             side = np.sum(np.cross(tangent, one) * other, axis=1)
             turned = np.arctan2(side, np.sum(one * other, axis=1))
             own = places < 3 * system.points.n_owned
-            system.x.reshape(-1)[places[own]] -= (length * turned)[own]
-            changed = True
-        if changed:
+            change.reshape(-1)[places[own]] = -(length * turned)[own]
+            turns = True
+        if turns:
+            system.x[: system.points.n_owned] += change
             system.state.update_ghosts()
+            system.integrator.shift_past(change)
 
     # -- edges whose unknowns are in equilibrium at the end of the step -------------------------------
 

@@ -98,6 +98,9 @@ class Bdf2(Integrator):
     def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         self._past = [(x, v, dt), *self._past[:1]]
 
+    def shift_past(self, change: Array) -> None:
+        self._past = [(x + change, v, dt) for x, v, dt in self._past]
+
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         arrays: Arrays = {}
         numbers: dict[str, float] = {}

@@ -76,6 +76,9 @@ class Forgetful:
     def accepted(self, x: Array, v: Array, free: NDArray[np.bool_], dt: float) -> None:
         """Remember the step that led from x, v; ``free`` marks the coordinates nothing prescribed."""
 
+    def shift_past(self, change: Array) -> None:
+        """Let remembered positions be measured from others: they change by ``change`` (n_owned, 3) [m]."""
+
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
         return {}, {}
