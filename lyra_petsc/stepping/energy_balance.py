@@ -66,12 +66,15 @@ class Works:
         By how much the energy [J] of this rank's terms with moving targets is more than before the step.
     damping : (m,)
         Force [N] of material damping at the prescribed unknowns.
+    damped : float
+        Heat [J] of material damping on this rank.
     """
 
     external: float
     heat: float
     moving: float
     damping: Array
+    damped: float
 
 
 class Ledger:
@@ -159,6 +162,7 @@ class Ledger:
         if "damping" in parts:
             local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
             damping = parts["damping"].take(self._at)
+        damped = float(local[1])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         del parts, external, moved  # energies need the room
         work, heat = system.points.summed(*local)
@@ -166,7 +170,7 @@ class Ledger:
         self.budget.dissipation += float(heat)
         moving = self._moving
         self.measure()
-        self.works = Works(float(work), float(heat), self._moving - moving, damping)
+        self.works = Works(float(work), float(heat), self._moving - moving, damping, damped)
         return self.budget
 
     def _turning(self) -> list[tuple[Array, Array]]:

@@ -9,7 +9,9 @@ and wind::
 W is by the trapezoidal rule: half the sum of the forces at both ends of the step, wind and pressure with the
 geometry there, times the way. (The integrator's own forces, at its stage, balance a blow-up as well.) A
 target that moves works by the mean over both ends of what its motion does to the energy, which for springs is
-the same rule. G is judged against the scale ::
+the same rule. D of integrators whose stage's velocity is not Δx/Δt is that of uniform motion, the least that
+leads from end to end: at the start from rest, the stage's is several times what any motion makes. G is judged
+against the scale ::
 
     S = largest so far of T + U + |V − V₀| + Σ|W| + ΣD
 
@@ -27,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -161,6 +163,7 @@ class EnergyGuard:
                 layout.update_ghosts(values)
         x1, v1, at = system.x, system.v, system.prescribed.at
         moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
+        works, least = self._least_heat(x1 - x0, works)
         change = 0.5 * float(np.einsum("i,ij,ij", system.mass, gained, gained))
         # what the ledger's kinetic energies hold beyond the free coordinates
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
@@ -168,13 +171,13 @@ class EnergyGuard:
         work += self._handle_work(x0, x1, moved, works)
         pulled = self._of_targets(x0, x1)
         reach = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2)
+        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2, least)
         sums = [float(value) for value in layout.summed(*local)]
-        slower, faster, change, work, rise, from_targets, *springs, moving, stiff = sums
+        slower, faster, change, work, rise, from_targets, *springs, moving, stiff, least = sums
         slower, faster = before.kinetic - slower, after.kinetic - faster
         work += from_targets
         plain = after.elastic - before.elastic - moving
-        heat, fall = works.heat, after.potential - before.potential
+        heat, fall = works.heat + least, after.potential - before.potential
         gain = faster - slower + plain + rise + fall + heat - work
         energy, energy_before = faster + after.elastic + springs[1], slower + before.elastic + springs[0]
         sizes = energy + energy_before + before.kinetic + after.kinetic
@@ -193,6 +196,16 @@ class EnergyGuard:
             bracket=unexplained + change,
             noise=noise,
         )
+
+    def _least_heat(self, moved: Array, works: Works) -> tuple[Works, float]:
+        """Works with the damping of uniform motion along ``moved`` (n_local, 3), and this rank's part of how
+        much more heat [J] that makes than the forces at the stage."""
+        system = self._system
+        if not system.damping.acts or system.integrator.order == 1 or system.integrator.by_stage:
+            return works, 0.0
+        force = system.damping.product(moved / system.dt)
+        heat = float(np.vdot(force, moved[: len(force)]))
+        return replace(works, damping=force.take(system.prescribed.at)), heat - works.damped
 
     def _frozen(self, terms: Iterable[Elastic], at: float, x: Array) -> dict[Elastic, Any]:
         """What terms freeze with their targets where they are at time ``at`` [s] of the step."""

@@ -51,8 +51,10 @@ FORWARD = {0: -25.0 / 12.0, 1: 4.0, 2: -3.0, 3: 4.0 / 3.0, 4: -0.25}
 those of the neighbours at and above it.
 """
 
-RELATIVE = 6e-4
-"""δ over the size of the number."""
+RELATIVE, RELATIVE_STATIC = 1e-4, 6e-4
+"""δ over the size of the number. Small where damping may switch the sign of an eigenvalue between neighbours;
+equilibria have no damping, but feel the round-off of forces more.
+"""
 
 MOST_CORRECTIONS = 60
 """Linear solves for one derivative in one step."""
@@ -165,7 +167,8 @@ class Sensitivities:
         self._iterates = not self._system.integrator.lagged_loads
         self._static = isinstance(self._system.integrator, Static)
         self._semi = self._system.integrator.lagged_loads and not self._static
-        self._steps = [RELATIVE * number.size for number in self.numbers]
+        relative = RELATIVE_STATIC if self._static else RELATIVE
+        self._steps = [relative * number.size for number in self.numbers]
         self.tangents: list[Tangent] = []
         self._neighbours: list[list[Neighbour]] = []
         owner = self._owner()
@@ -366,7 +369,7 @@ class Sensitivities:
         tangent.memory = {name: _combined(beside, step, partial(_remembered, name)) for name in names}
 
     def _to_frames(self, system: StageEquations) -> None:
-        """Measure a neighbour's directors, past ones too, from the frames in which the simulation's now are."""
+        """Measure a neighbour's directors, past ones too, from the frames that the simulation's now have."""
         change = np.zeros((system.points.n_owned, 3))
         turns = False
         for mine, theirs in zip(_edged(system), _edged(self._system), strict=True):
