@@ -339,8 +339,8 @@ class LawCurves(Block):
     """One's own measurements: force [N/m], per width at rest, by strain.
 
     Each is a file of two columns (commas, semicolons or blanks between), beside the scene file, or a list of
-    points. Strains are fractions, and both columns grow. A curve begins at (0, 0), goes on straight after its last point, and warp and
-    weft do so under compression. Nothing couples the three.
+    points. Strains are fractions, and both columns grow. A curve begins at (0, 0), goes on straight after its
+    last point, and warp and weft do so under compression. Nothing couples the three.
 
     Attributes
     ----------

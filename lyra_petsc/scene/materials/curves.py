@@ -80,10 +80,9 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
     InputError
         Naming the first place where strain or force does not grow.
     """
-    if not points or len(points) > MOST_POINTS:
-        raise InputError(
-            f"{whole} has {len(points)} points; give 1 to {MOST_POINTS} (beside that at no strain)"
-        )
+    count = sum(strain != 0.0 for _, strain, _ in points)
+    if not points or count > MOST_POINTS:
+        raise InputError(f"{whole} has {count} points; give 1 to {MOST_POINTS} (beside that at no strain)")
     where, strain, force = points[0]
     if strain == 0.0 and force != 0.0:
         raise InputError(f"{where}: no strain has no force; take {force:g} N/m from all forces")
@@ -112,6 +111,20 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
         if not np.isfinite(interpolation(found)).all():
             raise InputError(f"{whole} has slopes that are no numbers; points are too near one another")
     return found
+
+
+def force_at(points: Points, strain: float) -> float:
+    """Force [N/m] of a curve at a strain >= 0."""
+    rows = interpolation(points)
+    i = min(int(np.searchsorted(rows[:, 0], strain)), len(rows)) - 1
+    if i + 1 == len(rows):
+        x, y, slope, _ = rows[-1]
+        return float(y + slope * (strain - x))
+    (x0, y0, d0, _), (x1, y1, d1, _) = rows[max(i, 0) : max(i, 0) + 2]
+    h = x1 - x0
+    t = (strain - x0) / h
+    rise = (1.0 - t) ** 2 * h * d0 - t * (1.0 - t) * h * d1 + t * (3.0 - 2.0 * t) * (y1 - y0)
+    return float(y0 + t * rise)
 
 
 def interpolation(points: Points) -> Array:
