@@ -2,7 +2,7 @@
 
     python scripts/fit_benchmark.py [INTEGRATOR]
 
-CPU time of a simulation (median of three), of one with derivatives (6 times that), and of the whole fit (24
+CPU time of a simulation (median of three), of one with derivatives (6 times that), and of the whole fit (23
 simulations).
 """
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from lyra_petsc.errors import in_python
+from lyra_petsc.errors import InputError, in_python
 from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import shown
 
 SceneLike: TypeAlias = Scene | str | Path | Mapping[str, Any]
 
@@ -42,6 +44,8 @@ def load(
     with in_python():
         if isinstance(source, Mapping):
             scene = scene_of(source, changes)
+        elif source is not None and not isinstance(source, Scene | str | os.PathLike):
+            raise InputError(f"must be a file, keys of a scene, or a Scene, not {shown(source)}", key="scene")
         else:
             scene = source if isinstance(source, Scene) else load_scene(source or default_scene())
             scene = scene.changed(changes) if changes else scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -254,11 +254,11 @@ class Bench:
         return str(path)
 
     @contextmanager
-    def simulation(self, content: Mapping[str, Any]) -> Iterator[Trial]:
+    def simulation(self, content: Mapping[str, Any], *, land: Sequence[float] = ()) -> Iterator[Trial]:
         """Set a scene up; freed, with the options it set, when the block ends; collective.
 
-        ``content`` is a scene as in a file. Defaults that are filled in: no output times, and on an
-        exact bench a direct linear solver and tight tolerances.
+        ``content`` is a scene as in a file; at times ``land`` steps end. Defaults that are filled in: no
+        output times, and on an exact bench a direct linear solver and tight tolerances.
         """
         filled: dict[str, Any] = {"output": {"every": None}} | dict(content)
         if self._exact:
@@ -268,6 +268,6 @@ class Bench:
         if self._trust_mesh:
             scene = scene.trusting_meshes()
         began, steps = time.perf_counter(), self.steps
-        with simulated(self.comm, scene) as simulation:
+        with simulated(self.comm, scene, land=land) as simulation:
             yield Trial(self, simulation)
         self.latest = (self.steps - steps, time.perf_counter() - began)

@@ -198,6 +198,8 @@ def _choose(
         choice = FolderChoice(path, given=force, force=force, first=first, kind=kind)
         key = "output folder"
     else:
+        if not isinstance(out, str | os.PathLike):
+            raise InputError(f"must be the path of a folder, not {out!r}", key=key)
         if not os.fspath(out).strip():
             raise InputError("is empty; give the folder to write to", key=key)
         choice = FolderChoice(Path(out), resume=resume, given=True, force=force, kind=kind)

@@ -74,7 +74,9 @@ _NUMBERS = {"anyOf": [FINITE, {"type": "array", "items": FINITE, "minItems": 1}]
 def _axes(value: Any) -> tuple[str, ...]:
     if not isinstance(value, (list, tuple)) or not value or any(a not in ("x", "y", "z") for a in value):
         raise problem(f"must be a list of x, y, z, not {shown(value)}")
-    return tuple(axis for axis in ("x", "y", "z") if axis in value)
+    if len(set(value)) < len(value):
+        raise problem(f"must hold each of x, y, z once, not {shown(value)}")
+    return tuple(value)
 
 
 class Parameter(Block):
@@ -152,7 +154,7 @@ class Quantity(Block):
     force : int or None
         Force [N] of a handle, by its number from 0, on the sheet.
     axes : tuple of "x", "y", "z" or None
-        Components of a probe or a force; without: all.
+        Components of a probe or a force, in the order of their values; without: all.
     at : float [s] or None
         When; in a static analysis a load factor. Without: at the end.
     """

@@ -284,10 +284,17 @@ _CURVE = {
 Curve = Annotated[Points, BeforeValidator(_curve), JsonSchema(_CURVE)]
 
 
+KES_CURVATURE, KES_ANGLE = 2.5, 8.0
+"""To which KES-F 2 bends [1/cm], and KES-F 1 shears [°]."""
+
+KES_RANGES = {"B": ((1e-4, 50.0), "gf·cm²/cm"), "G": ((1e-3, 100.0), "gf/(cm·degree)")}
+"""Wider than those of fabrics: numbers outside are in other units."""
+
+
 class KesReport(Block):
     """Numbers of a KES-F report as it prints them; each takes the place of the material's own.
 
-    One number, or two along warp and weft.
+    One number, or two along warp and weft. What no fabric has is refused: it is in other units.
 
     Attributes
     ----------
@@ -306,20 +313,34 @@ class KesReport(Block):
     G: Pair | None = None
     width_of_shear: Pair | None = Field(default=None, alias="2HG")
 
-    @field_validator("B", "G")
-    @classmethod
-    def _positive(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
-        if value is not None and min(value) <= 0.0:
-            raise problem(f"must be > 0, not {shown(min(value))}")
-        return value
+    @model_validator(mode="after")
+    def _of_a_fabric(self) -> Self:
+        for name, stiffness, loop, width, farthest in (
+            ("B", self.B, "2HB", self.width_of_bending, KES_CURVATURE),
+            ("G", self.G, "2HG", self.width_of_shear, KES_ANGLE),
+        ):
+            (least, most), unit = KES_RANGES[name]
+            for value in stiffness or ():
+                if not value > 0.0:
+                    raise problem(f"must be > 0, not {shown(value)}", name)
+                if not least <= value <= most:
+                    raise problem(f"must be {least:g} to {most:g} {unit} as of fabrics, not {value:g}", name)
+            for value, half in zip(width or (), stiffness or (), strict=False):
+                if value > 2.0 * farthest * half:
+                    raise problem(
+                        f"must be at most {2.0 * farthest:g} {name} = {2.0 * farthest * half:g}, "
+                        f"not {value:g}: no test goes far enough to see a wider loop",
+                        loop,
+                    )
+        return self
 
 
 class LawCurves(Block):
     """One's own measurements: force [N/m], per width at rest, by strain.
 
     Each is a file of two columns (commas, semicolons or blanks between), beside the scene file, or a list of
-    points. Both columns grow. A curve begins at (0, 0), goes on straight after its last point, and warp and
-    weft do so under compression. Nothing couples the three.
+    points. Strains are fractions, and both columns grow. A curve begins at (0, 0), goes on straight after its
+    last point, and warp and weft do so under compression. Nothing couples the three.
 
     Attributes
     ----------
@@ -366,6 +387,9 @@ def _needed(way: tuple[str, ...], key: str) -> Rule:
     ways = some(*way) if key != "membrane" else {"allOf": [some(*way), {"not": _BY_CURVES}]}
     return Rule(when(ways, given(key)), lambda m: f"missing (needed beside {m.given(*way)[0]})", key)
 
+
+_NO_SHEAR = 1.0
+"""c33 of what has G of a KES report, where it counts for nothing."""
 
 _FRICTION = {
     "anyOf": [
@@ -479,6 +503,26 @@ class Material(Block):
             )
             for name, key in (("B", "bending"), ("2HB", "friction_moment"), ("2HG", "friction_force"))
         ),
+        *(
+            Rule(
+                {"not": given("young", kes=given(name))},
+                f"has {name}, which young, poisson and thickness give, too; leave one of them out",
+                "kes",
+            )
+            for name in ("B", "G")
+        ),
+        *(
+            Rule(
+                {"not": given(kes=given("G"), **condition)},
+                f"kes has G, which takes the place of {what}; leave one of them out",
+                at,
+            )
+            for condition, what, at in (
+                ({"membrane": given(c33={"not": {"const": _NO_SHEAR}})}, "c33", "membrane.c33"),
+                ({"law": {"type": "object"}}, "the curve of shear", "law"),
+                ({"law": {"const": "neo-hookean"}}, "the shear modulus of neo-hookean", "law"),
+            )
+        ),
     )
     sometimes_filled = frozenset({"bending_model"})
 
@@ -511,7 +555,7 @@ class Material(Block):
             data = {"bending": 0.0, **data}
         membrane, kes = data.get("membrane"), data.get("kes")
         if isinstance(membrane, dict) and isinstance(kes, dict) and kes.get("G") is not None:
-            data["membrane"] = {"c33": 1.0, **membrane}  # which counts for nothing
+            data["membrane"] = {"c33": _NO_SHEAR, **membrane}
         isotropic = "young" in data or is_isotropic(data.get("cloth"))
         plate = isinstance(data.get("bending"), (dict, PlateStiffness))
         rubs = holds(_RUBS, data)

@@ -16,6 +16,8 @@ pytestmark = pytest.mark.quick
 
 SCENE = {"mesh": {"grid": {"width": 1.0, "height": 1.0, "nx": 1, "ny": 1}}, "time": {"end": 1.0, "step": 0.1}}
 NUMBERS = {"density": 0.2, "membrane": {"c11": 900.0, "c22": 800.0, "c12": 0.0}}
+SHEET = {"young": 1e6, "poisson": 0.3, "thickness": 1e-3}
+CURVES = {way: [[0.1, 10.0]] for way in ("warp", "weft", "shear")}
 REPORT = {"B": 0.1, "2HB": 0.05, "G": 0.6, "2HG": 1.5}
 
 
@@ -94,8 +96,17 @@ def test_a_scene_as_understood_is_the_same_scene(tmp_path: Any) -> None:
             "2HB of kes",
         ),
         ({"bending": 1e-5, "friction_moment": -1.0, "kes": {"G": 1.0}}, "must be >= 0"),
+        ({"kes": REPORT | {"B": 100.0}}, "kes.B: must be 0.0001 to 50 gf·cm²/cm as of fabrics, not 100"),
+        ({"kes": REPORT | {"B": [0.1, 1e-5]}}, "not 1e-05"),
+        ({"kes": REPORT | {"G": 500.0}}, "kes.G: must be 0.001 to 100"),
+        ({"kes": REPORT | {"2HB": 5.0}}, "kes.2HB: must be at most 5 B = 0.5, not 5"),
+        ({"kes": REPORT | {"2HG": 50.0}}, "kes.2HG: must be at most 16 G = 9.6"),
+        ({"membrane": {"c11": 9.0, "c22": 9.0, "c12": 0.0, "c33": 3.0}, "kes": REPORT}, "the place of c33"),
+        ({"membrane": None, "law": CURVES, "kes": REPORT}, "the place of the curve of shear"),
+        ({"membrane": None, **SHEET, "kes": {"B": 0.1}}, "has B, which young, poisson and thickness give"),
+        ({"membrane": None, **SHEET, "kes": {"G": 0.1}}, "has G, which young, poisson and thickness give"),
     ],
 )
 def test_what_contradicts_is_refused(keys: dict[str, Any], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        shell_of(**NUMBERS, **keys)
+        shell_of(**(NUMBERS | keys))

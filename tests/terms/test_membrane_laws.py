@@ -20,6 +20,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.materials.library import ShellMaterial, measured, resolve
+from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import LAWS, law_of
 from lyra_petsc.terms.membrane_laws.measured import fit_errors
@@ -164,9 +165,17 @@ def test_curves_are_met_at_their_points() -> None:
         assert law.stress(np.array([0.0, 0.3, -x]))[2] == pytest.approx(-force, rel=1e-12)
 
 
+def test_strains_that_may_be_percent_are_noted() -> None:
+    for strain, told in ((1.0, []), (5.0, ["strains up to 5; were they in percent"])):
+        law = CURVES | {"shear": [[0.1, 2.0], [strain, 20.0]]}
+        notes = resolve(checked(Material, {"density": 0.2, "law": law}, file=None))[1]
+        assert [words in note for words, note in zip(told, notes, strict=True)] == [True] * len(told)
+
+
 def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
     (tmp_path / "curves").mkdir()
-    (tmp_path / "curves" / "warp.csv").write_text("strain; N/m\n# KES\n0.01; 2\n\n0.03;10\n")
+    text = '\ufeff"strain"; "N/m"\n# KES\n"0.01"; 2\n\n0.03;10\n'
+    (tmp_path / "curves" / "warp.csv").write_text(text, encoding="utf-8")
     law = CURVES | {"warp": "curves/warp.csv"}
     scene = SCENE | {"mesh": {"grid": GRID}, "material": {"density": 0.2, "bending": 1e-5, "law": law}}
     (tmp_path / "scene.yaml").write_text(json.dumps(scene))
@@ -191,6 +200,11 @@ def test_curves_from_files_stand_in_the_scene(tmp_path: Path) -> None:
         ("0.1,5\n0.2,x\n", "line 2: must be two numbers"),
         ("0.1,5,6\n", "line 1: must be two numbers"),
         ("0.1,nan\n", "line 1: must be two numbers"),
+        ("strain;force\n0,01;5\n", "line 2: must be two numbers with decimal points"),
+        ("strain [%],force\n1,5\n", "heading says '%'; give strain as a fraction"),
+        ("0.1,5\n12,60\n", "line 2: strain 12 is 1200 %"),
+        ("1e-300,1e-300\n2e-300,5e300\n", "slopes that are no numbers"),
+        (2**18 * "0.1,5\n", "thin the curve out to at most 1000 points"),
         (None, "no such file"),
     ],
 )

@@ -38,8 +38,8 @@ class Fabric:
     block: dict[str, Any]
 
     def turned(self, degrees: float) -> dict[str, Any]:
-        """Its block for specimens whose length lies so to the warp."""
-        return self.block | {"warp_degrees": self.block.get("warp_degrees", 0.0) - degrees}
+        """Its block for specimens whose length lies so to the warp, however that lies in the scene."""
+        return self.block | {"warp_degrees": -degrees}
 
     def shell(self, degrees: float = 0.0) -> ShellMaterial:
         """Its constants, those of directions 1 and 2 exchanged at 90°."""
@@ -69,6 +69,7 @@ def _exchanged(shell: ShellMaterial) -> ShellMaterial:
     moments = shell.friction_moment
     return replace(
         shell,
+        curves=(*shell.curves[1::-1], *shell.curves[2:]),
         c11=shell.c22,
         c22=shell.c11,
         plate=(d22, d12, d11, d33),

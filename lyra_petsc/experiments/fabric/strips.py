@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,9 @@ from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.fabric.records import Curve, Number, Record
 from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
 from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.scene.materials.curves import force_at
+from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
@@ -38,18 +42,27 @@ def _number(quantity: str, value: float, unit: str) -> Number:
     return Number(quantity, float(value), unit)
 
 
-def _steps(trial: Trial) -> Iterator[float]:
-    """Load factors of all steps of a simulation, one after the other."""
-    while not trial.simulation.finished:
-        trial.step()
-        yield trial.simulation.time
-
-
-def _path(values: Sequence[float], **keys: Any) -> dict[str, Any]:
+def _path(values: Sequence[float]) -> dict[str, Any]:
     """Keys of a scene whose load factor goes through equal steps, one for each value but the first."""
     share = 1.0 / (len(values) - 1)
-    time = {"analysis": "static", "step": share}
-    return {"time": time, "petsc": {"ts_adapt_dt_max": share}} | keys
+    return {"time": {"analysis": "static", "step": share}, "petsc": {"ts_adapt_dt_max": share}}
+
+
+@contextmanager
+def _through(
+    bench: Bench, content: dict[str, Any], values: Sequence[float]
+) -> Iterator[Iterator[SteppedScene]]:
+    """The simulation of a scene at each of these values but the first, also where it takes shorter steps."""
+    factors = [k / (len(values) - 1) for k in range(1, len(values))]
+
+    def steps(trial: Trial) -> Iterator[SteppedScene]:
+        for factor in factors:
+            while trial.simulation.time < factor - 1e-9:
+                trial.step()
+            yield trial.simulation
+
+    with bench.simulation(content | _path(values), land=factors[:-1]) as trial:
+        yield steps(trial)
 
 
 def _to_and_fro(largest: float, steps: int, *, closed: bool) -> list[float]:
@@ -92,11 +105,18 @@ FAR = 100.0 * GAUGE
 """Length [m] of springs that pull with a constant force"""
 
 
+def _pull(shell: ShellMaterial, strain: float) -> float:
+    """Force [N/m] of a strip that cannot contract, by its curve or St. Venant-Kirchhoff."""
+    if shell.curves:
+        return shell.stretching * force_at(shell.curves[0], strain)
+    return shell.c11 * (1.0 + strain) * 0.5 * ((1.0 + strain) ** 2 - 1.0)
+
+
 def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     """20 cm × 5 cm between clamps, pulled to 500 gf/cm: EMT, WT, LT."""
     shell, record = fabric.shell(degrees), Record()
-    strain = 0.01  # where St. Venant-Kirchhoff's has the full load
-    while shell.c11 * (1.0 + strain) * 0.5 * ((1.0 + strain) ** 2 - 1.0) < FULL_LOAD and strain < LONGEST:
+    strain = 0.01
+    while _pull(shell, strain) < FULL_LOAD and strain < LONGEST:
         strain *= 1.02
     path = [1.1 * strain * (k / PULLS) ** 1.5 for k in range(PULLS + 1)]
     frames = [{"time": k / PULLS, "translate": [e * GAUGE, 0.0, 0.0]} for k, e in enumerate(path)]
@@ -109,12 +129,12 @@ def tensile(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             {"group": "sheet", "axes": ["z"]},
         ],
         motions={"pull": frames},
-    ) | _path(path)
+    )
     strains, forces = [0.0], [0.0]
-    with bench.simulation(content) as trial:
-        for _ in _steps(trial):
+    with _through(bench, content, path) as steps:
+        for simulation in steps:
             strains.append(path[len(strains)])
-            forces.append(abs(trial.simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
+            forces.append(abs(simulation.ledger.handle_forces(3)[0][0]) / CLAMPED)
             if forces[-1] >= FULL_LOAD:
                 break
     record.curves = [
@@ -150,8 +170,8 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     direction, and has the part T tan φ of the force; G and the widths of the loop are those of the rest.
     """
     record, shell = Record(), fabric.shell()
-    rubs, steps, cells = shell.friction_force > 0.0, 16, 40
-    path = [0.0, *_to_and_fro(SHEARED, steps, closed=rubs)]  # the first step is of the tension
+    rubs, rise, cells = shell.friction_force > 0.0, 16, 40
+    path = [0.0, *_to_and_fro(SHEARED, rise, closed=rubs)]  # the first step is of the tension
     share, width = 1.0 / (len(path) - 1), WIDE / cells
     frames = [
         {"time": k * share, "translate": [GAUGE * math.tan(math.radians(a)), 0.0, 0.0]}
@@ -179,17 +199,17 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             "shear": frames,
             "tension": [{"time": 0.0}, {"time": share, "translate": [0.0, FAR, 0.0]}],
         },
-    ) | _path(path)
+    )
     forces = [0.0]
-    with bench.simulation(content) as trial:
-        for _ in _steps(trial):
-            force = trial.simulation.ledger.handle_forces(5)[0][0]
+    with _through(bench, content, path) as steps:
+        for simulation in steps:
+            force = simulation.ledger.handle_forces(5)[0][0]
             forces.append(-float(force) / (len(middle) * width))
     angles, told = path[1 : len(forces)], [f / GF_PER_CM for f in forces[1:]]
     record.curves = [Curve("shear", "angle [°]", "force [gf/cm]", angles, told)]
     pull = TENSION / GF_PER_CM
     left = [f - pull * math.tan(math.radians(angle)) for f, angle in zip(told, angles, strict=True)]
-    up, down = _branches(angles, left, steps)
+    up, down = _branches(angles, left, rise)
     stiffness = 0.5 * sum((f(2.5 * s) - f(0.5 * s)) / (2.0 * s) for f, s in ((up, 1), (down, -1)))
     record.numbers = [_number("G", stiffness, "gf/(cm·°)")]
     if shell.law != "measured" and not shell.curves:
@@ -239,9 +259,9 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     for being a little longer than its arc, is no part of it.
     """
     fabric.needs_bending("bending")
-    shell, record, cells, steps = fabric.shell(degrees), Record(), 20, 10
+    shell, record, cells, rise = fabric.shell(degrees), Record(), 20, 10
     limit = shell.friction_moment[0]
-    path = _to_and_fro(CURVED, steps, closed=limit > 0.0)
+    path = _to_and_fro(CURVED, rise, closed=limit > 0.0)
     share, width = 1.0 / (len(path) - 1), LENGTH / cells
     content = _scene(
         _grid(LENGTH, width, cells, 1),
@@ -252,17 +272,17 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
             *({"group": side, "symmetry": "y"} for side in ("bottom", "top")),  # 20 cm are wide
         ],
         motions={"chuck": [{"time": k * share, **_chuck(kappa)} for k, kappa in enumerate(path)]},
-    ) | _path(path)
+    )
     moments = [0.0]
-    with bench.simulation(content) as trial:
-        for _ in _steps(trial):
-            ledger, kappa = trial.simulation.ledger, path[len(moments)]
+    with _through(bench, content, path) as steps:
+        for simulation in steps:
+            ledger, kappa = simulation.ledger, path[len(moments)]
             force, moment = ledger.handle_forces(4)[1], float(ledger.handle_moments()[1][1])
             moments.append((np.dot(force, _moves(kappa)) / LENGTH - moment) / width)
     told = [float(m) / (1e-2 * GF_PER_CM) for m in moments]  # gf·cm/cm
     curvature = [1e-2 * kappa for kappa in path]
     record.curves = [Curve("bending", "curvature [1/cm]", "moment [gf·cm/cm]", curvature, told)]
-    up, down = _branches(curvature, told, steps)
+    up, down = _branches(curvature, told, rise)
     stiffness = 0.5 * ((up(1.5) - up(0.5)) + (down(-0.5) - down(-1.5)))
     record.numbers = [_number("B", stiffness, "gf·cm²/cm")]
     record.claim("B", stiffness, shell.plate[0] / (1e-4 * GF_PER_CM), 0.01)

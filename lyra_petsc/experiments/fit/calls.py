@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,17 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.api.scenes import SceneLike, load
-from lyra_petsc.errors import in_python
+from lyra_petsc.errors import InputError, in_python
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
-from lyra_petsc.experiments.fit.readings import reading_of
+from lyra_petsc.experiments.fit.readings import readings_without_values
 from lyra_petsc.experiments.fit.work import FIT, Fitted, fit_scene
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.fit_block import Quantity
 from lyra_petsc.scene.messages import checked
+from lyra_petsc.scene.overrides import plain
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import shown
 
 Array = NDArray[np.float64]
 
@@ -77,26 +80,47 @@ def gradient(
     comm = MPI.COMM_WORLD if comm is None else comm
     with in_python():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
-        asked = {"probe": quantity} if isinstance(quantity, str) else dict(quantity)
 
         def prepare() -> Any:
-            keys = list(parameters)
-            check_keys(loaded, keys, at="parameters")
-            block = checked(Quantity, asked, file=None, context={"directory": Path.cwd()})
-            given = dict(parameters) if isinstance(parameters, Mapping) else {}
-            values = {
-                key: float(given[key]) if key in given else value_of(loaded, key, at="parameters")
-                for key in keys
-            }
-            return reading_of(loaded, block), values
+            values = _values(loaded, parameters)
+            return readings_without_values(loaded, _quantity(quantity)), values
 
-        reading, values = on_root(comm, prepare)
+        readings, values = on_root(comm, prepare)
         sizes = {key: abs(value) or 1.0 for key, value in values.items()}
-        model = Model(comm, loaded, sizes, [reading])
+        model = Model(comm, loaded, sizes, readings)
         found = model.evaluate(list(values.values()))
         assert found.jacobian is not None
         columns = dict(zip(values, found.jacobian.T, strict=True))
         return Gradient(tuple(model.labels), found.values, columns)
+
+
+def _quantity(quantity: Any) -> Quantity:
+    asked = {"probe": quantity} if isinstance(quantity, str) else quantity
+    try:
+        return checked(Quantity, asked, file=None, context={"directory": Path.cwd()})
+    except InputError as error:
+        key = ".".join(part for part in ("quantity", error.key) if part)
+        raise InputError(error.message, key=key) from None
+
+
+def _values(scene: Scene, parameters: Any) -> dict[str, float]:
+    """The numbers by their keys, those that are given and those of the scene."""
+    whole = isinstance(parameters, str) or not isinstance(parameters, Iterable)
+    keys = [] if whole else list(dict.fromkeys(parameters))
+    if not keys or not all(isinstance(key, str) for key in keys):
+        raise InputError(
+            f"must be keys as in ['material.bending'], not {shown(parameters)}", key="parameters"
+        )
+    check_keys(scene, keys, at="parameters")
+    given = parameters if isinstance(parameters, Mapping) else {}
+    values = {}
+    for key in keys:
+        value = plain(given[key]) if key in given else value_of(scene, key, at="parameters")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"must be a number, not {shown(value)}", key=f"parameters.{key}")
+        values[key] = float(value)
+    scene.changed(values)
+    return values
 
 
 def fit(
@@ -134,6 +158,8 @@ def fit(
     with in_python():
         loaded = on_root(comm, lambda: load(scene, trust_mesh=trust_mesh))
         if out is None:
+            if resume:
+                raise InputError("needs the folder, out, that holds evaluations", key="resume")
             return fit_scene(comm, loaded)
         choice = choose(comm, "scene", out, force=force, resume=resume, kind=FIT)
         with RunDirectory(comm, choice) as directory:

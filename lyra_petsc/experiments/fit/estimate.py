@@ -38,6 +38,10 @@ NEAR = 0.5
 STALLED = 1e-7
 """Relative change of all numbers below which the search ends, too."""
 
+IDLE, LITTLE = 8, 5e-3
+"""Evaluations after which a search that is near ends, too, if the cost has fallen by less: where a sheet
+buckles to one side or the other the cost jumps, and a line search may not find its way."""
+
 MOST_ITERATIONS = 40
 
 NOTHING, UNSEEN = 1e-9, 1e-6
@@ -140,6 +144,10 @@ class Conclusion:
 Evaluate = Callable[[Array], Trial]
 
 
+class _IdleError(Exception):
+    """Ends a search that is near."""
+
+
 def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]:
     """The trial with the least cost, and why the search ended, in words; the same on every rank.
 
@@ -162,10 +170,18 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
     known: dict[bytes, Trial] = {}
     failure: list[BaseException] = []
 
+    def idle() -> bool:
+        costs = [trial.cost for trial in known.values()]
+        if len(costs) <= IDLE or min(costs[:-IDLE]) - min(costs) >= LITTLE:
+            return False
+        return _step(min(known.values(), key=lambda trial: trial.cost), low, high) <= NEAR
+
     def at(y: PETSc.Vec) -> Trial:
         numbers = np.clip(np.array(y.getArray(readonly=True)) * size, low, high)
         key = numbers.tobytes()
         if key not in known:
+            if idle():
+                raise _IdleError
             try:
                 known[key] = evaluate(numbers)
             except BaseException as error:
@@ -241,6 +257,8 @@ def search(unknowns: Sequence[Unknown], evaluate: Evaluate) -> tuple[Trial, str]
             tao.setConvergenceTest(ended)
         tao.solve()
         reason = int(tao.getConvergedReason())
+    except _IdleError:
+        reason = int(PETSc.TAO.Reason.CONVERGED_USER)
     except PETSc.Error as error:
         if failure:
             raise failure[0] from None
@@ -318,12 +336,12 @@ def conclude(unknowns: Sequence[Unknown], trial: Trial) -> Conclusion:
     low, high = (np.array([getattr(u, name) for u in unknowns]) for name in ("low", "high"))
     held = _held(trial.numbers, trial.jacobian.T @ trial.residuals, low, high)
     scaled = trial.jacobian * size
-    _, values, directions = np.linalg.svd(scaled, full_matrices=True)
+    _, values, directions = np.linalg.svd(scaled, full_matrices=m < n)
     values = np.concatenate([values, np.zeros(n - len(values))])
     covariance = np.full((n, n), np.nan)
     free = np.flatnonzero(~held)
     if len(free):
-        _, own, across = np.linalg.svd(scaled[:, free], full_matrices=True)
+        _, own, across = np.linalg.svd(scaled[:, free], full_matrices=m < len(free))
         own = np.concatenate([own, np.zeros(len(free) - len(own))])
         with np.errstate(divide="ignore"):
             inverse = np.where(own > 1e-12 * own[0], 1.0 / own, 1e12 / max(own[0], 1e-300))

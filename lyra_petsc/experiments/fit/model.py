@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import simulated
 from lyra_petsc.experiments.case import Watch
-from lyra_petsc.experiments.fit.readings import HandleForce, Reading, instants
+from lyra_petsc.experiments.fit.readings import SAME_TIME, HandleForce, Reading, instants
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.parallel import on_root
@@ -36,8 +37,7 @@ CHOICES = frozenset({"group", "nodes", "box", "from", "until", "fade", "seed", "
 WHOLE_RUNS = 1e-3
 """Change over the number's size of runs whose difference is a derivative, with contact or friction."""
 
-SAME_TIME = 1e-9
-"""Part of the run by which a step may miss a measurement's time."""
+_PART = re.compile(r"[^.\[\]\s]+(\[\d+\])*")
 
 Progress = Callable[[float], None]
 """Is told which part of an evaluation is done."""
@@ -219,13 +219,24 @@ def _scaled(progress: Progress, done: int, count: int, part: float) -> None:
 
 
 def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
-    """Refuse what is no number of the scene that can be varied.
+    """Refuse what is no number of the scene that can be varied, or the same number twice.
 
     Raises
     ------
     InputError
     """
+    names: dict[tuple[str, ...], str] = {}
     for key in keys:
+        if not all(map(_PART.fullmatch, key.split("."))):
+            raise InputError(
+                "is no key of a scene; write it as in handles[0].stiffness",
+                file=scene.source,
+                key=f"{at}.{key}",
+            )
+        if (other := names.setdefault(tuple(_parts(key)), key)) != key:
+            raise InputError(
+                f"is the number {other}; leave one of them out", file=scene.source, key=f"{at}.{key}"
+            )
         root = key.split(".")[0].split("[")[0]
         if root not in ROOTS:
             raise InputError(
@@ -242,6 +253,14 @@ def check_keys(scene: Scene, keys: Sequence[str], *, at: str) -> None:
             )
 
 
+def _parts(key: str) -> list[str]:
+    """Where a key leads; ``material`` may stand for the first of a list."""
+    parts = key.replace("[", ".").replace("]", "").split(".")
+    if parts[0] == "material" and not (len(parts) > 1 and parts[1].isdecimal()):
+        parts.insert(1, "0")
+    return parts
+
+
 def value_of(scene: Scene, key: str, *, at: str) -> float:
     """The number that a scene has at a key.
 
@@ -251,10 +270,7 @@ def value_of(scene: Scene, key: str, *, at: str) -> float:
         If there is none.
     """
     target: Any = scene
-    parts = key.replace("[", ".").replace("]", "").split(".")
-    if parts[0] in ("material", "mesh") and not (len(parts) > 1 and parts[1].isdecimal()):
-        parts.insert(1, "0")
-    for part in parts:
+    for part in _parts(key):
         if target is None:
             break
         if part.isdecimal() and isinstance(target, (list, tuple)):

@@ -28,6 +28,10 @@ Ints = NDArray[np.int64]
 
 AXES = ("x", "y", "z")
 LARGEST_TABLE = 2**26
+MOST_ROWS = 100_000
+
+SAME_TIME = 1e-9
+"""Part of the run by which a step may miss a measurement's time."""
 
 
 @dataclass
@@ -199,30 +203,48 @@ def readings_of(scene: Scene, measurements: Sequence[Measurement]) -> list[Readi
     found: list[Reading] = []
     for number, measurement in enumerate(measurements):
         key = f"fit.measurements[{number}]"
+        if measurement in measurements[:number]:
+            raise InputError(
+                f"is fit.measurements[{measurements.index(measurement)}] again; leave one of them out",
+                file=scene.source,
+                key=key,
+            )
         try:
             found += _readings(scene, measurement, key)
         except InputError as error:
             if error.key is None:
                 raise InputError(str(error), key=key) from None
             raise
+    _refuse_times(scene, found)
+    return found
+
+
+def _refuse_times(scene: Scene, readings: Sequence[Reading]) -> None:
     end = scene.time.end
-    for reading in found:
-        if not 0.0 < reading.time <= end * (1.0 + 1e-9):
+    for reading in readings:
+        if not SAME_TIME * end < reading.time <= end * (1.0 + SAME_TIME):
             what = "load factor" if scene.time.analysis == "static" else "time"
             raise InputError(
                 f"measures at {what} {reading.time:g}, but the scene ends at {end:g}; times are > 0",
                 file=scene.source,
                 key=reading.key,
             )
-    return found
 
 
-def reading_of(scene: Scene, quantity: Quantity, key: str = "quantity") -> Reading:
-    """A quantity without values."""
+def readings_without_values(scene: Scene, quantity: Quantity, key: str = "quantity") -> list[Reading]:
+    """A quantity that was not measured, at one time, or at those of its table (one rank).
+
+    Raises
+    ------
+    InputError
+        As `readings_of`.
+    """
     if quantity.points is not None:
-        table = _Table(quantity.points)
-        return _points(scene, table, key, quantity.at, None)[0]
-    return _made(scene, quantity, key, quantity.at or scene.time.end)
+        found = _points(scene, _Table(quantity.points), key, quantity.at, 1.0)
+    else:
+        found = [_made(scene, quantity, key, quantity.at or scene.time.end)]
+    _refuse_times(scene, found)
+    return found
 
 
 def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]:
@@ -245,16 +267,19 @@ def _readings(scene: Scene, measurement: Measurement, key: str) -> list[Reading]
         return [reading]
     table = _Table(measurement.table)
     one = _made(scene, measurement, key, scene.time.end)
+    table.refuse_others("time", "uncertainty", *(AXES if measurement.axes else one.parts))
     names = ["time", *one.parts]
-    if measurement.uncertainty is None:
+    if measurement.uncertainty is None or "uncertainty" in table.names:
         names.append("uncertainty")
     columns = table.numbers(names)
     found = []
     for row, time in enumerate(columns["time"]):
         reading = _made(scene, measurement, key, float(time))
         reading.measured = np.array([columns[part][row] for part in one.parts])
-        sigma = columns["uncertainty"][row] if measurement.uncertainty is None else measurement.uncertainty
-        reading.uncertainty = np.full(len(one.parts), _positive(table, row, float(sigma)))
+        sigma = measurement.uncertainty
+        if sigma is None or "uncertainty" in columns:
+            sigma = _positive(table, row, float(columns["uncertainty"][row]))
+        reading.uncertainty = np.full(len(one.parts), sigma)
         found.append(reading)
     return found
 
@@ -305,6 +330,8 @@ class _Table:
         kept = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
         if len(kept) < 2:
             raise InputError("must hold a line with the names of columns, and lines of numbers", file=path)
+        if len(kept) - 1 > MOST_ROWS:
+            raise InputError(f"holds {len(kept) - 1} lines; thin it out to at most {MOST_ROWS}", file=path)
         heading = kept[0][1]
         sign = next((sign for sign in ";\t" if sign in heading), ",")
         try:  # each line by itself: quotes do not reach beyond it
@@ -322,6 +349,21 @@ class _Table:
                 raise InputError(
                     f"line {line} has {len(row)} columns, the heading {len(self.names)}", file=path
                 )
+        first: dict[tuple[str, ...], int] = {}
+        for line, row in zip(self.lines, self.rows, strict=True):
+            if first.setdefault(tuple(row), line) != line:
+                raise InputError(f"line {line} is line {first[tuple(row)]} again; leave it out", file=path)
+
+    def refuse_others(self, *known: str) -> None:
+        """Refuse columns that are none of these.
+
+        Raises
+        ------
+        InputError
+        """
+        for name in self.names:
+            if name not in known:
+                raise InputError(f"unknown column {name!r}, {nearest(name, known)}", file=self.path)
 
     def numbers(self, names: Sequence[str]) -> Mapping[str, Array]:
         """Columns of numbers.
@@ -374,6 +416,8 @@ def _points(
         raise InputError("has none of the columns x, y, z", file=table.path)
     columns = table.numbers(names)
     whats: list[str | int] = []
+    if "vertex" in table.names and "probe" in table.names:
+        raise InputError("has columns 'vertex' and 'probe'; leave one out", file=table.path)
     if "vertex" in table.names:
         for row, number in enumerate(table.numbers(["vertex"])["vertex"]):
             if number != int(number):
@@ -390,6 +434,7 @@ def _points(
             f"has neither a column 'vertex' nor 'probe'; its columns are {', '.join(table.names)}",
             file=table.path,
         )
+    table.refuse_others("vertex", "probe", "time", "uncertainty", *AXES)
     if "uncertainty" in table.names:
         sigmas = table.numbers(["uncertainty"])["uncertainty"]
     elif uncertainty is not None:
@@ -398,6 +443,8 @@ def _points(
         raise InputError("has no column 'uncertainty'; add it, or give uncertainty", file=table.path, key=key)
     times = np.full(len(whats), at or scene.time.end)
     if "time" in table.names:
+        if at is not None:
+            raise InputError("has a column time; leave at out", file=table.path, key=key)
         times = table.numbers(["time"])["time"]
     found: list[Reading] = []
     axes = tuple(AXES.index(name) for name in names)

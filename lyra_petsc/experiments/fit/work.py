@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 TRIALS_FILE = "trials.json"
 
+FARTHEST = 1e8
+"""Uncertainties by which a start may miss a measurement: beyond, rounding errors of a simulation count."""
+
 
 def _resumable(folder: Path) -> list[Path]:
     """The evaluations from which a fit can go on."""
@@ -235,7 +238,9 @@ def fit_scene(
                 Trial(numbers, (found.values - target) / sigma, found.jacobian / sigma[:, None])
             )
             shapes[numbers.tobytes()] = model.shape
-            refuse_idle(unknowns, trial, scene.source)
+            if number == 1:
+                refuse_idle(unknowns, trial, scene.source)
+                _refuse_far(model.readings, trial, scene)
             if folder is not None:
                 kept.trials.append(trial)
                 on_root(comm, lambda: save_record(folder / TRIALS_FILE, kept))
@@ -262,6 +267,19 @@ def fit_scene(
         model.runs,
         time.monotonic() - began,
     )
+
+
+def _refuse_far(readings: Sequence[Reading], trial: Trial, scene: Scene) -> None:
+    """Refuse measurements whose squares are no numbers, or leave none to all others."""
+    keys = [reading.key for reading in readings for _ in reading.parts]
+    worst = int(np.argmax(np.abs(trial.residuals)))
+    if not abs(trial.residuals[worst]) < FARTHEST:
+        raise InputError(
+            f"is missed by {abs(trial.residuals[worst]):.2g} uncertainties; check value and uncertainty, "
+            "and their units",
+            file=scene.source,
+            key=keys[worst],
+        )
 
 
 def _fingerprint(scene: Scene, target: Array, sigma: Array) -> str:

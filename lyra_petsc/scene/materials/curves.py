@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,11 +22,20 @@ Place = tuple[str, float, float]
 MOST_POINTS = 1000
 """Of a curve: every triangle looks its strain up in them."""
 
+LARGEST_FILE = 2**20
+"""Bytes."""
+
+LARGEST_STRAIN = 10.0
+"""What is more was meant in percent, or as an angle."""
+
+OTHER_UNITS = ("%", "°", "gf", "/cm", "/mm")
+"""Of headings."""
+
 
 def read_curve(path: Path) -> list[Place]:
     """What the lines of a file hold: strain and force, with commas, semicolons or blanks between.
 
-    A first line without numbers is a heading, what follows # a comment.
+    A first line without numbers is a heading, what follows # a comment; quotes are left out.
 
     Raises
     ------
@@ -33,20 +43,33 @@ def read_curve(path: Path) -> list[Place]:
         If it cannot be read, or a line has not two numbers.
     """
     found: list[Place] = []
-    for number, line in enumerate(read_text(path, largest=2**20).splitlines(), start=1):
-        columns = line.split("#")[0].replace(";", " ").replace(",", " ").split()
+    if path.is_file() and path.stat().st_size > LARGEST_FILE:
+        raise InputError(f"is too large; thin the curve out to at most {MOST_POINTS} points", file=path)
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        columns = re.sub("[;,\"']", " ", line.split("#")[0]).split()
         try:
             strain, force = map(float, columns)
             if not math.isfinite(strain + force):
                 raise ValueError
         except ValueError:
             if not columns or (not found and columns[0][0].isalpha()):
+                _refuse_units(line, path)
                 continue
             raise InputError(
-                f"{path}, line {number}: must be two numbers, strain and force [N/m], not {cut(line)!r}"
+                f"{path}, line {number}: must be two numbers with decimal points, strain and force [N/m], "
+                f"not {cut(line)!r}"
             ) from None
         found.append((f"{path}, line {number}", strain, force))
     return found
+
+
+def _refuse_units(heading: str, path: Path) -> None:
+    for unit in OTHER_UNITS:
+        if unit in heading:
+            raise InputError(
+                f"{path}: its heading says {unit!r}; give strain as a fraction (0.05, not 5 %), "
+                "force in N/m, and name no other units"
+            )
 
 
 def checked_points(points: list[Place], whole: str = "the curve") -> Points:
@@ -57,10 +80,9 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
     InputError
         Naming the first place where strain or force does not grow.
     """
-    if not points or len(points) > MOST_POINTS:
-        raise InputError(
-            f"{whole} has {len(points)} points; give 1 to {MOST_POINTS} (beside that at no strain)"
-        )
+    count = sum(strain != 0.0 for _, strain, _ in points)
+    if not points or count > MOST_POINTS:
+        raise InputError(f"{whole} has {count} points; give 1 to {MOST_POINTS} (beside that at no strain)")
     where, strain, force = points[0]
     if strain == 0.0 and force != 0.0:
         raise InputError(f"{where}: no strain has no force; take {force:g} N/m from all forces")
@@ -79,7 +101,30 @@ def checked_points(points: list[Place], whole: str = "the curve") -> Points:
                     f"{place}: {what} {after:g} is not more than {before:g} before it; sort by strain and "
                     "leave out or smooth what does not grow"
                 )
-    return tuple((x, y) for _, x, y in points)
+    place, strain, _ = points[-1]
+    if strain > LARGEST_STRAIN:
+        raise InputError(
+            f"{place}: strain {strain:g} is {100.0 * strain:g} %; give fractions, as 0.05 for 5 %"
+        )
+    found = tuple((x, y) for _, x, y in points)
+    with np.errstate(all="ignore"):
+        if not np.isfinite(interpolation(found)).all():
+            raise InputError(f"{whole} has slopes that are no numbers; points are too near one another")
+    return found
+
+
+def force_at(points: Points, strain: float) -> float:
+    """Force [N/m] of a curve at a strain >= 0."""
+    rows = interpolation(points)
+    i = min(int(np.searchsorted(rows[:, 0], strain)), len(rows)) - 1
+    if i + 1 == len(rows):
+        x, y, slope, _ = rows[-1]
+        return float(y + slope * (strain - x))
+    (x0, y0, d0, _), (x1, y1, d1, _) = rows[max(i, 0) : max(i, 0) + 2]
+    h = x1 - x0
+    t = (strain - x0) / h
+    rise = (1.0 - t) ** 2 * h * d0 - t * (1.0 - t) * h * d1 + t * (3.0 - 2.0 * t) * (y1 - y0)
+    return float(y0 + t * rise)
 
 
 def interpolation(points: Points) -> Array:

@@ -252,6 +252,9 @@ def resolve(
         curves = material.law.warp, material.law.weft, material.law.shear
         c11, c22, c33 = (float(interpolation(points)[0, 2]) for points in curves)
         shell = replace(shell, c11=c11, c12=0.0, c22=c22, c33=c33, curves=curves)
+        strain = max(points[-1][0] for points in curves)
+        if strain > 1.0:
+            notes.append(f"{key}.law: strains up to {strain:g}; were they in percent, give fractions")
     shell = _scaled(_with_friction(shell, material), material)
     if max(shell.friction_moment) > 0.0 and not shell.bends_by(shell.model):
         raise InputError(

@@ -16,6 +16,7 @@ from lyra_petsc.experiments.fabric import strips
 from lyra_petsc.experiments.fabric.records import FabricCase, outcome_of, restore, save
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
+from lyra_petsc.scene.materials.curves import force_at
 
 FABRIC = Fabric(
     "fabric",
@@ -31,8 +32,9 @@ FABRIC = Fabric(
 @pytest.mark.parallel
 def test_the_cantilever_gives_b_back(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strips, "CELLS", 30)
+    bias = Fabric("fabric", FABRIC.block | {"warp_degrees": 30.0})  # where it lies in the scene
     with Bench(comm) as bench:
-        record = strips.cantilever(bench, FABRIC, 90.0)
+        record = strips.cantilever(bench, bias, 90.0)
     assert record.verdicts["B"].passed, record.verdicts
     found = {number.quantity: number.value for number in record.numbers}
     assert found["B"] == pytest.approx(5.0, rel=5e-3)  # µN·m, of the weft
@@ -60,6 +62,32 @@ def test_shear_and_tension() -> None:
     emt = pulled.numbers[0].value / 100.0
     # (1 + e) c22 E of a strip that cannot contract
     assert 800.0 * (1.0 + emt) * 0.5 * ((1.0 + emt) ** 2 - 1.0) == pytest.approx(490.3, rel=0.02)
+
+
+def test_tension_gives_a_curve_back() -> None:
+    """Also one that softens beyond what its slope at rest would let expect, and that of the weft alone."""
+    curve = [[e, 600.0 * (1.0 - np.exp(-e / 0.02))] for e in (0.001, 0.004, 0.01, 0.03, 0.08, 0.2, 0.5)]
+    law = {"warp": [[0.1, 50.0]], "weft": curve, "shear": [[0.1, 5.0]]}
+    soft = Fabric("soft", {"density": 0.2, "bending": 1e-5, "bending_model": "midedge", "law": law})
+    with Bench(MPI.COMM_SELF) as bench:
+        found = strips.tensile(bench, soft, 90.0)
+    assert found.curves[0].y[-1] >= 500.0
+    points = tuple((0.0 + x, 0.0 + y) for x, y in [(0.0, 0.0), *curve])
+    forces = [force_at(points, x / 100.0) / 0.980665 for x in found.curves[0].x]
+    assert found.curves[0].y == pytest.approx(forces, rel=1e-9)
+    assert [force_at(points, x) for x, _ in points] == pytest.approx([y for _, y in points])
+
+
+def test_shorter_steps_do_not_shift_the_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where steps fail and are taken again."""
+    with Bench(MPI.COMM_SELF) as bench:
+        exact = strips.tensile(bench, FABRIC, 0.0)
+        steps, path = bench.steps, strips._path
+        monkeypatch.setattr(strips, "_path", lambda values: path([0.0] * (2 * len(values) + 5)))
+        again = strips.tensile(bench, FABRIC, 0.0)
+        assert bench.steps > 3 * steps
+    assert again.curves[0].x == exact.curves[0].x
+    assert again.curves[0].y == pytest.approx(exact.curves[0].y, rel=1e-6)
 
 
 @pytest.mark.parametrize("test", ["bending", "cantilever", "shear", "loop"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,6 +34,7 @@ STRIP: dict[str, Any] = {
     "petsc": {"snes_max_it": 50},
 }
 
+BENDING_KEY = ["material.bending"]
 BENDING = {"material.bending": {"start": 2e-5, "bounds": [1e-6, 1e-3]}}
 
 
@@ -113,6 +115,25 @@ def test_search_and_conclusion(kind: str) -> None:
     assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / deviation[0] / deviation[1])
 
 
+def test_a_search_ends_beside_a_jump() -> None:
+    """A sheet that buckles to the other side has no least cost where TAO looks for it."""
+    rng = np.random.default_rng(5)
+    matrix, right = rng.standard_normal((40, 2)), rng.standard_normal(40)
+    best = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    matrix, right, made = np.vstack([matrix, [0.0, 0.0]]), np.append(right, 0.0), []
+
+    def jumps(numbers: np.ndarray) -> Trial:
+        made.append(numbers)
+        missed = matrix @ numbers - right
+        missed[-1] = 9.0 * (numbers[0] > best[0] - 0.04)
+        return Trial(numbers, missed, matrix)
+
+    found, words = search([Unknown("a", best[0] - 0.1, -9.0, 9.0), Unknown("b", best[1], -9.0, 9.0)], jumps)
+    assert words.startswith("the search ended")
+    assert best[0] - 0.1 < found.numbers[0] <= best[0] - 0.04
+    assert len(made) < 40
+
+
 def test_bound_and_what_is_not_told() -> None:
     matrix = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
     right = np.array([1.0, 2.0, 5.0, 10.0])
@@ -170,6 +191,15 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"measurements": [{"force": 1, "value": 1, "uncertainty": 1}]}, "has 1 handles"),
         ({"measurements": [{"probe": "tip", "value": 1, "uncertainty": 1}]}, "must hold 3 numbers"),
         ({"measurements": [{"probe": "tip", "at": 2, "value": [0, 0, 0], "uncertainty": 1}]}, "ends at 1"),
+        ({"measurements": [{"probe": "tip", "at": 1e-14, "value": [0, 0, 0], "uncertainty": 1}]}, "are > 0"),
+        ({"measurements": [{"probe": "tip", "axes": ["z", "z"], "value": 0, "uncertainty": 1}]}, "once"),
+        ({"measurements": 2 * [{"force": 0, "value": [0, 0, 0], "uncertainty": 1}]}, "measurements[0] again"),
+        (
+            {"measurements": [{"probe": "tip", "value": [0, 0, 0], "uncertainty": 1e-300}]},
+            "uncertainties; check",
+        ),
+        ({"parameters": BENDING | {"material[0].bending": BENDING["material.bending"]}}, "is the number"),
+        ({"parameters": {"material[0.bending": BENDING["material.bending"]}}, "is no key of a scene"),
         ({"measurements": [{"length": 1}]}, "unknown key"),
         ({"measurements": [{"points": "none.csv"}]}, "none.csv"),
         ({"table": "vertx,x\n1,0\n"}, "neither a column 'vertex' nor 'probe'"),
@@ -182,6 +212,10 @@ def test_goes_on_without_repeating(tmp_path: Path) -> None:
         ({"table": "vertex,x,x,uncertainty\n1,0,0,1\n"}, "two columns 'x'"),
         ({"table": 'vertex,x,uncertainty\n"1,0,1\n2,0,1\n'}, "line 2 has 1 columns"),
         ({"table": "vertex,x,uncertainty\n1,nan,1\n"}, "x must be a number"),
+        ({"table": "vertex,x,uncertainty\n1,0,1\n2,0,1\n1,0,1\n"}, "line 4 is line 2 again"),
+        ({"table": "vertex,probe,x,uncertainty\n1,tip,0,1\n"}, "columns 'vertex' and 'probe'"),
+        ({"table": "vertex,tme,x,uncertainty\n1,1,0,1\n"}, "unknown column 'tme', did you mean 'time'"),
+        ({"table": "vertex,x,uncertainty\n" + 100_001 * "1,0,1\n"}, "at most 100000"),
     ],
 )
 def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
@@ -202,10 +236,48 @@ def test_refuses(change: dict[str, Any], words: str, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_refuses_a_key_without_a_number() -> None:
-    content = STRIP | {"material": {"cloth": "gray-interlock"}}
-    with pytest.raises(InputError, match="no number that the scene gives"):
-        lyra_petsc.gradient(content, "tip", ["material.bending"])
+@pytest.mark.parametrize(
+    ("scene", "quantity", "parameters", "words"),
+    [
+        (
+            STRIP | {"material": {"cloth": "gray-interlock"}},
+            "tip",
+            BENDING_KEY,
+            "number that the scene gives",
+        ),
+        (5, "tip", BENDING_KEY, "scene: must be a file"),
+        (STRIP, 5, BENDING_KEY, "quantity: must be a block"),
+        (STRIP, {}, BENDING_KEY, "quantity: must have exactly one"),
+        (STRIP, {"probe": "tip", "at": 2.0}, BENDING_KEY, "quantity: measures at load factor 2"),
+        (STRIP, "tip", "material.bending", "parameters: must be keys as in"),
+        (STRIP, "tip", [], "parameters: must be keys as in"),
+        (STRIP, "tip", [5], "parameters: must be keys as in"),
+        (STRIP, "tip", {"material.bending": "1"}, "parameters.material.bending: must be a number"),
+        (STRIP, "tip", {"material.bending": -1.0}, "must be >= 0"),
+        (STRIP, "tip", [*BENDING_KEY, "material[0].bending"], "is the number material.bending"),
+    ],
+)
+def test_gradient_refuses(scene: Any, quantity: Any, parameters: Any, words: str) -> None:
+    with pytest.raises(InputError, match=re.escape(words)):
+        lyra_petsc.gradient(scene, quantity, parameters)
+
+
+def test_gradient_of_a_table_of_points(tmp_path: Path) -> None:
+    """At all its times; a table without values measured has no uncertainty."""
+    (tmp_path / "points.csv").write_text("time,probe,z\n0.5,tip,0\n1,tip,0\n")
+    found = lyra_petsc.gradient(STRIP, {"points": str(tmp_path / "points.csv")}, BENDING_KEY)
+    once = lyra_petsc.gradient(STRIP, {"probe": "tip", "axes": ["z"]}, BENDING_KEY)
+    assert found.value[1] == pytest.approx(once.value[0], rel=1e-4)
+    assert 0.0 > found.value[0] > found.value[1]
+
+
+def test_values_are_in_the_order_of_their_axes() -> None:
+    one, other = (
+        lyra_petsc.gradient(STRIP, {"probe": "tip", "axes": axes}, BENDING_KEY)
+        for axes in (["x", "z"], ["z", "x"])
+    )
+    assert one.labels == other.labels[::-1]
+    np.testing.assert_array_equal(one.value, other.value[::-1])
 
 
 def test_each_simulation_has_its_own_rows() -> None:
