@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.errors import SolverError
-from lyra_petsc.experiments.verification.cases.contacts import SLID, G, _slope
+from lyra_petsc.experiments.verification.cases.contacts import SLID, G, sheet_on_slope
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.load import load_scene
@@ -253,7 +253,7 @@ class Watch:
 def scene_of(name: str, friction: float = 0.9) -> Scene:
     """A reduced scene."""
     if name == "slope":
-        return Scene.model_validate(_slope(30.0, friction * math.tan(math.radians(30.0)), 2, SLID))
+        return Scene.model_validate(sheet_on_slope(30.0, friction * math.tan(math.radians(30.0)), 2, SLID))
     coarse = [f"mesh[{sheet}].grid.{n}=3" for sheet in range(20) for n in ("nx", "ny")]
     config, settings = {
         "drape": ("ball", ["mesh.grid.nx=20", "mesh.grid.ny=20", "time.step=0.01", "time.end=1"]),

@@ -25,11 +25,11 @@ from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import (
-    _cylinder,
-    _on,
-    _symmetric,
+    cylinder,
     open_cylinder_scene,
+    plane_box,
     slit_annulus_scene,
+    symmetric,
 )
 
 LOAD_STEPS = 15
@@ -38,7 +38,7 @@ LOAD_STEPS = 15
 def _part_of_cylinder(bench: Bench, cells: tuple[int, int], radius: float, length: float) -> dict[str, Any]:
     """The mesh of a quarter of its circumference, from the crown (x = 0) on."""
     flat, faces = rectangle(*cells, 1.0, 1.0, alternating=True)
-    vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, length)(flat[:, 0], flat[:, 1]))
+    vertices = np.column_stack(cylinder(radius, 0.5 * math.pi, length)(flat[:, 0], flat[:, 1]))
     return bench.mesh(vertices, faces)
 
 
@@ -55,7 +55,7 @@ def hemisphere(bench: Bench, n: int) -> dict[str, Any]:
     return scene(
         bench.mesh(vertices, faces),
         {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0},
-        handles=[*_symmetric("xy", 10.0), {"nodes": [n // 2], "axes": ["z"]}],
+        handles=[*symmetric("xy", 10.0), {"nodes": [n // 2], "axes": ["z"]}],
         loads=[{"nodes": [0], "force": [200.0, 0, 0]}, {"nodes": [n], "force": [0, -200.0, 0]}],
     )
 
@@ -72,7 +72,7 @@ def half_cylinder(bench: Bench, n: int) -> dict[str, Any]:
     return scene(
         mesh,
         {"young": 2.0685e7, "poisson": 0.3, "thickness": 0.03, "density": 1.0},
-        handles=[{"box": _on("y", length, radius), "clamp": True}, *_symmetric("xz", radius)],
+        handles=[{"box": plane_box("y", length, radius), "clamp": True}, *symmetric("xz", radius)],
         loads=[{"nodes": [0], "force": [0, 0, -1000.0]}],
     )
 
@@ -83,7 +83,7 @@ def diaphragms(bench: Bench, n: int) -> dict[str, Any]:
     return scene(
         mesh,
         {"young": 30e3, "poisson": 0.3, "thickness": 1.0, "density": 1.0},
-        handles=[{"box": _on("y", 100.0, 100.0), "axes": ["x", "z"]}, *_symmetric("xyz", 100.0)],
+        handles=[{"box": plane_box("y", 100.0, 100.0), "axes": ["x", "z"]}, *symmetric("xyz", 100.0)],
         loads=[{"nodes": [0], "force": [0, 0, -3000.0]}],
     )
 

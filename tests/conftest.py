@@ -123,6 +123,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = chosen
 
 
+def pytest_collection_finish() -> None:
+    """What has been imported stays: no later collection of garbage, one a parallel test, need look at it."""
+    gc.collect()
+    gc.freeze()
+
+
 def together(item: pytest.Item) -> bool:
     return WORLD.size > 1 and item.get_closest_marker("parallel") is not None
 

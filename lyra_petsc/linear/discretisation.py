@@ -43,32 +43,14 @@ def _far(x, origin, i, square):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _leaves(x, to, start, end, reach):  # type: ignore[no-untyped-def]
-    """Whether x are farther than ``reach`` from start, ``to`` from end, ``to`` from start, x from end."""
-    square, far = reach * reach, np.zeros(4, dtype=np.int64)
-    s = e = m = n = 0
+def _leaves(x, start, end, reach):  # type: ignore[no-untyped-def]
+    """Whether some of x are farther than ``reach`` from start, and from end."""
+    square, s, e = reach * reach, 0, 0
     for row in range(len(x)):  # without a way out, so that several are looked at together
         i = Index(row)
         s |= _far(x, start, i, square)
-        e |= _far(to, end, i, square)
-        m |= _far(to, start, i, square)
-        n |= _far(x, end, i, square)
-    far[0], far[1], far[2], far[3] = s, e, m, n
-    return far
-
-
-@cached()
-def _leaves_at(x, start, end, reach):  # type: ignore[no-untyped-def]
-    """The same where x and ``to`` are one."""
-    square, far = reach * reach, np.zeros(4, dtype=np.int64)
-    s = e = 0
-    for row in range(len(x)):
-        i = Index(row)
-        s |= _far(x, start, i, square)
         e |= _far(x, end, i, square)
-    far[0] = far[2] = s
-    far[1] = far[3] = e
-    return far
+    return s != 0, e != 0
 
 
 @cached()
@@ -195,13 +177,14 @@ class Discretisation:
             return [*self._searching, *(term for term in self._changing if term not in self._searching)]
         return [*(self._searching if searches else []), *(t for t in told if t not in self._searching)]
 
-    def _from_way(self, x: Array, to: Array, reach: float) -> list[bool]:
+    def _from_way(self, x: Array, to: Array, reach: float) -> tuple[bool, bool, bool, bool]:
         """Whether points of this rank on a way from x to ``to`` are farther than ``reach`` [m] from the
         way that was searched: x from its start, ``to`` from its end, ``to`` from its start, x from its end.
         """
         assert self._way is not None
-        far = _leaves_at(x, *self._way, reach) if x is to else _leaves(x, to, *self._way, reach)
-        return [bool(leaves) for leaves in far]
+        start, back = _leaves(x, *self._way, reach)
+        along, end = (start, back) if x is to else _leaves(to, *self._way, reach)
+        return start, end, along, back
 
     @property
     def guards(self) -> bool:

@@ -36,6 +36,9 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 
+EDGES_EVERY = 2
+"""Sweeps over the vertices for one over the edges."""
+
 STIFF_UNTIL = 0.03
 """Inertia over what all resists a vertex in its softest direction, up to which bending is stiff beside it."""
 
@@ -293,9 +296,9 @@ class SweepsWithEdges:
         rows = *self._rows, *self._groups, blocks, groups
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
-    def backward_again(self, x: Floats, *, edges: bool) -> None:
-        """Sweep over the edges, if so, and over the vertices once more."""
-        if edges:
+    def backward_again(self, x: Floats, number: int) -> None:
+        """Sweep over the vertices for the time ``number``, from 0; every second time over edges too."""
+        if number % EDGES_EVERY == 0:
             self._moved[:] = 0.0
             self.backward(self._moved)
             x += self._moved
@@ -304,24 +307,23 @@ class SweepsWithEdges:
         rows = *self._rows, *self._groups, blocks, groups
         backward_again(*rows, self._inverse, self._moved, x, self.r, self.of_edges)
 
-    def forward_ahead(self, b: Floats, x: Floats) -> None:
-        """Sweep over the vertices, before ``forward``."""
-        blocks, groups, _ = self._values
-        forward_ahead(*self._rows, *self._groups, blocks, groups, self._inverse, b, x, self.r)
-
     def subtract_ghosts(self, x: Floats) -> None:
         """As the function, of both residuals."""
         subtract_ghosts(self._beside, *self._rows, self._values.blocks, x, self.r)
         subtract_ghosts(self._edges_beside, *self._rows, self._values.blocks, x, self.of_edges)
 
-    def correct(self, x: Floats) -> None:
-        """Add to x (n_local, 3) what the diagonal makes of the residual of owned edges."""
+    def correct(self, x: Floats) -> bool:
+        """Add to x (n_local, 3) what the diagonal makes of the residual of owned edges; whether it does."""
         correct_edges(self._first, self._inverse_of_edges, x, self.of_edges)
+        return True
 
-    def forward(self, b: Floats, x: Floats) -> None:
-        """Sweep over the vertices, then over the edges."""
+    def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
+        """Sweep over the vertices, ``number`` sweeps before the last; every second time over edges too."""
         blocks, groups, numbers = self._values
         rows = *self._rows, *self._groups, blocks, groups
+        if number % EDGES_EVERY:
+            forward_ahead(*rows, self._inverse, b, x, self.r)
+            return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
         beyond = self._rows.indptr, self._rows.columns, blocks, len(self._inverse)
         forward_edges(*beyond, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)

@@ -273,8 +273,12 @@ class BlockSweeps:
         """Sweep; see the function."""
         backward(*self._rows, self._blocks, self._inverse, x, self.r)
 
-    def backward_again(self, x: Floats) -> None:
-        """Sweep once more, from where the residual is that of x, b − A x."""
+    def inertia(self) -> Array | None:
+        """Of use where sweeps may be worth to be repeated: nowhere."""
+        return None
+
+    def backward_again(self, x: Floats, number: int) -> None:
+        """Sweep once more, for whichever time, from where the residual is that of x, b − A x."""
         if self._moved is None:
             self._moved = np.zeros_like(x)
         self._moved[:] = 0.0
@@ -285,6 +289,10 @@ class BlockSweeps:
         """See the function."""
         subtract_ghosts(self._beside, *self._rows, self._blocks, x, self.r)
 
-    def forward(self, b: Floats, x: Floats) -> None:
-        """Sweep; see the function."""
+    def correct(self, x: Floats) -> bool:
+        """Whether something is added to x (n_local, 3) beside what coarser levels find: nothing."""
+        return False
+
+    def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
+        """Sweep, whichever follow; see the function."""
         forward(*self._rows, self._blocks, self._inverse, b, x, self.r)

@@ -34,9 +34,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-EDGES_EVERY = 2
-"""Sweeps over the vertices for one over the edges."""
-
 TWICE = 3
 """Levels that are visited twice at most: each doubles the visits of coarser ones, where ranks only wait."""
 
@@ -98,17 +95,17 @@ class Smoother:
         """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
         values = values.reshape(-1, 9)
         self._sweeps.set(values)
-        if not isinstance(self._sweeps, sweeps.BlockSweeps):
-            self._choose_sweeps(self._sweeps)
+        if (inertia := self._sweeps.inertia()) is not None:
+            self._choose_sweeps(inertia)
         self._increase_diagonal(values)
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
 
-    def _choose_sweeps(self, of_mesh: SweepsWithEdges) -> None:
+    def _choose_sweeps(self, own: Array) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
         from lyra_petsc.linear.edge_sweeps import STIFF_UNTIL, SWEEPS  # of use for nothing else
 
-        inertia, resistance = self.points.comm.allreduce(of_mesh.inertia())
+        inertia, resistance = self.points.comm.allreduce(own)
         worth, self.n_coarse_sweeps = SWEEPS[bool(inertia < STIFF_UNTIL * resistance)]
         self.n_sweeps = self._asked_sweeps or worth
 
@@ -153,10 +150,7 @@ class Smoother:
         for number in range(1, self.n_sweeps):
             seen = self.x[self.points.n_owned :].copy()
             with PETSc.Log.Event(SWEEP):
-                if isinstance(self._sweeps, sweeps.BlockSweeps):
-                    self._sweeps.backward_again(self.x)
-                else:
-                    self._sweeps.backward_again(self.x, edges=number % EDGES_EVERY == 0)
+                self._sweeps.backward_again(self.x, number)
                 PETSc.Log.logFlops(self._sweeps.flops)
             self._subtract_ghosts(seen)
         with PETSc.Log.Event(TRANSFER):
@@ -193,20 +187,17 @@ class Smoother:
             self._add_interpolated(coarse)
             PETSc.Log.logFlops(self._transfer_flops)
         for number in range(self.n_sweeps - 1, 0, -1):
-            if isinstance(self._sweeps, sweeps.BlockSweeps) or number % EDGES_EVERY == 0:
-                self._sweep_after(self._sweeps.forward)
-            else:
-                self._sweep_after(self._sweeps.forward_ahead)
+            self._sweep_after(number)
             self.points.update_ghosts(self.x)
-        self._sweep_after(self._sweeps.forward)
+        self._sweep_after(0)
 
-    def _sweep_after(self, forward: Callable[[Floats, Floats], None]) -> None:
+    def _sweep_after(self, number: int) -> None:
         lagged = self._lagged
         if len(lagged):
             right, self._seen = self.b[lagged], self.x[lagged]
             self.b[lagged] += np.einsum("nij,nj->ni", self._increase, self._seen)
         with PETSc.Log.Event(SWEEP):
-            forward(self.b, self.x)
+            self._sweeps.forward(self.b, self.x, number)
             PETSc.Log.logFlops(self._sweeps.flops)
         if len(lagged):
             self.b[lagged] = right
@@ -217,8 +208,7 @@ class Smoother:
         if self._turns is not None:
             self._turns.follow(more)
             self.x += more
-        if not isinstance(self._sweeps, sweeps.BlockSweeps):
-            self._sweeps.correct(self.x)
+        if self._sweeps.correct(self.x):
             self.points.update_ghosts(self.x)  # of edges' unknowns only owners know these
 
 

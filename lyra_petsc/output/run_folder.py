@@ -324,7 +324,7 @@ class RunDirectory:
                 if choice.resume and not kind.resumable(path):  # replaced by another meanwhile
                     raise InputError(f"holds {kind.lacks}; run without --resume", file=path)
                 return path, self._lock.held
-            except (FileExistsError, Busy) as obstacle:
+            except (FileExistsError, FolderLocked) as obstacle:
                 self.release()
                 if not fresh or choice.given:
                     raise self._refusal(path, obstacle) from None
@@ -337,7 +337,7 @@ class RunDirectory:
                 raise
 
     def _refusal(self, path: Path, obstacle: Exception) -> InputError:
-        if not isinstance(obstacle, Busy):
+        if not isinstance(obstacle, FolderLocked):
             return self._choice.kind.exists(path, "--out")
         words = f"another {self._choice.kind.what} is at work in this folder ({obstacle}); wait for it, or "
         key = "--resume" if self._choice.resume else "--out"
@@ -375,7 +375,7 @@ class RunDirectory:
             raise InputError(f"cannot be cleared: {reason(error)}", file=self.path, key="--out") from error
 
 
-class Busy(Exception):
+class FolderLocked(Exception):
     """Another process holds the lock; the text says which."""
 
 
@@ -401,7 +401,7 @@ class FolderLock:
 
     Raises
     ------
-    Busy
+    FolderLocked
         If another process holds it.
     OSError
         If the file cannot be created.
@@ -430,7 +430,7 @@ class FolderLock:
         try:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise Busy(self._holder()) from None
+            raise FolderLocked(self._holder()) from None
         except OSError:
             return False
         return True

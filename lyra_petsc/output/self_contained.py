@@ -22,7 +22,7 @@ ENDINGS = (".h5", ".xdmf", ".vtkhdf", ".csv", ".yaml", ".json", ".txt", ".part")
 _REMEDY = "a run's folder must hold all of its results"
 
 
-class LeadsOutError(InputError):
+class OutsideFolderError(InputError):
     """A file that is no part of its folder, or takes data from elsewhere."""
 
 
@@ -54,10 +54,10 @@ def check_file(path: Path) -> None:
         inside = target.is_relative_to(path.parent.resolve())
     except (OSError, ValueError, RuntimeError):  # missing, or a circle of links
         if path.is_symlink():
-            raise LeadsOutError(f"is a link that leads nowhere; {_REMEDY}", file=path) from None
+            raise OutsideFolderError(f"is a link that leads nowhere; {_REMEDY}", file=path) from None
         return
     if not inside:
-        raise LeadsOutError(f"is a link out of the folder; {_REMEDY}", file=path)
+        raise OutsideFolderError(f"is a link out of the folder; {_REMEDY}", file=path)
     if not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
         raise InputError("is no plain file", file=path)
 
@@ -70,7 +70,7 @@ def check_name(name: str, file: Path) -> None:
     InputError
     """
     if name in ("", ".", "..") or "\\" in name or os.path.basename(name) != name or not name.isprintable():
-        raise LeadsOutError(f"names {name[:80]!r}, which is no file in its folder; {_REMEDY}", file=file)
+        raise OutsideFolderError(f"names {name[:80]!r}, which is no file in its folder; {_REMEDY}", file=file)
 
 
 @contextmanager
@@ -112,7 +112,7 @@ def _check_content(file: Any, path: Path) -> None:
         for name in group:
             where = f"{above}/{name.decode(errors='replace')}"[-80:]
             if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
-                raise LeadsOutError(f"{where!r} is a link to elsewhere; {_REMEDY}", file=path)
+                raise OutsideFolderError(f"{where!r} is a link to elsewhere; {_REMEDY}", file=path)
             member = h5py.h5o.open(group, name)
             if isinstance(member, h5py.h5g.GroupID):
                 # hard links may make circles, and few groups look like very many
@@ -124,5 +124,7 @@ def _check_content(file: Any, path: Path) -> None:
             elif isinstance(member, h5py.h5d.DatasetID):
                 plan = member.get_create_plist()
                 if plan.get_layout() == h5py.h5d.VIRTUAL or plan.get_external_count() > 0:
-                    raise LeadsOutError(f"{where!r} takes its data from other files; {_REMEDY}", file=path)
+                    raise OutsideFolderError(
+                        f"{where!r} takes its data from other files; {_REMEDY}", file=path
+                    )
     _known[path] = stamp

@@ -24,7 +24,7 @@ from lyra_petsc.output.agreement import HDF5_ERRORS, reason
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import LeadsOutError
+from lyra_petsc.output.self_contained import OutsideFolderError
 from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
@@ -98,7 +98,7 @@ class StateWriter:
         self.vertices = vertices
         self.triangles = triangles
         self.n_triangles = n_triangles
-        self._room: _Room | None = None
+        self._room: _PreallocatedFile | None = None
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
         self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
         self._in_vtk = 0
@@ -185,7 +185,7 @@ class StateWriter:
         if self._vtkhdf:
             on_root(self._comm, lambda: self._announce_to_vtk(late=True))
 
-    def _lay_out(self, slabs: Fields, fields: tuple[StoredField, ...]) -> _Room:
+    def _lay_out(self, slabs: Fields, fields: tuple[StoredField, ...]) -> _PreallocatedFile:
         """A file with room for the next states; collective."""
         first, names = self._next, list(slabs)
         on = {"position": "vertex"} | {field.name: field.on for field in fields}
@@ -218,7 +218,7 @@ class StateWriter:
             return places
 
         places = np.array(on_root(self._comm, work), dtype=np.int64)
-        return _Room(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
+        return _PreallocatedFile(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
 
     @staticmethod
     def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[StoredField, ...]:
@@ -281,7 +281,7 @@ class StateWriter:
 
 
 @dataclass(frozen=True)
-class _Room:
+class _PreallocatedFile:
     """A file with room for states: its first state, what each holds, and where [bytes] these stand.
 
     ``table`` has the places of the table's columns, ``places`` (slots, datasets) those of each state.
@@ -298,7 +298,7 @@ class _Room:
 class _Row:
     """A state's row of the table in its file."""
 
-    room: _Room
+    room: _PreallocatedFile
     index: int
     state: WrittenState
     sums: NDArray[np.uint64]
@@ -343,7 +343,7 @@ def stored_states(folder: Path) -> list[WrittenState]:
     for path in state_files(folder):
         try:
             found += _states_of(path)
-        except LeadsOutError:
+        except OutsideFolderError:
             raise
         except InputError:
             continue

@@ -63,7 +63,7 @@ ROUND_OFF = 10.0 * float(np.finfo(np.float64).eps)
 
 
 @dataclass
-class Gains:
+class GuardState:
     """What the guard remembers between steps; energies in J.
 
     Attributes
@@ -149,7 +149,7 @@ class EnergyGuard:
         self._pull: tuple[float, Array] | None = None
         self._next_pull: tuple[float, Array] | None = None
         self._stiffness: float | None = None
-        self.gains = Gains()
+        self.gains = GuardState()
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -311,7 +311,7 @@ class EnergyGuard:
         """Whether it is backward Euler."""
         return self._system.integrator.name == "beuler"
 
-    def _with(self, step: Balance) -> Gains:
+    def _with(self, step: Balance) -> GuardState:
         """What would be remembered with a step."""
         old = self.gains
         start = step.potential_before if old.start is None else old.start
@@ -319,7 +319,7 @@ class EnergyGuard:
         if self._by_identity:
             judged = min(judged, step.bracket - step.inertia)
         work, heat = old.work + abs(step.work), old.heat + step.heat
-        return Gains(
+        return GuardState(
             start=start,
             scale=max(
                 old.scale,
@@ -383,7 +383,7 @@ class EnergyGuard:
 
     def restore(self, memory: Mapping[str, Any], *, same: bool) -> None:
         """Go on with a memory; with another integrator (not ``same``) its gains are counted anew."""
-        self.gains = Gains(**memory)
+        self.gains = GuardState(**memory)
         if not same:
             self.gains.total, self.gains.recent = 0.0, []
 

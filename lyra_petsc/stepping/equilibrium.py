@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.integrators.static import Static
-from lyra_petsc.stepping.newton_trace import Iteration, Stuck
+from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.relaxation import Relaxation
 from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -74,7 +74,7 @@ MOST_DESCENTS = 5
 
 
 @dataclasses.dataclass(frozen=True)
-class Settled:
+class EquilibriumReport:
     """How the last equilibrium stands, what it took to get there, and what there is to tell."""
 
     stability: Stability
@@ -204,7 +204,7 @@ class Equilibrium:
         self._stepper.convergence.farthest = np.inf
         return attempt
 
-    def settle(self, before: float, factor: float) -> Settled:
+    def settle(self, before: float, factor: float) -> EquilibriumReport:
         """Leave the equilibrium just found along its lowest mode while it is unstable; collective."""
         system, n = self._system, self._system.points.n_owned
         anchored = system.moving_energy_before
@@ -246,7 +246,7 @@ class Equilibrium:
                 break
             followed += 1
         system.moving_energy_before = anchored
-        return Settled(found, newton, linear, _note(found, followed, words))
+        return EquilibriumReport(found, newton, linear, _note(found, followed, words))
 
     def memory(self, factor: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers to go on with from the equilibrium at ``factor``; collective."""
@@ -280,7 +280,7 @@ class Equilibrium:
             return f"no equilibrium: the last {solves - lessened} of {solves} proximal steps came no nearer"
         return f"no equilibrium within {solves} proximal steps" if solves >= MOST_SOLVES else ""
 
-    def _off_balance(self, before: float, factor: float, history: list[Iteration], x: Array) -> Stuck:
+    def _off_balance(self, before: float, factor: float, history: list[Iteration], x: Array) -> FailedSolve:
         """Where so many proximal steps led that began at positions x."""
         system, n = self._system, self._system.points.n_owned
         system.begin_step(before, factor)
@@ -288,7 +288,7 @@ class Equilibrium:
         goal = x.copy()
         if system.held:
             system.prescribed.targets(before, factor, factor, goal)
-        return Stuck(
+        return FailedSolve(
             iterations=tuple(history),
             norm=self._norm(force),
             time=factor,

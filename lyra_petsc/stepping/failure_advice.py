@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis
 from lyra_petsc.stepping.near_pairs import NearPair
-from lyra_petsc.stepping.newton_trace import Stuck
+from lyra_petsc.stepping.newton_trace import FailedSolve
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason
@@ -82,7 +82,7 @@ class Circumstances:
     ranks: int
 
 
-def trouble(diagnosis: Diagnosis, stuck: Stuck) -> str:
+def trouble(diagnosis: Diagnosis, stuck: FailedSolve) -> str:
     """``overflow``, ``linear trouble`` or ``nonlinear trouble``."""
     if diagnosis.not_finite or not math.isfinite(diagnosis.norm):
         return "overflow"
@@ -98,7 +98,7 @@ def trouble(diagnosis: Diagnosis, stuck: Stuck) -> str:
     return "nonlinear trouble" if ran_out else "linear trouble"
 
 
-def advice(diagnosis: Diagnosis, stuck: Stuck, scene: Scene, now: Circumstances) -> list[str]:
+def advice(diagnosis: Diagnosis, stuck: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
     """What to try and why, most promising first; never empty."""
     kind = trouble(diagnosis, stuck)
     if kind == "overflow":
@@ -190,7 +190,7 @@ def _place(diagnosis: Diagnosis, scene: Scene, now: Circumstances) -> list[str]:
     return found
 
 
-def _linear(stuck: Stuck, scene: Scene, now: Circumstances) -> list[str]:
+def _linear(stuck: FailedSolve, scene: Scene, now: Circumstances) -> list[str]:
     direct = "a direct solver: -pc_type lu"
     if now.ranks > 1:
         direct += " -pc_factor_mat_solver_type mumps"
@@ -203,7 +203,7 @@ def _linear(stuck: Stuck, scene: Scene, now: Circumstances) -> list[str]:
     return [direct, f"another preconditioner than -pc_type {now.preconditioner}"]
 
 
-def _limit(stuck: Stuck, now: Circumstances) -> list[str]:
+def _limit(stuck: FailedSolve, now: Circumstances) -> list[str]:
     """Whether more iterations would help."""
     if stuck.snes_reason == SNES.DIVERGED_FUNCTION_COUNT:
         return ["a larger -snes_max_funcs"]

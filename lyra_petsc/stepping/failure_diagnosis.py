@@ -16,7 +16,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.mesh.points import Layout
-from lyra_petsc.stepping.newton_trace import Stuck
+from lyra_petsc.stepping.newton_trace import FailedSolve
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.prescribed_handles import Held
 
@@ -121,7 +121,13 @@ class Diagnosis:
 
 
 def diagnose(
-    points: Layout, membrane: Membrane, held: Held, stuck: Stuck, x: Array, mass: Array, tags: Array | None
+    points: Layout,
+    membrane: Membrane,
+    held: Held,
+    stuck: FailedSolve,
+    x: Array,
+    mass: Array,
+    tags: Array | None,
 ) -> Diagnosis:
     """Look at where a solve stands.
 
@@ -131,7 +137,7 @@ def diagnose(
     membrane : Membrane
         For its triangles.
     held : Held
-    stuck : Stuck
+    stuck : FailedSolve
     x : (n_owned, 3) or more rows
         Positions before the step [m].
     mass : (n_owned,) [kg]
@@ -199,7 +205,7 @@ def worst(comm: MPI.Comm, sizes: Array, numbers: Ints, describe: Callable[[int],
 
 def _vertex(
     points: Layout,
-    stuck: Stuck,
+    stuck: FailedSolve,
     residual: Array,
     forces: dict[str, Array],
     x: Array,
@@ -221,7 +227,7 @@ def _vertex(
     return worst(points.comm, _size(residual), points.original, describe)
 
 
-def _triangle(points: Layout, membrane: Membrane, stuck: Stuck, residual: Array) -> Triangle:
+def _triangle(points: Layout, membrane: Membrane, stuck: FailedSolve, residual: Array) -> Triangle:
     n, owned = points.n_vertices, membrane.n_owned
     # with the ghosts: residual norms and mesh numbers, and positions
     known, position = np.zeros((points.n_local, 3)), np.zeros((points.n_local, 3))
@@ -261,7 +267,7 @@ def _stretches(corners: Array, inverse: Array) -> tuple[float, ...]:
     return _numbers(np.linalg.svd(gradient, compute_uv=False)[::-1])
 
 
-def _furthest(comm: MPI.Comm, held: Held, stuck: Stuck, x: Array) -> tuple[int | None, float]:
+def _furthest(comm: MPI.Comm, held: Held, stuck: FailedSolve, x: Array) -> tuple[int | None, float]:
     """The handle that moves its vertices furthest, and how far [m]."""
     ways = _size(np.where(stuck.prescribed, stuck.goal - x, 0.0))
     numbers = held.numbers

@@ -12,7 +12,7 @@ import numpy as np
 from lyra_petsc.mesh.mesh import Source
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis
 from lyra_petsc.stepping.near_pairs import NearPair
-from lyra_petsc.stepping.newton_trace import Iteration, Stuck
+from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 from lyra_petsc.stepping.stepper import Attempt
 
 FEW = 8
@@ -20,7 +20,7 @@ FEW = 8
 
 
 @dataclass(frozen=True)
-class Tried:
+class FailedAttempt:
     """One attempt that failed: its Δt [s] (increment of the load factor), linear solver, and end."""
 
     dt: float
@@ -31,7 +31,7 @@ class Tried:
     words: str
 
     @classmethod
-    def of(cls, attempt: Attempt, dt: float, solver: str) -> Tried:
+    def of(cls, attempt: Attempt, dt: float, solver: str) -> FailedAttempt:
         """From the stepper's outcome."""
         iterations = attempt.newton_iterations, attempt.linear_iterations
         norm = attempt.residual if attempt.stuck is None else attempt.stuck.norm
@@ -51,13 +51,13 @@ class Failure:
     static : bool
     kind : str
         ``overflow``, ``linear trouble`` or ``nonlinear trouble``.
-    tried : list of Tried
+    tried : list of FailedAttempt
         All attempts at this step, the last one last.
     diagnosis : Diagnosis
     advice : list of str
     sources : list of Source
         Of the mesh.
-    stuck : Stuck
+    stuck : FailedSolve
         The last attempt's arrays, of this rank.
     near : NearPair or None
         With contact, what would meet in the last attempt, else what is nearest where it stands.
@@ -68,11 +68,11 @@ class Failure:
     dt: float
     static: bool
     kind: str
-    tried: list[Tried]
+    tried: list[FailedAttempt]
     diagnosis: Diagnosis
     advice: list[str]
     sources: list[Source]
-    stuck: Stuck
+    stuck: FailedSolve
     near: NearPair | None = None
 
     @property
@@ -141,7 +141,7 @@ class Failure:
 
     # -- pieces ----------------------------------------------------------------------------------------
 
-    def _attempt(self, tried: Tried) -> str:
+    def _attempt(self, tried: FailedAttempt) -> str:
         length = f"increment {tried.dt:.3g}" if self.static else f"Δt {tried.dt:.3g} s"
         return (
             f"{length} ({tried.solver}): {tried.newton_iterations} Newton and {tried.linear_iterations} "

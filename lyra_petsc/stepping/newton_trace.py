@@ -40,7 +40,7 @@ class Iteration:
 
 
 @dataclass(frozen=True)
-class Stuck:
+class FailedSolve:
     """Where a failed solve stood.
 
     Attributes
@@ -78,7 +78,7 @@ class Stuck:
     ksp_reason: int
     linear_residuals: Array
 
-    def of_vertices(self, n: int) -> Stuck:
+    def of_vertices(self, n: int) -> FailedSolve:
         """The same with the rows of the n owned vertices alone."""
         rows = ("velocity", "position", "residual", "prescribed", "goal")
         forces = {name: part[:n] for name, part in self.forces.items()}
@@ -124,7 +124,7 @@ class Trace:
         self._iterations.append(Iteration(norm, linear - self._linear, reason, taken))
         self._linear, self._last = linear, here
 
-    def stuck(self, velocity: Array | None = None) -> Stuck:
+    def stuck(self, velocity: Array | None = None) -> FailedSolve:
         """Where the solve that just failed stands, or one that does not begin, at a velocity (n_owned, 3);
         collective, before the next step begins.
         """
@@ -141,7 +141,7 @@ class Trace:
                 system.prescribed.targets(system.t0, system.t1, system.t0 + stage.after, position)
             system.prescribed.targets(system.t0, system.t1, system.t1, goal)
         square = system.points.comm.allreduce(float(np.vdot(residual, residual)))
-        return Stuck(
+        return FailedSolve(
             tuple(self._iterations),
             float(np.sqrt(square)),
             system.t0 + stage.after,

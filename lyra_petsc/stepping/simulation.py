@@ -27,7 +27,7 @@ from lyra_petsc.stepping.energy_guard import EnergyGuard
 from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
-from lyra_petsc.stepping.failure_report import Failure, Tried
+from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.near_pairs import worst_pair
@@ -181,7 +181,7 @@ class SteppedScene:
         self._repeated: dict[str, int] = {}
         self._least = math.inf
         self.failure: Failure | None = None
-        self._tried: list[Tried] = []
+        self._tried: list[FailedAttempt] = []
         self.stepper.start(0.0, 0)
         if self.problem.points.n_edges_global and not self.stepper.settle_edges(floor):
             self.notes.append("the moments on the edges of the start shape do not balance")
@@ -423,7 +423,7 @@ class SteppedScene:
             )
 
     def _recover(self, attempt: Attempt, end: float) -> None:
-        self._tried.append(Tried.of(attempt, end - self.time, self.stepper.preset))
+        self._tried.append(FailedAttempt.of(attempt, end - self.time, self.stepper.preset))
         if self.stepper.linear_solver_failed:
             previous, slow = self.stepper.preset, self.stepper.linear_solver_slow
             following = self.stepper.next_preset()

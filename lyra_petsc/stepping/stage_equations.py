@@ -31,7 +31,7 @@ from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms
 from lyra_petsc.stepping.applied_loads import AppliedLoads
 from lyra_petsc.stepping.damping import Damping
-from lyra_petsc.stepping.integrators.integrator import Follower, Integrator, Stage
+from lyra_petsc.stepping.integrators.integrator import Integrator, NeedsAcceleration, Stage
 from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
@@ -58,7 +58,7 @@ LEAST = 1e-10
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""
 
 
-class RefusedWay(NamedTuple):
+class RefusedDisplacement(NamedTuple):
     """What may not be gone because something meets there.
 
     Attributes
@@ -105,17 +105,17 @@ class StageEquations:
         Length, start and end of the step [s].
     objective : Objective
         The function whose gradient F is.
-    followers : list of Follower
+    followers : list of NeedsAcceleration
         Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
     active : ActiveTerms
     applied : AppliedLoads
     touches : bool
         Whether anything acted that changes its stencils, where the block rows were last renewed.
-    refused_way : RefusedWay or None
+    refused_way : RefusedDisplacement or None
         What the present step may not go.
     """
 
-    refused_way: RefusedWay | None = None
+    refused_way: RefusedDisplacement | None = None
     touches = False
     _may_begin: Array | None = None  # where ``may_move`` found a way to
 
@@ -152,7 +152,7 @@ class StageEquations:
         self.stage = Stage(1.0, 1.0, 1.0)
         self.objective = Objective(self)
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
-        self.followers: list[Follower] = [integrator]
+        self.followers: list[NeedsAcceleration] = [integrator]
         self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
         self._iterate: Array | None = None
         self._predicted: tuple[Array, Array] | None = None
@@ -593,7 +593,7 @@ class StageEquations:
             if seen == 1.0:
                 return True
             gone = part.end - begin
-        self.refused_way = RefusedWay(x.copy(), ahead, part)
+        self.refused_way = RefusedDisplacement(x.copy(), ahead, part)
         return False
 
     def may_end(self, v: Array) -> bool:

@@ -27,7 +27,7 @@ from lyra_petsc.stepping.inexact import LOOSEST, STATIC
 from lyra_petsc.stepping.initial_guess import first_guess
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
-from lyra_petsc.stepping.newton_trace import Stuck, Trace
+from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.ts_options import hidden
 
@@ -45,7 +45,7 @@ class Attempt:
     left: float = math.inf
     words: str = ""
     at_roundoff: bool = False
-    stuck: Stuck | None = None
+    stuck: FailedSolve | None = None
 
 
 FIRST_OF_ALL = 1e-3
@@ -246,7 +246,7 @@ class Stepper:
         number = self.ts.getStepNumber()
         before = equations.x[: self._shape[0]].copy() if equations.edges_lag else None
         rate_before = equations.v[: self._shape[0]].copy() if before is not None else None
-        stuck: Stuck | None = None
+        stuck: FailedSolve | None = None
         if equations.discretisation.guards and not equations.may_move():
             self._trace.begin()
             stuck = self._trace.stuck(equations.velocity_of_staying())

@@ -137,7 +137,7 @@ def test_more_sweeps_over_the_vertices() -> None:
     sweeps.backward(x)
     expected = x[:N_OWNED].astype(float).ravel()
     expected[:n] += np.linalg.solve(upper[:n, :n], (right - owned @ expected)[:n])
-    sweeps.backward_again(x, edges=False)
+    sweeps.backward_again(x, 1)
 
     def check() -> None:
         np.testing.assert_allclose(x[:N_OWNED].ravel(), expected, rtol=1e-4, atol=1e-5)
@@ -146,13 +146,13 @@ def test_more_sweeps_over_the_vertices() -> None:
 
     check()
     expected += np.linalg.solve(upper, right - owned @ expected)
-    sweeps.backward_again(x, edges=True)
+    sweeps.backward_again(x, 2)
     check()
 
     x[:] = RNG.normal(size=x.shape)
     expected = x.astype(float).ravel()
     expected[:n] += np.linalg.solve(upper[:n, :n].T, (right - dense @ expected)[:n])
-    sweeps.forward_ahead(b, x)
+    sweeps.forward(b, x, 1)
     np.testing.assert_allclose(x.ravel(), expected, rtol=1e-4, atol=1e-4)
 
 

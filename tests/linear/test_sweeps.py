@@ -145,7 +145,7 @@ def test_more_sweeps_before() -> None:
     x = np.zeros((N + GHOSTS, 3), dtype=np.float32)
     sweep.begin(b)
     sweep.backward(x)
-    sweep.backward_again(x)
+    sweep.backward_again(x, 1)
     owned, upper = dense[:, : 3 * N], triangle(dense, upper=True)
     expected = np.linalg.solve(upper, b.ravel())
     expected += np.linalg.solve(upper, b.ravel() - owned @ expected)

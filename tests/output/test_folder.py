@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.run_folder import LOCK_FILE, Busy, FolderLock, RunDirectory, choose
+from lyra_petsc.output.run_folder import LOCK_FILE, FolderLock, FolderLocked, RunDirectory, choose
 
 pytestmark = pytest.mark.parallel(3)
 
@@ -203,7 +203,7 @@ def test_a_file_system_without_locks_is_said(comm, here, monkeypatch):
 
 def test_the_lock_is_that_of_the_file_others_find(comm, tmp_path):
     first = FolderLock(tmp_path)
-    with pytest.raises(Busy, match=f"process {os.getpid()} on "):
+    with pytest.raises(FolderLocked, match=f"process {os.getpid()} on "):
         FolderLock(tmp_path)
     first.path.unlink()
     second = FolderLock(tmp_path)

@@ -12,7 +12,7 @@ from physics import grid, scene_of
 
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, trouble
 from lyra_petsc.stepping.failure_diagnosis import Diagnosis, Triangle, Vertex
-from lyra_petsc.stepping.newton_trace import Iteration, Stuck
+from lyra_petsc.stepping.newton_trace import FailedSolve, Iteration
 
 SNES = PETSc.SNES.ConvergedReason
 KSP = PETSc.KSP.ConvergedReason
@@ -34,7 +34,7 @@ DIAGNOSIS = Diagnosis(
     handle=None, jump=0.0,
 )  # fmt: skip
 NONE = np.empty((0, 3))
-STUCK = Stuck(
+STUCK = FailedSolve(
     iterations=(), norm=1.0, time=0.0, velocity=NONE, position=NONE, residual=NONE, forces={},
     prescribed=np.empty((0, 3), dtype=bool), goal=NONE, snes_reason=SNES.DIVERGED_LINE_SEARCH, ksp_reason=2,
     linear_residuals=np.empty(0),
@@ -47,7 +47,7 @@ def iterations(*norms: float, linear: int = 2) -> tuple[Iteration, ...]:
 
 def advised(
     diagnosis: Diagnosis = DIAGNOSIS,
-    stuck: Stuck = STUCK,
+    stuck: FailedSolve = STUCK,
     now: Circumstances = NOW,
     **scene: Any,
 ) -> list[str]:

@@ -1,5 +1,4 @@
 """Standard tests of textiles on a material.
 
-``specimens`` takes materials, ``strips`` and ``cusick`` have the tests, ``records`` what comes of them and
-how it is told.
+``specimens`` reads materials, ``strips`` and ``cusick`` hold the tests, ``records`` their results and tables.
 """

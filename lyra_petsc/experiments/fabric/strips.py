@@ -95,8 +95,8 @@ LONGEST, PULLS = 1.0, 30
 TENSION = 10.0 * GF_PER_CM
 """Of a shear test [N/m]"""
 
-SHEARED = 8.0
-"""Largest angle [°]"""
+SHEARED, SHEARS = 8.0, 16
+"""Largest angle [°], and steps to it"""
 
 WIDE = 15 * CLAMPED
 """Width of a specimen whose sides do not count [m]"""
@@ -170,7 +170,7 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     direction, and has the part T tan φ of the force; G and the widths of the loop are those of the rest.
     """
     record, shell = Record(), fabric.shell()
-    rubs, rise, cells = shell.friction_force > 0.0, 16, 40
+    rubs, rise, cells = shell.friction_force > 0.0, SHEARS, 40
     path = [0.0, *_to_and_fro(SHEARED, rise, closed=rubs)]  # the first step is of the tension
     share, width = 1.0 / (len(path) - 1), WIDE / cells
     frames = [
@@ -225,8 +225,8 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 # -- KES-F 2 ---------------------------------------------------------------------------------------------
 
 LENGTH = 0.01
-CURVED = 250.0
-"""Largest curvature [1/m]"""
+CURVED, TURNS = 250.0, 10
+"""Largest curvature [1/m], and steps to it"""
 
 
 def _place(curvature: float) -> Array:
@@ -259,7 +259,7 @@ def bending(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     for being a little longer than its arc, is no part of it.
     """
     fabric.needs_bending("bending")
-    shell, record, cells, rise = fabric.shell(degrees), Record(), 20, 10
+    shell, record, cells, rise = fabric.shell(degrees), Record(), 20, TURNS
     limit = shell.friction_moment[0]
     path = _to_and_fro(CURVED, rise, closed=limit > 0.0)
     share, width = 1.0 / (len(path) - 1), LENGTH / cells

@@ -1,1 +1,1 @@
-"""Numbers of a scene from measurements: readings, simulations with derivatives, least squares, report."""
+"""Parameters of a scene from measurements: readings, simulations with derivatives, least squares, report."""

@@ -83,7 +83,7 @@ class Setting:
         return float(self.base["time"]["step"])
 
 
-class NotHere(Exception):
+class NotApplicable(Exception):
     """A case that makes no sense for the scene at hand; says why."""
 
 
@@ -99,7 +99,7 @@ class StressCase(Case):
     Attributes
     ----------
     scene : callable (setting, bench) → scene content
-        Raises `NotHere` where it makes no sense.
+        Raises `NotApplicable` where it makes no sense.
     steps : int
         Nominal number of steps.
     step : float or None
@@ -134,7 +134,7 @@ class StressCase(Case):
     def content(self, setting: Setting, bench: Bench) -> Content:
         """The scene, with its time block."""
         if self.own and setting.given:
-            raise NotHere("has a scene of its own")
+            raise NotApplicable("has a scene of its own")
         content = self.scene(setting, bench)
         step = self.step if self.step is not None else float(content["time"]["step"])
         content["time"] = {**content["time"], "step": step, "end": self.steps * step}
@@ -297,7 +297,7 @@ def blow(content: Content, speed: float) -> Content:
 def weigh(content: Content, factor: float) -> Content:
     """Multiply gravity."""
     if not any(content.get("gravity") or ()):
-        raise NotHere("has no gravity to be multiplied")
+        raise NotApplicable("has no gravity to be multiplied")
     content["gravity"] = [factor * g for g in content["gravity"]]
     return content
 
@@ -311,7 +311,7 @@ def release(content: Content) -> Content:
 def move(content: Content, keyframes: list[dict[str, Any]]) -> Content:
     """Move all handles alike, for ever, linearly between the keyframes."""
     if not content.get("handles"):
-        raise NotHere("needs a handle")
+        raise NotApplicable("needs a handle")
     content["motions"] = {**(content.get("motions") or {}), "stress": keyframes}  # obstacles keep theirs
     for handle in content["handles"]:
         handle |= {"motion": "stress", "interpolation": "linear", "from": 0.0}

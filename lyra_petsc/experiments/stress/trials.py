@@ -29,7 +29,7 @@ from lyra_petsc.experiments.stress.step_balance import (
     speed,
 )
 from lyra_petsc.experiments.stress.stress_scenes import (
-    NotHere,
+    NotApplicable,
     Scope,
     Setting,
     StressCase,
@@ -149,7 +149,7 @@ def run_case(
     with setting.bench(comm, watch) as bench:
         try:
             content = case.content(setting, bench)
-        except NotHere as why:
+        except NotApplicable as why:
             outcome.left_out = str(why)
             return outcome
         record = outcome.record
@@ -235,7 +235,7 @@ OUTCOME_FILE = "outcome.json"
 
 
 @dataclass
-class Told:
+class SavedOutcome:
     """A `StressOutcome` without its case, for the process that has launched this one."""
 
     verdicts: dict[str, Verdict]
@@ -277,12 +277,12 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
 def save(outcome: StressOutcome, folder: Path) -> None:
     """Write an outcome, but for its case. On one rank."""
     content = {name: value for name, value in vars(outcome).items() if name != "case"}
-    save_record(folder / OUTCOME_FILE, Told(**content))
+    save_record(folder / OUTCOME_FILE, SavedOutcome(**content))
 
 
 def restore(folder: Path, case: StressCase) -> StressOutcome | None:
     """The outcome in a folder; None if there is none, or the process was stopped while it wrote."""
-    told = read_record(folder / OUTCOME_FILE, Told)
+    told = read_record(folder / OUTCOME_FILE, SavedOutcome)
     return StressOutcome(case, **vars(told)) if told is not None else None
 
 

@@ -45,7 +45,7 @@ class Stage:
     v: Array | None = None
 
 
-class Follower(Protocol):
+class NeedsAcceleration(Protocol):
     """What depends on the accelerations at the start of a step."""
 
     @property
@@ -59,8 +59,8 @@ class Follower(Protocol):
         """Forces jump at the start of the coming step."""
 
 
-class Forgetful:
-    """What a integrator answers that remembers nothing between steps."""
+class NoHistory:
+    """Base of integrators that keep no history between steps."""
 
     @property
     def needs_acceleration(self) -> bool:
@@ -87,7 +87,7 @@ class Forgetful:
         """Go on with a memory."""
 
 
-class Integrator(Forgetful, ABC):
+class Integrator(NoHistory, ABC):
     """One integrator and what it remembers between steps.
 
     Attributes

@@ -13,7 +13,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.stress.cases import FAMILIES, chain, rigid_plate, selected, shapes_and_handles
 from lyra_petsc.experiments.stress.stress_scenes import (
-    NotHere,
+    NotApplicable,
     Scope,
     Setting,
     anisotropic,
@@ -88,7 +88,7 @@ def test_every_case_is_a_scene(comm: MPI.Comm, scene: Path, given: bool) -> None
         for case in selected([], Scope.FULL):
             try:
                 content = case.content(setting, bench)
-            except NotHere:
+            except NotApplicable:
                 left_out.append(case.name)
                 continue
             checked = Scene.model_validate(content)
@@ -138,7 +138,7 @@ def test_handles_move_for_ever_and_a_sheet_without_cannot() -> None:
     moved = move(content, [{"time": 0.0}])["handles"][0]
     assert moved["motion"] == "stress"
     assert not {"until", "fade"} & moved.keys()
-    with pytest.raises(NotHere):
+    with pytest.raises(NotApplicable):
         move(sheet(4) | {"handles": []}, [{"time": 0.0}])
 
 

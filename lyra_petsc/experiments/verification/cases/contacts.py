@@ -44,7 +44,7 @@ SETTLED, END, SLID = 1.0, 3.0, 1.5
 """Times [s]: from when a sheet that sticks must stand, its end, that of a sheet that slides."""
 
 
-def _slope(degrees: float, friction: float, cells: int, end: float) -> dict[str, Any]:
+def sheet_on_slope(degrees: float, friction: float, cells: int, end: float) -> dict[str, Any]:
     """A free sheet on a slope that falls along x."""
     angle = math.radians(degrees)
     normal = [math.sin(angle), 0.0, math.cos(angle)]
@@ -94,12 +94,14 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
         angle = math.radians(degrees)
         down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
         slope = {"obstacles": {"slope": _roof(bench, degrees)}} if triangles else {}
-        with bench.simulation(_slope(degrees, STICKS * math.tan(angle), round(n), END) | slope) as trial:
+        with bench.simulation(
+            sheet_on_slope(degrees, STICKS * math.tan(angle), round(n), END) | slope
+        ) as trial:
             settled = _at(trial, SETTLED).x
             creep = max(creep, float(np.abs((trial.run().x - settled) @ down).max()))
         for part in SLIDING[1:2] if triangles else SLIDING:
             friction = part * math.tan(angle)
-            with bench.simulation(_slope(degrees, friction, round(n), SLID) | slope) as trial:
+            with bench.simulation(sheet_on_slope(degrees, friction, round(n), SLID) | slope) as trial:
                 before, weight = _at(trial, 0.5 * SLID).v, G * float(trial.mass.sum())
                 while not trial.simulation.finished:
                     trial.step()

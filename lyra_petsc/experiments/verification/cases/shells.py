@@ -204,7 +204,7 @@ BESIDE = 1e-6
 """Of a coordinate at which vertices count as on a plane, over the shell's radius."""
 
 
-def _on(axis: str, at: float, size: float) -> list[list[float]]:
+def plane_box(axis: str, at: float, size: float) -> list[list[float]]:
     """Opposite corners of a box about the vertices on a plane."""
     return [
         [at - BESIDE * size if each == axis else -FAR for each in "xyz"],
@@ -212,8 +212,9 @@ def _on(axis: str, at: float, size: float) -> list[list[float]]:
     ]
 
 
-def _symmetric(axes: str, size: float) -> list[dict[str, Any]]:
-    return [{"box": _on(axis, 0.0, size), "symmetry": axis} for axis in axes]
+def symmetric(axes: str, size: float) -> list[dict[str, Any]]:
+    """Handles that hold the vertices on planes of symmetry through the origin, normal to these axes."""
+    return [{"box": plane_box(axis, 0.0, size), "symmetry": axis} for axis in axes]
 
 
 def _curved(
@@ -234,8 +235,8 @@ def _curved(
         return vertices, trial.run().x - vertices
 
 
-def _cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Array], Any]:
-    """From the crown on, with its axis along y."""
+def cylinder(radius: float, angle: float, length: float) -> Callable[[Array, Array], Any]:
+    """Part of a cylinder as a function of s and t in [0, 1], from the crown on, with its axis along y."""
 
     def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
         return radius * np.sin(angle * s), length * t, radius * np.cos(angle * s)
@@ -256,8 +257,8 @@ def scordelis_lo_roof(bench: Bench, n: float) -> Iterator[Measured]:
     for pattern in PATTERNS:
         material = {"young": 4.32e8, "poisson": 0.0, "thickness": 0.25, "density": 1.0}
         gravity = [0.0, 0.0, -90.0 * part]
-        held = [*_symmetric("xy", 25.0), {"box": _on("y", half, 25.0), "axes": ["x", "z"]}]
-        surface = _cylinder(25.0, math.radians(40.0), half)
+        held = [*symmetric("xy", 25.0), {"box": plane_box("y", half, 25.0), "axes": ["x", "z"]}]
+        surface = cylinder(25.0, math.radians(40.0), half)
         _, way = _curved(bench, round(n), pattern, surface, material, gravity=gravity, handles=held)
         found = float(-way[round(n), 2]) / part
         yield Measured(f"deflection, {pattern}", found, LINEAR["roof"], "m")
@@ -282,8 +283,8 @@ def pinched_cylinder(bench: Bench, n: float) -> Iterator[Measured]:
     for pattern in PATTERNS:
         material = {"young": 3e6, "poisson": 0.3, "thickness": 3.0, "density": 1.0}
         loads = [{"nodes": [0], "force": [0.0, 0.0, -force / 4.0]}]
-        held = [{"box": _on("y", 300.0, 300.0), "axes": ["x", "z"]}, *_symmetric("xyz", 300.0)]
-        given = (_cylinder(300.0, 0.5 * math.pi, 300.0), material)
+        held = [{"box": plane_box("y", 300.0, 300.0), "axes": ["x", "z"]}, *symmetric("xyz", 300.0)]
+        given = (cylinder(300.0, 0.5 * math.pi, 300.0), material)
         coarse, fine = (
             float(-_curved(bench, cells, pattern, *given, loads=loads, handles=held)[1][0, 2]) / force
             for cells in (round(n) // 2, round(n))
@@ -305,7 +306,7 @@ def open_hemisphere(bench: Bench, n: float) -> Iterator[Measured]:
     for pattern in PATTERNS:
         material = {"young": 6.825e7, "poisson": 0.3, "thickness": 0.04, "density": 1.0}
         loads = [{"nodes": [0], "force": [part, 0.0, 0.0]}, {"nodes": [cells], "force": [0.0, -part, 0.0]}]
-        held = [*_symmetric("xy", 10.0), {"nodes": [cells // 2], "axes": ["z"]}]
+        held = [*symmetric("xy", 10.0), {"nodes": [cells // 2], "axes": ["z"]}]
 
         def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
             around, up = 0.5 * math.pi * s, math.radians(72.0) * t
@@ -332,7 +333,7 @@ def hyperbolic_paraboloid(bench: Bench, n: float) -> Iterator[Measured]:
     for pattern in PATTERNS:
         material = {"young": 2e11, "poisson": 0.3, "thickness": 1e-3, "density": 1.0}
         gravity = [0.0, 0.0, -8.0 * part]
-        held = [{"box": _on("x", -0.5, 1.0), "clamp": True}, *_symmetric("y", 1.0)]
+        held = [{"box": plane_box("x", -0.5, 1.0), "clamp": True}, *symmetric("y", 1.0)]
 
         def surface(s: Array, t: Array) -> tuple[Array, Array, Array]:
             x, y = s - 0.5, 0.5 * t
@@ -368,7 +369,7 @@ def twisted_beam(bench: Bench, n: float) -> Iterator[Measured]:
                 {"young": 2.9e7, "poisson": 0.22, "thickness": 0.0032, "density": 1.0},
                 STATIC | {"step": 1.0},
                 gravity=[0, 0, 0],
-                handles=[{"box": _on("x", 0.0, length), "clamp": True}],
+                handles=[{"box": plane_box("x", 0.0, length), "clamp": True}],
                 loads=_line_load(end, force * np.eye(3)[axis]),
                 solver={"force_tolerance": 1e-6},
             )
@@ -387,11 +388,11 @@ def open_cylinder_scene(bench: Bench, n: int, pattern: str) -> tuple[dict[str, A
     radius, half = 4.953, 5.175
     cells = n, round(n * half / (0.5 * math.pi * radius))
     flat, faces = rectangle(*cells, 1.0, 1.0, alternating=pattern == "alternating")
-    vertices = np.column_stack(_cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
+    vertices = np.column_stack(cylinder(radius, 0.5 * math.pi, half)(flat[:, 0], flat[:, 1]))
     made = scene(
         bench.mesh(vertices, faces),
         {"young": 1.05e7, "poisson": 0.3125, "thickness": 0.094, "density": 1.0},
-        handles=_symmetric("xyz", radius),
+        handles=symmetric("xyz", radius),
         loads=[{"nodes": [0], "force": [0.0, 0.0, 1e4]}],
     )
     return made, vertices, n
@@ -439,13 +440,13 @@ def hinged_roof(bench: Bench, n: float) -> Iterator[Measured]:
     loads, deflections = np.array(TABLES["hinged_roof"]["rows"]).T
     for pattern in PATTERNS:
         flat, faces = rectangle(round(n), round(n), 1.0, 1.0, alternating=pattern == "alternating")
-        vertices = np.column_stack(_cylinder(radius, angle, half)(flat[:, 0], flat[:, 1]))
+        vertices = np.column_stack(cylinder(radius, angle, half)(flat[:, 0], flat[:, 1]))
         content = scene(
             bench.mesh(vertices, faces),
             {"young": 3102.75, "poisson": 0.3, "thickness": 12.7, "density": 1.0},
             handles=[
-                *_symmetric("xy", radius),
-                {"box": _on("x", radius * math.sin(angle), radius)},
+                *symmetric("xy", radius),
+                {"box": plane_box("x", radius * math.sin(angle), radius)},
                 {"nodes": [0], "axes": ["z"], "motion": "push", "interpolation": "linear"},
             ],
             motions={"push": [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, -DEFLECTION]}]},
