@@ -29,9 +29,8 @@ FEWER: dict[str, tuple[str, object]] = {
     name: ("KINDS", ("criss-cross", "gmsh"))
     for name in ("post-buckling", "lateral-buckling", "elastica-tip", "elastica-weight", "elastica-roll-up",
                  "elastica-overhang")
-} | {"cusick": ("STARTS", 2), "incline": ("SLOPES", (5.0, 30.0))}  # fmt: skip
-"""What is cut of cases that repeat it: other kinds of meshes, on which `plate` and `column` bend; starts; a
-slope steeper than those of `tests/stepping/test_friction.py`."""
+} | {"cusick": ("STARTS", 2)}  # fmt: skip
+"""What is cut of cases that repeat it: other kinds of meshes, on which `plate` and `column` bend; starts."""
 
 TOGETHER = (
     *SOME, "patch-states", "rigid-rotation", "wind-drag", "hanging-strip", "hanging-chain",
