@@ -159,8 +159,25 @@ class EdgeCouplings:
 
     def empty(self, kind: Any, times: int = 1) -> EdgeValues:
         """Room for values of this floating-point type."""
-        sizes = (len(self._block), 9), (len(self.groups.places), 3 * GROUP), (len(self._number), 1)
-        return EdgeValues(*(np.empty((times * n, width), dtype=kind) for n, width in sizes))
+        return self.within(np.empty(times * self.n_stored, dtype=kind), times)
+
+    @property
+    def n_stored(self) -> int:
+        """Of numbers that are stored."""
+        return sum(n * width for n, width in self._sizes)
+
+    @property
+    def _sizes(self) -> tuple[tuple[int, int], ...]:
+        return (len(self.groups.places), 3 * GROUP), (len(self._block), 9), (len(self._number), 1)
+
+    def within(self, memory: NDArray[Any], times: int = 1) -> EdgeValues:
+        """Room for values in ``memory`` (at least n_stored,)."""
+        sizes = [times * n * width for n, width in self._sizes]
+        parts = np.split(memory[: sum(sizes)], np.cumsum(sizes)[:-1])
+        groups, blocks, numbers = (
+            part.reshape(-1, width) for part, (_, width) in zip(parts, self._sizes, strict=True)
+        )
+        return EdgeValues(blocks, groups, numbers)
 
     def take(self, values: Array, least: float, out: EdgeValues, wide: EdgeValues | None = None) -> None:
         """Copy block rows (n_blocks, 9); entries up to ``least`` become 0, but in ``wide``."""
@@ -271,8 +288,17 @@ class ProductWithEdges:
     def __init__(self, couplings: EdgeCouplings, pattern: BlockPattern, values: Array) -> None:
         self._couplings, self._whole = couplings, HalfStored(pattern, values)
         self._rows = *couplings.blocks, *couplings.groups, *couplings.numbers
+        self._memory = np.empty(0)
         self._values: EdgeValues | None = None
         self._current = False
+
+    def room(self, size: int) -> Array:
+        """Memory (size,) of the copy, which is lost, for what is there before there is another."""
+        if len(self._memory) < size:
+            self._values = None  # of which the views go with the memory
+            self._memory = np.empty(max(size, self._couplings.n_stored))
+        self._current = False
+        return self._memory[:size]
 
     def changed(self) -> None:
         """The values are others."""
@@ -281,7 +307,7 @@ class ProductWithEdges:
     def copied(self) -> EdgeValues:
         """Where the caller copies the values as they are now."""
         if self._values is None:
-            self._values = self._couplings.empty(np.float64)
+            self._values = self._couplings.within(self.room(self._couplings.n_stored))
         self._current = True
         return self._values
 

@@ -233,15 +233,15 @@ class SweepsWithEdges:
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
         self.flops = 2.0 * couplings.n_numbers
 
-    def _of_all_alike(self, pattern: BlockPattern, n: int) -> Array:
+    def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
         """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
         of_edges = np.zeros(pattern.n_local, dtype=bool)
         for part in pattern.edges:
             of_edges[part.edges // 3] = True
         begin = self._rows.indptr[: n + 1]
         columns = self._rows.columns[: begin[-1]]
-        weight = np.where(columns < n, 2.0, np.where(of_edges[columns], 0.0, 1.0))
-        weight[begin[:-1]] = 1.0
+        weight = np.where(columns < n, 2, np.where(of_edges[columns], 0, 1)).astype(np.int8)
+        weight[begin[:-1]] = 1
         return weight
 
     def diagonal(self, values: Array, rows: Ints) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -81,8 +81,11 @@ class WithoutEdges(Protocol):
     pattern: BlockPattern
     turns: EdgeTurns
 
-    def values(self, held: Mask) -> Array:
-        """Its block rows (n_blocks, 3, 3) now, and ``turns`` with them; held (n_local, 3) are prescribed."""
+    def values(self, held: Mask, room: Callable[[int], Array]) -> Array:
+        """Its block rows (n_blocks, 3, 3) now, and ``turns`` with them; held (n_local, 3) are prescribed.
+
+        ``room`` gives memory for so many numbers.
+        """
 
 
 class Level:
@@ -158,12 +161,18 @@ class Hierarchy:
         free : (n_owned, 3)
             0 for coordinates that take no part in interpolation, 1 for others.
         """
-        free = np.where(held[: self.levels[0].points.n_owned], 0.0, 1.0)
+        finest = self.levels[0]
+        free = np.where(held[: finest.points.n_owned], 0.0, 1.0)
+        below: tuple[Array, Array] | None = None
+        if self._below is not None and finest.galerkin is not None:
+            # before the finest level fills the memory that this one is made in
+            room = np.empty if finest.product is None else finest.product.room
+            below = finest.galerkin.project(self._below.values(held, room), free)
         for level in self.levels:
             yield values, free
-            if self._below is not None and level is self.levels[0]:
-                values = self._below.values(held)
-            if level.galerkin is not None:
+            if below is not None:
+                (values, free), below = below, None
+            elif level.galerkin is not None:
                 values, free = level.galerkin.project(values, free)
 
     def destroy(self) -> None:

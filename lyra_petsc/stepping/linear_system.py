@@ -151,6 +151,10 @@ class LinearSystem:
         convex : bool
             The Hessian was positive definite when it was last seen.
         """
+        self._set_both(v, blend, keep=keep, convex=convex)
+        self._equations.forget_directors()
+
+    def _set_both(self, v: Array, blend: float, *, keep: bool, convex: bool) -> None:
         self.set_operator(v, blend)
         if self.preconditioner is self.operator:
             return
