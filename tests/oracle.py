@@ -163,10 +163,11 @@ def midedge_blocks(
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
         (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
-        shape = term.shape(x, frames)
+        shape, length = term.shape(x, frames), term.of_edges.length
     else:
         stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
         edges, shape = term._edges, term._sheet.shape(x, frames)
+        length = term._sheet.of_edges.length
     for e, points in enumerate(term.stencil):
         corners, k = x[points], np.empty((3, 3))
         k[np.triu_indices(3)] = k.T[np.triu_indices(3)] = stiffness[e]
@@ -193,7 +194,7 @@ def midedge_blocks(
                     both = np.outer(n, tau) - 0.5 * data["sign"][e, i] * np.outer(spin[i], about[i])
                     block += ends[i, c] * ends[i, d] * (both + both.T)
                     curved[at, 3 * d : 3 * d + 3] += pull[i] * block
-            gradients[i, 9 + i] = data["sign"][e, i] / data["length"][e, i]
+            gradients[i, 9 + i] = data["sign"][e, i] / length[edges[e, i]]
         bend = own @ (t - rest[e]) * t2 + between @ further * s2
         curved += gradients.T * bend @ gradients
         curved += friction[e, 0] * np.outer(pull @ gradients, pull @ gradients)

@@ -33,8 +33,7 @@ def _scale(indptr, source, factor, diagonal, values):  # type: ignore[no-untyped
 
 @cached()
 def _set_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
-    """values = the diagonal (n_owned,) times the identity."""
-    values[:] = 0.0
+    """Set the diagonal (n_owned,) times the identity in values that are 0."""
     for row in range(len(indptr) - 1):
         for i in range(3):
             values[indptr[row], i, i] = diagonal[row]
@@ -97,6 +96,7 @@ class BlockRows:
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""
+        values.fill(0.0)
         _set_diagonal(self.pattern.indptr, diagonal, values)
 
     def scale(self, source: Array, factor: float, diagonal: Array, values: Array) -> None:

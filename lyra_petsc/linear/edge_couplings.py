@@ -157,14 +157,22 @@ class EdgeCouplings:
         beyond = len(self.blocks.columns) - int(np.count_nonzero(self.blocks.columns < self.n_vertices))
         return 2 * inside + 9 * beyond - 9 * self.n_vertices - len(self.numbers.indptr) + 1
 
-    def empty(self, kind: Any, times: int = 1) -> EdgeValues:
-        """Room for values of this floating-point type."""
-        sizes = (len(self._block), 9), (len(self.groups.places), 3 * GROUP), (len(self._number), 1)
-        return EdgeValues(*(np.empty((times * n, width), dtype=kind) for n, width in sizes))
+    @property
+    def n_values(self) -> int:
+        """How many values there are."""
+        return int(9 * len(self._block) + 3 * self.groups.places.size + len(self._number))
+
+    def within(self, memory: NDArray[Any]) -> EdgeValues:
+        """Room for values in ``memory`` (at least n_values,)."""
+        first = 3 * self.groups.places.size
+        last = first + 9 * len(self._block)
+        groups, blocks = memory[:first].reshape(-1, 3 * GROUP), memory[first:last].reshape(-1, 9)
+        return EdgeValues(blocks, groups, memory[last : self.n_values].reshape(-1, 1))
 
     def take(self, values: Array, least: float, out: EdgeValues, wide: EdgeValues | None = None) -> None:
         """Copy block rows (n_blocks, 9); entries up to ``least`` become 0, but in ``wide``."""
-        whole = self.empty(np.float64, 0) if wide is None else wide
+        nothing = EdgeValues(np.empty((0, 9)), np.empty((0, 3 * GROUP)), np.empty((0, 1)))
+        whole = nothing if wide is None else wide
         where = self._block, self._triple, self._number
         _take(*where, values, values.reshape(-1), least, wide is not None, *out, *whole)
 
@@ -269,7 +277,7 @@ class ProductWithEdges:
     """
 
     def __init__(self, couplings: EdgeCouplings, pattern: BlockPattern, values: Array) -> None:
-        self._couplings, self._whole = couplings, HalfStored(pattern, values)
+        self.couplings, self._whole = couplings, HalfStored(pattern, values)
         self._rows = *couplings.blocks, *couplings.groups, *couplings.numbers
         self._values: EdgeValues | None = None
         self._current = False
@@ -278,17 +286,15 @@ class ProductWithEdges:
         """The values are others."""
         self._current = False
 
-    def copied(self) -> EdgeValues:
+    def copied(self, values: EdgeValues) -> EdgeValues:
         """Where the caller copies the values as they are now."""
-        if self._values is None:
-            self._values = self._couplings.empty(np.float64)
-        self._current = True
-        return self._values
+        self._values, self._current = values, True
+        return values
 
     def __call__(self, x: Array, out: Array) -> None:
         """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
         if self._current and self._values is not None:
-            sums = np.empty((self._couplings.n_vertices, 4))
+            sums = np.empty((self.couplings.n_vertices, 4))
             multiply(*self._rows, *self._values, x, sums, out)
         else:
             self._whole(x, out)

@@ -198,6 +198,11 @@ def forward_ahead(  # type: ignore[no-untyped-def]
         scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
 
 
+def memory_needed(couplings: EdgeCouplings, product: ProductWithEdges | None) -> int:
+    """In numbers of double precision, by sweeps and by a product with the same rows."""
+    return -(-couplings.n_values // 2) + (0 if product is None else couplings.n_values)
+
+
 class SweepsWithEdges:
     """``gauss_seidel.BlockSweeps`` where edges carry unknowns.
 
@@ -207,6 +212,8 @@ class SweepsWithEdges:
     couplings : EdgeCouplings
     product : ProductWithEdges, optional
         With the same rows.
+    memory : (n,), optional
+        Where the copies of rows are.
 
     Attributes
     ----------
@@ -219,7 +226,11 @@ class SweepsWithEdges:
     """
 
     def __init__(
-        self, pattern: BlockPattern, couplings: EdgeCouplings, product: ProductWithEdges | None = None
+        self,
+        pattern: BlockPattern,
+        couplings: EdgeCouplings,
+        product: ProductWithEdges | None = None,
+        memory: Array | None = None,
     ) -> None:
         self._couplings, self._indptr, self._product = couplings, pattern.indptr, product
         self._rows, self._groups = couplings.blocks, couplings.groups
@@ -228,7 +239,10 @@ class SweepsWithEdges:
         beside = np.flatnonzero(self._rows.ends < self._rows.indptr[1:])
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
         self._weight = self._of_all_alike(pattern, n)
-        self._values = couplings.empty(np.float32)
+        memory = np.empty(memory_needed(couplings, product)) if memory is None else memory
+        n_wide = 0 if product is None else couplings.n_values
+        self._wide = None if product is None else couplings.within(memory)
+        self._values = couplings.within(memory[n_wide:].view(np.float32))
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._moved = np.zeros((n_local, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
@@ -236,15 +250,15 @@ class SweepsWithEdges:
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
         self.flops = 2.0 * couplings.n_numbers
 
-    def _of_all_alike(self, pattern: BlockPattern, n: int) -> Array:
+    def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
         """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
         of_edges = np.zeros(pattern.n_local, dtype=bool)
         for part in pattern.edges:
             of_edges[part.edges // 3] = True
         begin = self._rows.indptr[: n + 1]
         columns = self._rows.columns[: begin[-1]]
-        weight = np.where(columns < n, 2.0, np.where(of_edges[columns], 0.0, 1.0))
-        weight[begin[:-1]] = 1.0
+        weight = np.where(columns < n, 2, np.where(of_edges[columns], 0, 1)).astype(np.int8)
+        weight[begin[:-1]] = 1
         return weight
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
@@ -265,8 +279,9 @@ class SweepsWithEdges:
 
     def set(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""
-        wide = None if self._product is None else self._product.copied()
-        self._couplings.take(values, negligible(self._indptr, values), self._values, wide)
+        self._couplings.take(values, negligible(self._indptr, values), self._values, self._wide)
+        if self._product is not None and self._wide is not None:
+            self._product.copied(self._wide)
         invert_diagonal(self._indptr, values, self._inverse)
         invert_numbers(self._numbers.indptr, self._values.numbers, self._inverse_of_edges)
 

@@ -81,8 +81,10 @@ class WithoutEdges(Protocol):
     pattern: BlockPattern
     turns: EdgeTurns
 
-    def values(self, held: Mask) -> Array:
-        """Its block rows (n_blocks, 3, 3) now, and ``turns`` with them; held (n_local, 3) are prescribed."""
+    def values(self, held: Mask, memory: Array) -> Array:
+        """Its block rows (n_blocks, 3, 3) now, in ``memory``, and ``turns`` with them; held (n_local, 3) are
+        prescribed.
+        """
 
 
 class Level:
@@ -98,12 +100,15 @@ class Level:
         How unknowns of edges, that nothing is interpolated to, follow the vertices.
     product : ProductWithEdges or None
         With the same block rows, where edges carry unknowns.
+    memory : (n,) float64 or None
+        For what the sweeps and this product copy.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
         self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
         self.product: ProductWithEdges | None = None
+        self.memory: Array | None = None
 
 
 class Hierarchy:
@@ -117,6 +122,8 @@ class Hierarchy:
         Between the levels, finest first.
     below : WithoutEdges, optional
         Where edges carry unknowns.
+    product : ProductWithEdges, optional
+        With the finest level's rows.
 
     Attributes
     ----------
@@ -129,9 +136,17 @@ class Hierarchy:
         pattern: BlockPattern,
         interpolations: Sequence[InterpolationRows],
         below: WithoutEdges | None = None,
+        product: ProductWithEdges | None = None,
     ) -> None:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
+        level.product = product
+        if below is not None and pattern.edge_couplings is not None:
+            from lyra_petsc.linear.edge_sweeps import memory_needed  # of use for nothing else
+
+            # what is below is there before the copies are
+            needed = memory_needed(pattern.edge_couplings, product)
+            level.memory = np.empty(max(needed, 9 * below.pattern.n_blocks))
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
@@ -158,12 +173,16 @@ class Hierarchy:
         free : (n_owned, 3)
             0 for coordinates that take no part in interpolation, 1 for others.
         """
-        free = np.where(held[: self.levels[0].points.n_owned], 0.0, 1.0)
+        finest = self.levels[0]
+        free = np.where(held[: finest.points.n_owned], 0.0, 1.0)
+        below: tuple[Array, Array] | None = None
+        if self._below is not None and finest.memory is not None and finest.galerkin is not None:
+            below = finest.galerkin.project(self._below.values(held, finest.memory), free)
         for level in self.levels:
             yield values, free
-            if self._below is not None and level is self.levels[0]:
-                values = self._below.values(held)
-            if level.galerkin is not None:
+            if below is not None:
+                (values, free), below = below, None
+            elif level.galerkin is not None:
                 values, free = level.galerkin.project(values, free)
 
     def destroy(self) -> None:

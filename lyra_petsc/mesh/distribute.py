@@ -211,7 +211,9 @@ def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-
             index, local = index[order], local[order]
             data = {key: np.ascontiguousarray(v[index]) for key, v in each.data.items()}
             counts = np.promote_types(np.int32, np.min_scalar_type(-len(each.stencil)))
-            edges = None if each.edges is None else 3 * local[:, n:] + rows.component[each.edges[index]]
+            edges = None
+            if each.edges is not None:
+                edges = (3 * local[:, n:] + rows.component[each.edges[index]]).astype(np.int32)
             stencil = local[:, :n].astype(np.int32)
             elements[name] = Elements(stencil, data, n_owned, index.astype(counts), edges)
         own = rows.unknowns[rank]

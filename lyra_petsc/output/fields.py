@@ -94,7 +94,7 @@ def _curvature(problem: Problem) -> Array:
         # the angle of a collapsed triangle is undefined
         lambda hinges, x: -hinges.elements.data["length"] * hinges.weights(x) * hinges.angles(x),
         lambda midedge, x, frames: (
-            midedge.elements.data["area"] * np.nan_to_num(midedge.curvatures(x, frames)[:, :2].sum(axis=1))
+            midedge.areas * np.nan_to_num(midedge.curvatures(x, frames)[:, :2].sum(axis=1))
         ),
     )
 

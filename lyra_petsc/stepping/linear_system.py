@@ -106,10 +106,11 @@ class LinearSystem:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)
-        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below)
         product = self.preconditioner.product
-        if self.preconditioner is self.operator and not isinstance(product, HalfStored):
-            hierarchy.levels[0].product = product
+        shared = (
+            None if isinstance(product, HalfStored) or self.preconditioner is not self.operator else product
+        )
+        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, shared)
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
     def attach(self, ksp: PETSc.KSP) -> None:
@@ -151,6 +152,10 @@ class LinearSystem:
         convex : bool
             The Hessian was positive definite when it was last seen.
         """
+        self._set_both(v, blend, keep=keep, convex=convex)
+        self._equations.forget_directors()
+
+    def _set_both(self, v: Array, blend: float, *, keep: bool, convex: bool) -> None:
         self.set_operator(v, blend)
         if self.preconditioner is self.operator:
             return

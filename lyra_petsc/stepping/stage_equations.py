@@ -712,6 +712,11 @@ class StageEquations:
             self._internal.forget()
         self.objective.forget()
 
+    def forget_directors(self) -> None:
+        """Keep none while a linear system is solved, which needs the room: next they are elsewhere."""
+        for term in self.active.edged:
+            term.forget()
+
     def forget_rows(self) -> None:
         """Work no longer with the rows that ``jacobian`` was given, which their owner may free now."""
         self.damping.let_go()

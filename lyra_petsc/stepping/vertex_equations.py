@@ -59,14 +59,16 @@ class VertexEquations:
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
         self.turns.hold(held)
 
-    def values(self, held: Mask) -> Array:
-        """Block rows (n_blocks, 3, 3) at the stage last evaluated; held (n_local, 3) are decoupled."""
+    def values(self, held: Mask, memory: Array) -> Array:
+        """Block rows (n_blocks, 3, 3), in ``memory``, at the stage last evaluated; held (n_local, 3) are
+        decoupled.
+        """
         equations, rows = self._equations, self._rows
         (x, vs), stage, damped = equations.evaluated, equations.stage, equations.damping.acts
         if not np.array_equal(held, self._held):
             self._hold(held)
         self.turns.set(x)
-        values = np.empty((self.pattern.n_blocks, 3, 3))
+        values = memory[: 9 * self.pattern.n_blocks].reshape(-1, 3, 3)
         rows.set_diagonal(stage.sigma * equations.mass, values)
         for term in self._elastic:
             weight: Array | float = stage.reach

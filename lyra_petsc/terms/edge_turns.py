@@ -106,18 +106,23 @@ class EdgeTurns:
 
     def __init__(self, term: MidEdge, n_owned: int) -> None:
         assert term.edges is not None
-        self._stencil, self._places = term.stencil, term.edges.astype(np.int32)
-        edges = term.of_edges.of_triangles
+        self._term, self._n_unknowns = term, 3 * n_owned
+        self._stencil, self._places = term.stencil, term.edges
+        self._share = self._shares(term.edges >= 3 * n_owned)
+        self._turns = np.zeros((len(term.edges), 12), dtype=np.float32)
+
+    def _shares(self, without: Mask) -> Floats:
+        """What each triangle has (E, 3) in the turns of its edges, length times −sign [m]; 0 of others."""
+        edges, length = self._term.of_edges.of_triangles, self._term.of_edges.length
         # all triangles of an edge that this rank owns are here
-        share = 1.0 / np.bincount(edges.ravel())[edges]
-        share[term.edges >= 3 * n_owned] = 0.0
-        self._all = -share * term.elements.data["length"] * term.elements.data["sign"]
-        self._share = self._all
-        self._turns = np.zeros((len(edges), 12), dtype=np.float32)
+        of_each = (length / np.bincount(edges.ravel(), minlength=len(length))).astype(np.float32)
+        share: Floats = -of_each[edges] * self._term.elements.data["sign"]
+        share[without] = 0.0
+        return share
 
     def hold(self, held: Mask) -> None:
         """Let unknowns that are held (n_local, 3) not follow."""
-        self._share = np.where(held.ravel()[self._places], 0.0, self._all)
+        self._share = self._shares(held.ravel()[self._places] | (self._places >= self._n_unknowns))
 
     def set(self, x: Array) -> None:
         """Take positions x (n_local, 3)."""

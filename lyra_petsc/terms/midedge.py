@@ -90,24 +90,24 @@ class MidEdge(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3), edges (E, 3) opposite the corners; data ``stiffness`` (E, 6) of the tangents [N·m],
-        ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) 1 where the triangle runs along an edge, else
-        −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of edges and
-        directors before the start, ``curvature`` (E, 3, 3) [1/m] κ of each tangent, ``area`` (E,) [m²],
-        ``triangle`` (E,) numbers in the mesh, ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴],
-        ``damping`` (E,) [s].
+        ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) int8 1 where the triangle runs along an edge,
+        else −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of
+        edges and directors before the start, ``material`` (E, 2, 2) the ways from the first corner to the
+        others in material axes [m], ``triangle`` (E,) int32 numbers in the mesh, ``height`` (E,) the smallest
+        [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
     """
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director"))
+        super().__init__(elements.without("tangent", "director", "length"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
         ends = np.stack([self.stencil[triangle, (side + k) % 3] for k in (1, 2)], axis=1)
-        against = data["sign"].ravel()[first] < 0.0
+        against = data["sign"].ravel()[first] < 0
         ends[against] = ends[against, ::-1]
         index = index.reshape(-1, 3).astype(np.int32)
-        self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
+        self.of_edges = Edges(places.astype(np.int64), ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
         self._constants = data["stiffness"], data["rest"], data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
@@ -126,8 +126,9 @@ class MidEdge(Elastic):
 
     @property
     def edge_stiffness(self) -> Array:
-        diagonal = self.elements.data["stiffness"][:, [0, 3, 5]] / self.elements.data["length"] ** 2
-        return np.bincount(self.of_edges.of_triangles.ravel(), diagonal.ravel()).astype(np.float64)
+        diagonal = self.elements.data["stiffness"][:, [0, 3, 5]]
+        sums = np.bincount(self.of_edges.of_triangles.ravel(), diagonal.ravel())
+        return np.asarray(sums / self.of_edges.length**2)
 
     def nearer(self, x: Array, frozen: Frames, held: Mask) -> Frames | None:
         places, ends, *_ = self.of_edges
@@ -206,6 +207,11 @@ class MidEdge(Elastic):
         self.frames = Frames(tangent, np.cos(angle) * base + np.sin(angle) * np.cross(tangent, base))
 
     @property
+    def areas(self) -> Array:
+        """Of the triangles (E,) at rest [m²]."""
+        return areas(self.elements.data["material"])
+
+    @property
     def edge_places(self) -> Ints:
         return self.of_edges.places
 
@@ -229,6 +235,10 @@ class MidEdge(Elastic):
             self._shapes = Remembered(lambda at: self._computed(at, frames))
         return self._shapes(x)
 
+    def forget(self) -> None:
+        if self._shapes is not None:
+            self._shapes.forget()
+
     def _computed(self, x: Array, frames: Frames) -> Array:
         angle = x.ravel()[self.of_edges.places] / self.of_edges.length
         out = np.empty((len(angle), 9))
@@ -249,7 +259,8 @@ class MidEdge(Elastic):
     def add_gradient(self, x: Array, frozen: Frames, out: Array) -> None:
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.stencil, self.of_edges.of_triangles, self.edges
-        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *self._constants, data["length"], out)
+        constants = *self._constants, self.of_edges.length
+        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, out)
 
     def add_hessian(
         self,
@@ -263,7 +274,7 @@ class MidEdge(Elastic):
     ) -> None:
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
-        constants = *self._constants, data["length"], self.edges
+        constants = *self._constants, self.of_edges.length, self.edges
         midedge_energy.add_hessian(
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
         )
@@ -283,9 +294,33 @@ class MidEdge(Elastic):
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
         found = np.empty((self.n_elements, 3))
         tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), found)
-        curvature: Array = np.einsum("eki,ei->ek", self.elements.data["curvature"], found)
+        of_tangents = curvatures_of_tangents(self.elements.data["material"])
+        curvature: Array = np.einsum("eki,ei->ek", of_tangents, found)
         curvature[:, 2] *= 0.5
         return curvature
+
+
+def areas(material: Array) -> Array:
+    """Areas (n,) [m²] of triangles whose corners are ``material`` (n, 2, 2) [m] from the first."""
+    found: Array = 0.5 * np.abs(np.linalg.det(material))
+    return found
+
+
+def _outward(material: Array) -> tuple[Array, Array]:
+    """Normals (n, 3, 2) of the edges opposite the corners in material axes, and their lengths (n, 3) [m]."""
+    one, two = material[:, 0], material[:, 1]
+    side = np.stack([two - one, -two, one], axis=1)
+    size: Array = np.linalg.norm(side, axis=2)
+    return np.stack([side[..., 1], -side[..., 0]], axis=2) / size[..., None], size
+
+
+def curvatures_of_tangents(material: Array) -> Array:
+    """κ11, κ22, 2 κ12 [1/m] of each tangent T_i, (n, 3, 3)."""
+    normal, size = _outward(material)
+    x, y = normal[..., 0], normal[..., 1]
+    weight = (size / areas(material)[:, None])[:, None, :]
+    found: Array = -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * weight
+    return found
 
 
 def normals_of(x: Array, triangles: AnyInts) -> Array:
@@ -311,13 +346,13 @@ def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) 
     return unit(total)
 
 
-def edge_numbers(rest: RestShape, triangles: Ints) -> tuple[Ints, Array]:
+def edge_numbers(rest: RestShape, triangles: Ints) -> tuple[Ints, NDArray[np.int8]]:
     """Of triangles (F, 3) the edges opposite corners; 1 where they run from the lesser vertex, else −1."""
     tail, head = triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]
     n = rest.mesh.n_vertices
     keys = rest.edges[:, 0] * n + rest.edges[:, 1]
     number = np.searchsorted(keys, np.minimum(tail, head) * n + np.maximum(tail, head))
-    return number, np.where(tail < head, 1.0, -1.0)
+    return number, np.where(tail < head, 1, -1).astype(np.int8)
 
 
 def elements(rest: RestShape) -> Elements:
@@ -333,12 +368,8 @@ def elements(rest: RestShape) -> Elements:
     number, sign = edge_numbers(rest, triangles)
     edges, n_edges = rest.edges, len(rest.edges)
     material = np.linalg.inv(rest.inverse[chosen]).transpose(0, 2, 1)  # x1 − x0, x2 − x0
-    one, two = material[:, 0], material[:, 1]
-    side = np.stack([two - one, -two, one], axis=1)
-    size, area = np.linalg.norm(side, axis=2), rest.area[chosen]
-    normal = np.stack([side[..., 1], -side[..., 0]], axis=2) / size[..., None]
-    x, y = normal[..., 0], normal[..., 1]
-    curvature = -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * (size / area[:, None])[:, None, :]
+    size, area = _outward(material)[1], rest.area[chosen]
+    curvature = curvatures_of_tangents(material)
     stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
     # the two faces of a seam may have edges of different lengths
@@ -375,9 +406,8 @@ def elements(rest: RestShape) -> Elements:
         "length": length[number],
         "tangent": unit(ends[:, :, 1] - ends[:, :, 0]),
         "director": director,
-        "curvature": curvature,
-        "area": area,
-        "triangle": chosen.astype(np.float64),
+        "material": material,
+        "triangle": chosen.astype(np.int32),
         "height": 2.0 * area / size.max(axis=1),
         "limit": fading_limit(area),
         "damping": rest.per_triangle("damping")[chosen],

@@ -99,7 +99,7 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  
 def add_gradient(  # type: ignore[no-untyped-def]
     x, stencil, edges, places, sign, shape, stiffness, rest, limit, friction, length, out
 ):
-    """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (E, 3)."""
+    """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
     flat = out.reshape(-1)
     for e in range(stencil.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
@@ -133,9 +133,9 @@ def add_gradient(  # type: ignore[no-untyped-def]
             out[stencil[e, 0], i] += w0 * n[i] + r1 - r2
             out[stencil[e, 1], i] += w1 * n[i] + r2 - r0
             out[stencil[e, 2], i] += w2 * n[i] + r0 - r1
-        flat[places[e, 0]] += sign[e, 0] * p0 / length[e, 0]
-        flat[places[e, 1]] += sign[e, 1] * p1 / length[e, 1]
-        flat[places[e, 2]] += sign[e, 2] * p2 / length[e, 2]
+        flat[places[e, 0]] += sign[e, 0] * p0 / length[edges[e, 0]]
+        flat[places[e, 1]] += sign[e, 1] * p1 / length[edges[e, 1]]
+        flat[places[e, 2]] += sign[e, 2] * p2 / length[edges[e, 2]]
 
 
 @kernel(inline="always")
@@ -334,7 +334,8 @@ def add_hessian(  # type: ignore[no-untyped-def]
             _along(r1 * s12, n, scaled(-1.0, spin1)),
             scaled(r2 * s22, n),
         )
-        q0, q1, q2 = sign[e, 0] / length[e, 0], sign[e, 1] / length[e, 1], sign[e, 2] / length[e, 2]
+        q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
+        q2 = sign[e, 2] / length[edges[e, 2]]
         # ∇f K ∇fᵀ, and what T and S add as they bend
         k00 = a0 * a0 * stiffness[e, 0] + exact * (own[0] * c0 + others[0] * d0)
         k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)

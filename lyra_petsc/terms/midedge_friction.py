@@ -120,7 +120,8 @@ class MidEdgeFriction(Elastic):
             (self.stencil, self._edges, self.edges),
             self._constants(self._sliding(x, frozen)),
         )
-        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, data["length"], out)
+        length = self._sheet.of_edges.length
+        midedge_energy.add_gradient(x, *numbers, data["sign"], shape, *constants, length, out)
 
     def add_hessian(
         self,
@@ -133,7 +134,8 @@ class MidEdgeFriction(Elastic):
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         data, shape = self.elements.data, self._sheet.shape(x, frozen)
-        constants = *self._constants(self._sliding(x, frozen)), data["length"], self.edges
+        length = self._sheet.of_edges.length
+        constants = *self._constants(self._sliding(x, frozen)), length, self.edges
         numbers = self._edges, data["sign"], shape
         midedge_energy.add_hessian(
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
@@ -190,13 +192,12 @@ def elements(rest: RestShape) -> Elements:
     weight = np.stack(
         [one / np.where(rubs, two, 1.0), two / np.where(rubs, one, 1.0), 0.5 + 0.0 * one], axis=1
     )
-    mean, curvature = np.sqrt(one * two), data["curvature"]
-    form = (data["area"] * mean / GIVE)[:, None, None] * np.einsum(
-        "eki,ek,ekj->eij", curvature, weight, curvature
-    )
+    mean, curvature = np.sqrt(one * two), midedge.curvatures_of_tangents(data["material"])
+    area = midedge.areas(data["material"])
+    form = (area * mean / GIVE)[:, None, None] * np.einsum("eki,ek,ekj->eij", curvature, weight, curvature)
     data["stiffness"] = np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1)
-    data["reach"] = np.sqrt(data["area"] * mean * GIVE)
-    for name in ("tangent", "director", "curvature", "area", "triangle", "damping"):
+    data["reach"] = np.sqrt(area * mean * GIVE)
+    for name in ("tangent", "director", "material", "length", "triangle", "damping"):
         del data[name]
     assert found.edges is not None
     kept = {name: values[rubs] for name, values in data.items()}

@@ -46,7 +46,7 @@ class WithEdges(NamedTuple):
     """Elements that couple rows of ``vertices`` (E, n) and ``edges`` (E, m), places of their unknowns."""
 
     vertices: NDArray[np.int32]
-    edges: Ints
+    edges: NDArray[np.int32]
 
     @property
     def stencil(self) -> NDArray[np.int32]:
@@ -118,7 +118,7 @@ class Term(ABC):
     ----------
     stencil : (E, n) int32
         Vertices of each element, local rows.
-    edges : (E, m) int64 or None
+    edges : (E, m) int32 or None
         Places of the edge unknowns of each element in the flat form of arrays over local rows.
     n_elements, n_owned : int
         E, and how many of them this rank counts (energies); those come first.
@@ -133,7 +133,7 @@ class Term(ABC):
         """Work on these elements from here on."""
         self.elements = elements.once("damping")
         self.stencil = np.ascontiguousarray(elements.stencil, dtype=np.int32)
-        self.edges = None if elements.edges is None else np.ascontiguousarray(elements.edges, dtype=np.int64)
+        self.edges = None if elements.edges is None else np.ascontiguousarray(elements.edges, dtype=np.int32)
         self.n_elements = len(self.stencil)
         self.n_owned = elements.n_owned
 
@@ -421,6 +421,9 @@ class Elastic(Term):
     def largest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors of owned edges turn on a way (n_owned, 3)."""
         return 0.0
+
+    def forget(self) -> None:
+        """Keep nothing that can be computed again from positions."""
 
     @property
     def edge_stiffness(self) -> Array:

@@ -54,8 +54,10 @@ def test_the_product_is_the_dense_one() -> None:
     product = ProductWithEdges(couplings_of(pattern), pattern, values)
     for copied in (False, True):
         if copied:
-            couplings, narrow = couplings_of(pattern), couplings_of(pattern).empty(np.float32)
-            couplings.take(values.reshape(-1, 9), 0.0, narrow, product.copied())
+            couplings = couplings_of(pattern)
+            narrow = couplings.within(np.empty(couplings.n_values, dtype=np.float32))
+            wide = product.copied(couplings.within(np.empty(couplings.n_values)))
+            couplings.take(values.reshape(-1, 9), 0.0, narrow, wide)
         product(x, out)
         np.testing.assert_allclose(out.ravel(), dense @ x.ravel(), rtol=1e-12, atol=1e-12)
     values *= 2.0
@@ -194,7 +196,8 @@ def test_rows_of_ghosts_alone() -> None:
     couplings, x, out = couplings_of(pattern), RNG.normal(size=(5, 3)), np.empty((1, 3))
     assert couplings.n_vertices == 1
     product = ProductWithEdges(couplings, pattern, values)
-    couplings.take(values.reshape(-1, 9), 0.0, product.copied())
+    wide = product.copied(couplings.within(np.empty(couplings.n_values)))
+    couplings.take(values.reshape(-1, 9), 0.0, couplings.within(np.empty(couplings.n_values)), wide)
     product(x, out)
     expected = sum(values[k].T @ x[column] for k, column in enumerate(pattern.columns))
     np.testing.assert_allclose(out[0], expected, rtol=1e-13)
@@ -204,6 +207,6 @@ def test_rows_of_ghosts_alone() -> None:
 def test_negligible_entries_are_none(kind: type) -> None:
     pattern, values, _ = mixed_rows()
     couplings = couplings_of(pattern)
-    copy = couplings.empty(kind)
+    copy = couplings.within(np.empty(couplings.n_values, dtype=kind))
     couplings.take(values.reshape(-1, 9), 1e9, copy)
     assert not any(part.any() for part in copy)
