@@ -45,9 +45,11 @@ class _Product:
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, rows: Array, told: Callable[[], list[str]]
+        self, points: Points, pattern: BlockPattern, rows: Array, told: Callable[[], list[str]] | None
     ) -> None:
-        self._told = told
+        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: what is told of
+        # has PETSc objects of its own, and must not be freed then
+        self._told = None if told is None else weakref.WeakMethod(told)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
         edges = pattern.edge_couplings
@@ -79,7 +81,8 @@ class _Product:
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer) -> None:
         """Show the entries, as ``-ksp_view_mat`` asks, or for ``-ksp_view`` how they are kept; collective."""
         if viewer.getType() == PETSc.Viewer.Type.ASCII and viewer.getFormat() in SUMMARIES:
-            lines = ["block rows of the program, of which one half is stored", *self._told()]
+            told = None if self._told is None else self._told()
+            lines = ["block rows of the program, of which one half is stored", *(told() if told else [])]
             viewer.printfASCII("".join(f"  {line}\n" for line in lines))
             return
         whole = AssembledMatrix(self._all_points, self._pattern, "aij")
@@ -96,8 +99,8 @@ class BlockMatrix:
     ----------
     points : Points
     pattern : BlockPattern
-    told : callable
-        Further lines of ``-ksp_view``; collective.
+    told : method or None
+        Further lines of ``-ksp_view``; collective. Its object is not kept alive.
 
     Attributes
     ----------
@@ -113,7 +116,9 @@ class BlockMatrix:
 
     kind = "python"
 
-    def __init__(self, points: Points, pattern: BlockPattern, told: Callable[[], list[str]] = list) -> None:
+    def __init__(
+        self, points: Points, pattern: BlockPattern, told: Callable[[], list[str]] | None = None
+    ) -> None:
         rows = 3 * points.n_owned
         self.mat = PETSc.Mat().create(points.comm)
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
