@@ -44,7 +44,12 @@ class _Product:
     long; that for ``baij`` works number by number, and takes twice as long in the caches.
     """
 
-    def __init__(self, points: Points, pattern: BlockPattern, rows: Array) -> None:
+    def __init__(
+        self, points: Points, pattern: BlockPattern, rows: Array, told: Callable[[], list[str]] | None
+    ) -> None:
+        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: what is told of
+        # has PETSc objects of its own, and must not be freed then
+        self._told = None if told is None else weakref.WeakMethod(told)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
         edges = pattern.edge_couplings
@@ -76,7 +81,9 @@ class _Product:
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer) -> None:
         """Show the entries, as ``-ksp_view_mat`` asks, or for ``-ksp_view`` how they are kept; collective."""
         if viewer.getType() == PETSc.Viewer.Type.ASCII and viewer.getFormat() in SUMMARIES:
-            viewer.printfASCII("  block rows of the program, of which one half is stored\n")
+            told = None if self._told is None else self._told()
+            lines = ["block rows of the program, of which one half is stored", *(told() if told else [])]
+            viewer.printfASCII("".join(f"  {line}\n" for line in lines))
             return
         whole = AssembledMatrix(self._all_points, self._pattern, "aij")
         whole.set(self._rows)
@@ -92,6 +99,8 @@ class BlockMatrix:
     ----------
     points : Points
     pattern : BlockPattern
+    told : method or None
+        Further lines of ``-ksp_view``; collective. Its object is not kept alive.
 
     Attributes
     ----------
@@ -107,7 +116,9 @@ class BlockMatrix:
 
     kind = "python"
 
-    def __init__(self, points: Points, pattern: BlockPattern) -> None:
+    def __init__(
+        self, points: Points, pattern: BlockPattern, told: Callable[[], list[str]] | None = None
+    ) -> None:
         rows = 3 * points.n_owned
         self.mat = PETSc.Mat().create(points.comm)
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
@@ -116,7 +127,7 @@ class BlockMatrix:
         self.rows = np.zeros((pattern.n_blocks, 3, 3))
         self.followers: list[Callable[[Array], None]] = []
         self._diagonal = pattern.indptr[:-1]
-        made = _Product(points, pattern, self.rows)
+        made = _Product(points, pattern, self.rows, told)
         self.product = made.multiply
         self.mat.setPythonContext(made)
         _set_vec_type(self.mat)

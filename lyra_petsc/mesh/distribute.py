@@ -36,6 +36,8 @@ class Whole:
         Vertices of the mesh's edges, where elements couple unknowns on edges.
     owner : (V,) int64 or None
         Rank of each vertex, where that is settled already.
+    places : (V, 3) or None
+        Where the vertices begin [m], if they may touch.
     """
 
     n_vertices: int
@@ -44,6 +46,7 @@ class Whole:
     vertex_data: dict[str, Array]
     edges: Ints | None = None
     owner: Ints | None = None
+    places: Array | None = None
 
 
 @dataclass
@@ -170,7 +173,7 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
     if comm.bcast(whole is not None and whole.owner is not None):
         owner, name = (whole.owner if whole else None), "given"
     else:
-        owner, name = partition(comm, graph, n_vertices)
+        owner, name = partition(comm, graph, n_vertices, whole.places if whole else None)
     post = pkl5.Intracomm(comm)  # sends arrays without a copy, also those of more than 2 GiB
     if comm.rank == 0:
         assert whole is not None

@@ -1,4 +1,6 @@
-"""Which rank owns which vertex: a graph partitioner run by PETSc; and an ordering for locality."""
+"""Which rank owns which vertex: a graph partitioner run by PETSc, or cuts through space where sheets may
+touch; and an ordering for locality.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,7 @@ from petsc4py import PETSc
 from lyra_petsc.errors import InputError
 from lyra_petsc.parallel import on_root
 
+Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Graph = tuple[Ints, Ints]
 
@@ -53,12 +56,35 @@ def locality_order(graph: Graph) -> Ints:
     return position
 
 
-def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Ints | None, str]:
+def bisection(places: Array, n_ranks: int) -> Ints:
+    """Owner (V,) of vertices at ``places`` (V, 3) by recursive bisection of space, always across the longest
+    side of what is left (Berger & Bokhari, IEEE Trans. Comput. 36 (1987) 570-580).
+    """
+    owner = np.zeros(len(places), dtype=np.int64)
+    parts = [(np.arange(len(places)), range(n_ranks))]
+    while parts:
+        vertices, ranks = parts.pop()
+        if len(ranks) == 1 or not len(vertices):
+            owner[vertices] = ranks[0]
+            continue
+        at, left = places[vertices], len(ranks) // 2
+        sides = np.argsort(np.ptp(at, axis=0), kind="stable")
+        vertices = vertices[np.lexsort([at[:, side] for side in sides])]
+        cut = len(vertices) * left // len(ranks)
+        parts += [(vertices[:cut], ranks[:left]), (vertices[cut:], ranks[left:])]
+    return owner
+
+
+def partition(
+    comm: MPI.Comm, graph: Graph | None, n_vertices: int, places: Array | None = None
+) -> tuple[Ints | None, str]:
     """Owning rank of each vertex; collective.
 
     The partitioner is the best that this PETSc has (PT-Scotch, ParMETIS, …), or what
     ``-mat_partitioning_type`` says. It works on rank 0, where the mesh is: on several ranks the answer of
-    PT-Scotch would depend on the order in which messages arrive, here it is the same in every run.
+    PT-Scotch would depend on the order in which messages arrive, here it is the same in every run. With
+    ``places``, and without that option, it is `bisection`: a graph of the meshes does not know which sheets
+    lie on each other, and would cut between them.
 
     Parameters
     ----------
@@ -67,6 +93,8 @@ def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Int
         The whole graph, on rank 0; None elsewhere.
     n_vertices : int
         V, on all ranks.
+    places : (V, 3)
+        Positions [m] of vertices that may touch, on rank 0.
 
     Returns
     -------
@@ -81,6 +109,8 @@ def partition(comm: MPI.Comm, graph: Graph | None, n_vertices: int) -> tuple[Int
     """
     if comm.size == 1:
         return np.zeros(n_vertices, dtype=np.int64), "none (one rank)"
+    if not PETSc.Options().hasName("mat_partitioning_type") and comm.bcast(places is not None):
+        return (None if places is None else bisection(places, comm.size)), "bisection of space"
     owner: Ints | None = None
 
     def on_rank_0() -> str:

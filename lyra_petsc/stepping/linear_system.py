@@ -79,11 +79,11 @@ class LinearSystem:
         if is_set("mat_type") or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
-            self.operator = BlockMatrix(layout, pattern)
+            self.operator = BlockMatrix(layout, pattern, self._equations.told_of_blocks)
         self.preconditioner = self.operator
         if self.cycles:
             if self._regularised or isinstance(self.operator, AssembledMatrix):
-                self.preconditioner = BlockMatrix(layout, pattern)
+                self.preconditioner = BlockMatrix(layout, pattern, self._equations.told_of_blocks)
             self._multigrid = self._levels()
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE

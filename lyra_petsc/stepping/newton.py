@@ -44,6 +44,8 @@ class Newton:
     globalisation : Globalisation
     more_linear : int
         Linear iterations of directions that were solved for again.
+    allowed : float
+        Fraction of the last direction that terms allowed to go.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Newton:
 
     def begin_step(self) -> None:
         """Forget the step before."""
-        self.more_linear, self._length = 0, 0.0
+        self.more_linear, self._length, self.allowed = 0, 0.0, 1.0
         # a step begins as the one before did
         self._convex = self._began_convex
         self._linear.begin()
@@ -197,6 +199,7 @@ class Newton:
                 before.copy(y)
                 past = None
             before.destroy()
+        self.allowed = fraction
         y.scale(fraction)
         return past is not None or fraction < 1.0
 

@@ -220,12 +220,13 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     if scene.initial is not None:
         data |= start_positions(scene.initial, mesh, held)
         data |= start_velocities(scene.initial, mesh, rest.mass, file=scene.source)
+    places = None
     if scene.contact is not None:
         from lyra_petsc.mesh.obstacles import made as made_obstacles
         from lyra_petsc.mesh.start_crossings import refuse_crossings  # with kernels
 
-        obstacles = made_obstacles(scene, mesh.obstacles, Motion)
-        refuse_crossings(scene, mesh, data.get("start", mesh.positions), obstacles)
+        places = data.get("start", mesh.positions)
+        refuse_crossings(scene, mesh, places, made_obstacles(scene, mesh.obstacles, Motion))
     if mesh.tags is not None:
         data["tag"] = mesh.tags.astype(np.float64)
     outline = Outline(
@@ -241,7 +242,7 @@ def _whole(scene: Scene, mesh: Mesh) -> tuple[Outline, Whole]:
     )
     on_edges = any(each.edges is not None for each in elements.values())
     edges = rest.edges if on_edges else None
-    return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges)
+    return outline, Whole(mesh.n_vertices, mesh.triangles, elements, data, edges, places=places)
 
 
 def _check_symmetry(rest: RestShape, held: Selection) -> None:

@@ -674,6 +674,22 @@ class StageEquations:
         parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
 
+    def told_of_blocks(self) -> list[str]:
+        """Lines on the elements with changing stencils, and the blocks they add to the matrix; collective."""
+        near, frozen = self.active.near, self.active.frozen
+        if not near:
+            return []
+        acting = [np.count_nonzero(t.acting(self._xs, frozen[t])[: t.n_owned]) for t in near]
+        patterns = self.discretisation.fixed.pattern, self.discretisation.rows.pattern
+        fixed, every, *numbers = self.points.summed(
+            *(pattern.n_couplings for pattern in patterns), *acting, *(t.n_owned for t in near)
+        ).astype(np.int64)
+        pairs = [
+            f"{t.name} {acts} of {known}"
+            for t, acts, known in zip(near, numbers, numbers[len(near) :], strict=False)
+        ]
+        return [f"blocks: {fixed} of the mesh, {every - fixed} of pairs that act ({', '.join(pairs)})"]
+
     def renew_pattern(self) -> bool:
         """Let block rows have all blocks of the Jacobian where it was last evaluated; whether they are
         others; collective.

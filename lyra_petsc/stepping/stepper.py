@@ -155,6 +155,10 @@ class Stepper:
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
         if equations.discretisation.changes or (equations.active.edged and self._iterates):
             snes.setUpdate(self._update)
+        if PETSc.Options().getBool("contact_monitor", False) and equations.discretisation.guards:
+            from lyra_petsc.stepping.contact_monitor import ContactMonitor  # of use for nothing else
+
+            snes.setMonitor(ContactMonitor(equations, lambda: newton.allowed))
         if self._iterates:
             snes.setMonitor(self._trace.monitor)
             snes.setType(PETSc.SNES.Type.NEWTONLS)

@@ -428,6 +428,12 @@ class ContactBarrier(Elastic):
         given = met.at, weight[met.at] * met.weight, met.beta, met.felt
         contact_pairs.add_hessians(x, frozen.now, *self._of_pairs, given, blend, at, values)
 
+    def largest_stiffness(self, x: Array, frozen: Places) -> float:
+        """Largest stiffness b″ [N/m] of a counted contact, by as many pairs as it counts for."""
+        met = self.meeting(x, frozen.now)
+        stiffness = met.counted * met.felt[:, 4] * np.sum(met.felt[:, :3] ** 2, axis=1)
+        return float(stiffness.max(initial=0.0))
+
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
 

@@ -38,7 +38,8 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
-from lyra_petsc.kernels.scatter import add_element
+from lyra_petsc.kernels.scatter import AHEAD, add_element
+from lyra_petsc.kernels.vectors import add_outer, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
@@ -650,17 +651,27 @@ def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met,
     ``met`` as of `add_gradient`; ``offsets`` (E, 10) as of `kernels.scatter`. No rows for obstacles.
     ``blend`` 0 is exact, 1 keeps b″ g gᵀ / |g|² only (positive semidefinite).
     """
-    p, gamma, h, slope = np.empty((4, 3)), np.empty((2, 4)), np.empty((4, 4, 3, 3)), np.zeros(12)
-    room = p, gamma, h, np.empty((2, 3)), np.empty((2, 4, 3)), np.empty((2, 4, 3)), slope
+    room = np.empty((4, 3)), np.empty((2, 4)), np.empty((2, 3)), np.empty((4, 4, 3, 3)), np.zeros(12)
+    blocks = values.reshape(-1, 9)
     for n in range(len(met[0])):
+        _fetch_ahead(n, met[0], offsets, blocks)
         _add_hessian(
-            n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
-        )
+            n, x, others, kind, points, offset, gap, stiffness, parallel,
+            met, blend, offsets, room, values, blocks,
+        )  # fmt: skip
+
+
+@leaf()
+def _fetch_ahead(n, at, offsets, blocks):  # type: ignore[no-untyped-def]
+    """Let the blocks of a later pair come into the caches."""
+    later = at[Index(min(n + AHEAD, len(at) - 1))]
+    for m in range(10):
+        fetch(blocks, offsets[later, m] >> 1)
 
 
 @leaf()
 def _add_hessian(  # type: ignore[no-untyped-def]
-    n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values
+    n, x, others, kind, points, offset, gap, stiffness, parallel, met, blend, offsets, room, values, blocks
 ):  # fmt: skip
     """Add that of row n of what was found; what ``room`` holds is of no use later."""
     at, weight, beta, felt = met
@@ -668,70 +679,120 @@ def _add_hessian(  # type: ignore[no-untyped-def]
     factor = weight[n] if weight[n] > 0.0 else (1.0 - blend) * weight[n]
     if factor == 0.0 or not abs(g[3]) < np.inf:
         return
-    p, gamma, h, e, c, a_c, slope = room
-    square = g[0] ** 2 + g[1] ** 2 + g[2] ** 2
-    first, second = (1.0 - blend) * g[3], g[4]
-    along = second - first / square
+    p, gamma, e, h, slope = room
+    first, edges = (1.0 - blend) * g[3], kind[pair] == EDGE_EDGE
     free = _free(kind[pair], b, gamma) if first != 0.0 else 0
-    edges = kind[pair] == EDGE_EDGE
     if free > 0 or edges:
         _load(x, others, points, pair, p)
     if free > 0 and kind[pair] == VERTEX_PLANE:
         _around_foot(p)
+    _directions(gamma, p, free, e)
+    if not edges or not _fades(p, parallel):
+        _add_outers(factor, points[pair], g, b, first, free, gamma, e, offsets[pair], blocks)
+        return
+    _hessian(g, b, first, free, gamma, e, h)
+    delta = math.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2) - offset[pair]
+    _add_fading(p, b, g, gap[pair], delta, stiffness, g[3], blend, parallel, slope, h)
+    for i in range(4):
+        if points[pair, i] < 0:
+            h[i], h[:, i] = 0.0, 0.0
+    add_element(factor, h, offsets[pair], values)
+
+
+@leaf()
+def _directions(gamma, p, free, e):  # type: ignore[no-untyped-def]
+    """e_k of p (4, 3) into e (2, 3)."""
     for f in range(free):
         for k in range(3):
             e[f, k] = 0.0
             for i in range(4):
                 e[f, k] += gamma[f, i] * p[i, k]
-    # A⁻¹
-    a00 = a01 = a11 = 0.0
+
+
+@leaf()
+def _inverse(free, e):  # type: ignore[no-untyped-def]
+    """A⁻¹_00, A⁻¹_01 and A⁻¹_11 of e (2, 3)."""
+    if free == 0:
+        return 0.0, 0.0, 0.0
+    u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
     if free == 1:
-        a00 = 1.0 / (e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2)
-    elif free == 2:
-        u = e[0, 0] ** 2 + e[0, 1] ** 2 + e[0, 2] ** 2
-        v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
-        w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
-        det = u * w - v * v
-        a00, a01, a11 = w / det, -v / det, u / det
-    if free > 0:
-        c[1], a_c[1] = 0.0, 0.0
-        for i in range(4):
-            for k in range(3):
-                for f in range(free):
-                    c[f, i, k] = b[i] * e[f, k] + gamma[f, i] * g[k]
-                a_c[0, i, k] = first * (a00 * c[0, i, k] + a01 * c[1, i, k])
-                a_c[1, i, k] = first * (a01 * c[0, i, k] + a11 * c[1, i, k])
-    fades = edges and _fades(p, parallel)
-    if fades:
-        h[:] = 0.0
+        return 1.0 / u, 0.0, 0.0
+    v = e[0, 0] * e[1, 0] + e[0, 1] * e[1, 1] + e[0, 2] * e[1, 2]
+    w = e[1, 0] ** 2 + e[1, 1] ** 2 + e[1, 2] ** 2
+    det = u * w - v * v
+    return w / det, -v / det, u / det
+
+
+@leaf()
+def _add_outers(factor, points, felt, beta, first, free, gamma, e, offsets, blocks):  # type: ignore[no-untyped-def]
+    """Add that of a pair which does not fade, as products of two vectors, to blocks (n_blocks, 9).
+
+    Where two coordinates are free the e_k span what is across g: I − Σ A⁻¹_kl e_k e_lᵀ is g gᵀ / |g|².
+    """
+    g = felt[0], felt[1], felt[2]
+    second = factor * felt[4]
+    first = factor * first
+    a00, a01, a11 = _inverse(free, e)
+    along = second if free == 2 else second - first / (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    e0, e1 = (e[0, 0], e[0, 1], e[0, 2]), (e[1, 0], e[1, 1], e[1, 2])
     for i in range(4):
+        b = beta[i]
+        if b == 0.0 or points[i] < 0:  # γ is 0, too, where β is
+            continue
         for j in range(i, 4):
-            if b[i] == 0.0 or b[j] == 0.0:  # γ is 0, too
+            c = beta[j]
+            if c == 0.0 or points[j] < 0:
                 continue
-            to = offsets[pair, (7 - i) * i // 2 + j]
-            if not fades and (to < 0 or points[pair, i] < 0 or points[pair, j] < 0):
+            to, both = offsets[(7 - i) * i // 2 + j], b * c
+            if to < 0:
                 continue
-            both = b[i] * b[j]
+            if free == 2:
+                p, q = gamma[0, i], gamma[1, i]
+                r, s = gamma[0, j], gamma[1, j]
+                mixed = p * (a00 * r + a01 * s) + q * (a01 * r + a11 * s)
+                own = both * along - first * mixed
+                u, v = -first * b * (a00 * r + a01 * s), -first * b * (a01 * r + a11 * s)
+                left = (
+                    own * g[0] + u * e0[0] + v * e1[0],
+                    own * g[1] + u * e0[1] + v * e1[1],
+                    own * g[2] + u * e0[2] + v * e1[2],
+                )
+                add_outer(blocks, to, 0.0, left, g)
+                u, v = -first * c * (a00 * p + a01 * q), -first * c * (a01 * p + a11 * q)
+                right = u * e0[0] + v * e1[0], u * e0[1] + v * e1[1], u * e0[2] + v * e1[2]
+                add_outer(blocks, to, 0.0, g, right)
+                continue
+            own = both * along
+            add_outer(blocks, to, both * first, (own * g[0], own * g[1], own * g[2]), g)
+            if free == 1:
+                p, r, less = gamma[0, i], gamma[0, j], -first * a00
+                left = (
+                    less * (b * e0[0] + p * g[0]),
+                    less * (b * e0[1] + p * g[1]),
+                    less * (b * e0[2] + p * g[2]),
+                )
+                right = c * e0[0] + r * g[0], c * e0[1] + r * g[1], c * e0[2] + r * g[2]
+                add_outer(blocks, to, 0.0, left, right)
+
+
+@leaf()
+def _hessian(felt, beta, first, free, gamma, e, h):  # type: ignore[no-untyped-def]
+    """Let h (4, 4, 3, 3) be that of a pair, were it not to fade."""
+    square = felt[0] ** 2 + felt[1] ** 2 + felt[2] ** 2
+    along = felt[4] - first / square
+    a00, a01, a11 = _inverse(free, e)
+    for i in range(4):
+        for j in range(4):
+            both = beta[i] * beta[j]
             for k in range(3):
+                c0 = beta[i] * e[0, k] + gamma[0, i] * felt[k] if free > 0 else 0.0
+                c1 = beta[i] * e[1, k] + gamma[1, i] * felt[k] if free > 1 else 0.0
                 for m in range(3):
-                    value = along * both * g[k] * g[m]
-                    if k == m:
-                        value += first * both
-                    if free > 0:
-                        value -= c[0, i, k] * a_c[0, j, m] + c[1, i, k] * a_c[1, j, m]
-                    if fades:
-                        h[i, j, k, m] = h[j, i, m, k] = value
-                    elif to & 1:
-                        values[to >> 1, m, k] += factor * value
-                    else:
-                        values[to >> 1, k, m] += factor * value
-    if fades:
-        delta, force = math.sqrt(square) - offset[pair], g[3]
-        _add_fading(p, b, g, gap[pair], delta, stiffness, force, blend, parallel, slope, h)
-        for i in range(4):
-            if points[pair, i] < 0:
-                h[i], h[:, i] = 0.0, 0.0
-        add_element(factor, h, offsets[pair], values)
+                    d0 = beta[j] * e[0, m] + gamma[0, j] * felt[m] if free > 0 else 0.0
+                    d1 = beta[j] * e[1, m] + gamma[1, j] * felt[m] if free > 1 else 0.0
+                    value = along * both * felt[k] * felt[m] + (first * both if k == m else 0.0)
+                    value -= first * (c0 * (a00 * d0 + a01 * d1) + c1 * (a01 * d0 + a11 * d1))
+                    h[i, j, k, m] = value
 
 
 @leaf()

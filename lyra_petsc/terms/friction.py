@@ -111,7 +111,7 @@ class CoulombFriction(Elastic):
         self._slip, self._obstacle = slip, what[:, 1].astype(np.int64)
         numbers = elements.data.get("number", np.empty((0, 4)))
         self._key = np.column_stack([numbers, what]).astype(np.int64)
-        self._limit = self._spring = force[:, 0]
+        self._force = self._limit = self._spring = force[:, 0]
         if len(force):
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(slid[:, 0] > 0.5, kinetic, static) * force[:, 0]
@@ -216,6 +216,17 @@ class CoulombFriction(Elastic):
     ) -> None:
         state = self._state(frozen.stage)
         friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
+
+    def sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
+        """How many pairs that this rank counts stick and slide at positions x (n_local, 3), and the sum of
+        the normal forces [N] that they are given in the step.
+        """
+        mine, state = slice(self.n_owned), list(self._state(frozen.stage))
+        state[SLIP] = self._slip.copy()
+        heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
+        friction_pairs.slide(x, *state, heat, slides)
+        sliding = float(np.count_nonzero(slides[mine]))
+        return self.n_owned - sliding, sliding, float(self._force[mine].sum())
 
     def force_scale(self, size: float) -> Array:
         return self._spring * size

@@ -22,6 +22,8 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
+from lyra_petsc.kernels.scatter import fetch_ahead
+from lyra_petsc.kernels.vectors import add_outer
 from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
 
@@ -73,31 +75,29 @@ def add_hessians(  # type: ignore[no-untyped-def]
     ``offsets`` (E, 10) as of `kernels.scatter`. ``blend`` 0 is exact; 1 takes a spring of the stiffness
     μ N / |u| for what slides, whose energy is nowhere less.
     """
-    u, block = np.empty(3), np.empty((3, 3))
+    u, blocks = np.empty(3), values.reshape(-1, 9)
     for e in range(len(stencil)):
+        fetch_ahead(e, offsets, blocks, 10)
         m = way(x, e, stencil, beta, normal, start, slip, u)
-        _add_hessian(e, m, u, beta, normal, stiffness[e], limit[e], weight[e], blend, offsets, block, values)
+        _add_hessian(e, m, u, beta, normal, stiffness[e], limit[e], weight[e], blend, offsets, blocks)
 
 
 @leaf()
-def _add_hessian(e, m, u, beta, normal, stiffness, limit, weight, blend, offsets, block, values):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Add that of pair e with the way u (3,), of length m, by way of ``block`` (3, 3)."""
+def _add_hessian(e, m, u, beta, normal, stiffness, limit, weight, blend, offsets, blocks):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Add that of pair e with the way u (3,), of length m, to blocks (n_blocks, 9)."""
     sticks = stiffness * m <= limit
     factor = stiffness if sticks else limit / m
     less = 0.0 if sticks else (1.0 - blend) * factor / (m * m)
-    for k in range(3):
-        for j in range(3):
-            same = 1.0 if k == j else 0.0
-            block[k, j] = factor * (same - normal[e, k] * normal[e, j]) - less * u[k] * u[j]
+    n, along = (normal[e, 0], normal[e, 1], normal[e, 2]), (u[0], u[1], u[2])
     for a in range(4):
         for b in range(a, 4):
-            both, at = weight * beta[e, a] * beta[e, b], offsets[e, (7 - a) * a // 2 + b]
-            if both == 0.0 or at < 0:
+            both, to = weight * beta[e, a] * beta[e, b], offsets[e, (7 - a) * a // 2 + b]
+            if both == 0.0:
                 continue
-            to = Index(at >> 1)
-            for k in range(3):
-                for j in range(3):
-                    values[to, k, j] += both * block[k, j]  # which is symmetric
+            own, by = both * factor, -both * less
+            add_outer(blocks, to, own, (-own * n[0], -own * n[1], -own * n[2]), n)
+            if by != 0.0:
+                add_outer(blocks, to, 0.0, (by * u[0], by * u[1], by * u[2]), along)
 
 
 @kernel()

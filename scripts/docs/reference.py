@@ -68,9 +68,11 @@ OPTIONS = {
     "By default the operator is block rows of the program's (`python`), the other as the preconditioner "
     "needs.",
     "mg_coarse_mat_type": "Type of the matrix of multigrid's coarsest level (`aij`).",
+    "contact_monitor": "Print contacts, smallest gap, stiffest contact, step limit and friction at each "
+    "Newton iterate.",
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
     "without any of "
-    "these `average`.",
+    "these `average`; with `contact` bisection of space.",
 }
 """What the program does with options that it reads, sets defaults for, or refuses."""
 

@@ -89,7 +89,7 @@ def test_coarse_matrices_are_galerkin_products(held: bool, comm: MPI.Comm) -> No
 def test_coarse_meshes_do_not_depend_on_the_partition(
     comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def at_random(ranks: MPI.Comm, graph: object, n_vertices: int) -> tuple[np.ndarray, str]:
+    def at_random(ranks: MPI.Comm, graph: object, n_vertices: int, places: object) -> tuple[np.ndarray, str]:
         return np.random.default_rng(1).integers(ranks.size, size=n_vertices), "at random"
 
     monkeypatch.setattr(distribute, "partition", at_random)

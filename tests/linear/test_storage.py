@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import weakref
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +96,31 @@ def test_products_of_our_rows_are_those_of_petscs_entries(comm: MPI.Comm) -> Non
             np.testing.assert_array_equal(z.getArray(), t.getArray())
         for item in (assembled, ours, x, y, z, t):
             item.destroy()
+
+
+@pytest.mark.parallel
+def test_a_matrix_keeps_nothing_alive_of_which_it_tells(comm: MPI.Comm, shared_tmp: Path) -> None:
+    # PETSc would free it at the end, when MPI is gone
+    class Teller:
+        def lines(self) -> list[str]:
+            return ["one line more"]
+
+    def seen(name: str) -> str:
+        viewer = PETSc.Viewer().createASCII(str(shared_tmp / name), comm=comm)
+        viewer.pushFormat(PETSc.Viewer.Format.ASCII_INFO)
+        matrix.mat.view(viewer)
+        viewer.destroy()
+        return (shared_tmp / name).read_text() if comm.rank == 0 else ""
+
+    with Simulation({"mesh": grid(1, 1, 6, 5), "material": CLOTH}, comm) as simulation:
+        teller = Teller()
+        matrix = BlockMatrix(simulation.problem.points, simulation.problem.pattern, teller.lines)
+        assert ("one line more" in seen("with")) == (comm.rank == 0)
+        kept = weakref.ref(teller)
+        del teller
+        assert kept() is None
+        assert "one line more" not in seen("without")
+        matrix.destroy()
 
 
 @pytest.mark.parallel

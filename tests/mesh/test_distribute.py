@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -12,7 +14,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.distribute import Part, Whole, distribute, split_elements
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.grids import grid_sheet
-from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
+from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, vertex_graph
 from lyra_petsc.mesh.points import Numbering, Points
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.scene.schema import Grid
@@ -132,6 +134,33 @@ def test_a_large_mesh_is_cut_evenly_with_few_ghosts(comm: MPI.Comm) -> None:
     assert max(sizes) <= 1.15 * mesh[1] / comm.size
     # a straight cut has 41 vertices a side, hinges reach one row further
     assert len(part.layout.ghosts) <= (0 if comm.size == 1 else 4 * 41)
+
+
+def layers() -> Whole:
+    """Four square sheets, 0.01 apart."""
+    triangles, n = square(12, 12)
+    flat = grid_sheet(Grid(width=1, height=1, nx=12, ny=12, pattern="alternating")).points
+    whole = whole_of(np.concatenate([triangles + n * layer for layer in range(4)]), 4 * n)
+    whole.places = np.concatenate([flat + [0.0, 0.0, 0.01 * layer] for layer in range(4)])
+    return whole
+
+
+def test_sheets_that_lie_on_each_other_are_cut_through_all(comm: MPI.Comm) -> None:
+    part = distribute(comm, layers() if comm.rank == 0 else None)
+    layer = part.layout.original // 169
+    share = np.bincount(layer, minlength=4) / 169.0
+    assert np.abs(share - 1.0 / comm.size).max() < 13.0 / 169.0  # to a row of vertices
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("ranks", [2, 3, 7])
+def test_bisection_is_even_and_across_the_longest_side(ranks: int) -> None:
+    places = np.random.default_rng(1).random((1001, 3)) * [1.0, 40.0, 0.1]
+    owner = bisection(places, ranks)
+    sizes = np.bincount(owner, minlength=ranks)
+    assert sizes.max() - sizes.min() <= 2
+    along = [places[owner == rank, 1] for rank in range(ranks)]
+    assert all(low.max() < high.min() for low, high in pairwise(along))
 
 
 def test_the_partitioner_can_be_chosen(comm: MPI.Comm) -> None:

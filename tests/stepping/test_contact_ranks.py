@@ -1,18 +1,28 @@
-"""Contact on ranks that have next to nothing, or nothing, of the sheets."""
+"""Contact does not depend on the number of ranks, and its work is shared among them."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import Simulation, grid
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import Simulation, direct_solver, gathered, grid, obj_file, scene_of
+
+from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.contact import ContactBarrier
+
+Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel
 
 SQUARE = grid(0.1, 0.1, 1, 1)
 """Two triangles, four vertices."""
+
+FLOOR = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
 
 
 def falling(above: float) -> dict[str, Any]:
@@ -24,7 +34,7 @@ def falling(above: float) -> dict[str, Any]:
         "gravity": [0, 0, -9.81],
         "contact": {"gap": 0.01},
         "obstacles": {
-            "floor": {"plane": {"point": [0, 0, 0], "normal": [0, 0, 1]}},
+            "floor": FLOOR,
             "ball": {"sphere": {"center": [0.05, 0.05, -0.03], "radius": 0.04}},
         },
         "time": {"end": 1.0, "step": 0.004},
@@ -41,3 +51,79 @@ def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
     assert heights.min() > 0.0
     assert heights[4:].max() - heights[:4].max() < 0.015  # the upper one has come near the lower one
     np.testing.assert_allclose(ways[1], ways[0], atol=1e-10)
+
+
+def two_sheets(folder: Path) -> dict[str, Any]:
+    """One falls, turned, on one that is held by two of its edges."""
+    turned = {"rotate": {"axis": [0.3, 1.0, 0.5], "degrees": 20.0}, "translate": [0.05, 0.05, 0.08]}
+    return {
+        "mesh": [grid(0.3, 0.3, 6, 6), grid(0.2, 0.2, 5, 5) | {"transform": turned}],
+        "handles": [{"nodes": [row * 7 for row in range(7)]}, {"nodes": [row * 7 + 6 for row in range(7)]}],
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "contact": {"friction": 0.3},
+    }
+
+
+def tent(folder: Path) -> dict[str, Any]:
+    """A sheet falls on an open pyramid of four triangles."""
+    corners = [(-0.1, -0.1, 0.0), (0.1, -0.1, 0.0), (0.1, 0.1, 0.0), (-0.1, 0.1, 0.0), (0.01, 0.0, 0.06)]
+    sides = [(0, 1, 4), (1, 2, 4), (2, 3, 4), (3, 0, 4)]
+    return {
+        "mesh": grid(0.24, 0.24, 8, 8) | {"transform": {"translate": [-0.12, -0.12, 0.08]}},
+        "contact": {"friction": 0.3},
+        "obstacles": {"tent": {"mesh": obj_file(folder / "tent.obj", corners, sides)}},
+    }
+
+
+def roll(folder: Path) -> dict[str, Any]:
+    """A strip in two turns falls on the floor, and collapses on itself."""
+    angles, wide = np.linspace(0.0, 4.0 * np.pi, 33), 4
+    radius = 0.05 + 0.016 * angles / (2.0 * np.pi)
+    spiral = np.column_stack([radius * np.cos(angles), radius * np.sin(angles) + 0.087])
+    rows = [(a, 0.02 * j, b) for a, b in spiral for j in range(wide)]
+    cells = [wide * i + j for i in range(len(spiral) - 1) for j in range(wide - 1)]
+    triangles = [(c, c + 1, c + wide) for c in cells] + [(c + 1, c + wide + 1, c + wide) for c in cells]
+    return {
+        "mesh": obj_file(folder / "roll.obj", rows, triangles),
+        "contact": {"friction": 0.3, "gap": 0.004},
+        "obstacles": {"floor": FLOOR},
+    }
+
+
+@pytest.mark.parametrize(("scene", "steps"), [(two_sheets, 40), (tent, 40), (roll, 40)])
+def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -> None:
+    common = {"gravity": [0.0, 0.0, -9.81], "material": {"cloth": "gray-interlock", "damping": 0.01}}
+    content = common | {"time": {"end": 1.0, "step": 0.004}}
+    (folder := shared_tmp / str(comm.rank)).mkdir()
+    content |= scene(folder)
+    ways: list[list[Array]] = []
+    for ranks in (MPI.COMM_SELF, comm):
+        for name, value in (direct_solver(ranks) | {"ksp_rtol": "1e-12"}).items():
+            PETSc.Options().setValue(name, value)
+        simulation = SteppedScene(ranks, scene_of(content))
+        size, contacts = simulation.problem.outline.size, 0.0
+        ways.append([])
+        for step in range(1, steps + 1):
+            simulation.step()
+            contacts = max(contacts, simulation.ledger.columns()["contacts"])
+            if step in (20, steps):
+                ways[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
+        assert contacts > 10.0
+        simulation.destroy()
+    for alone, together, tolerance in zip(*ways, (1e-8, 1e-6), strict=True):
+        np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
+
+
+def test_the_pairs_of_a_stack_are_shared(comm: MPI.Comm) -> None:
+    one, gap = grid(1.0, 1.0, 12, 12), 0.02
+    content = {
+        "mesh": [one | {"transform": {"translate": [0.0, 0.0, 0.9 * gap * (n + 1)]}} for n in range(4)],
+        "contact": {"gap": gap},
+        "obstacles": {"floor": FLOOR},
+    }
+    with Simulation(content, comm) as simulation:
+        contact = simulation.problem.terms["contact"]
+        assert isinstance(contact, ContactBarrier)
+        work = np.array(comm.allgather(contact.n_elements))
+        whole = comm.allreduce(contact.n_owned)
+        assert work.max() < 1.45 * whole / comm.size  # a cut is 13 vertices long, a rank 169 / ranks a sheet

@@ -108,8 +108,8 @@ def test_ranks_without_vertices(comm: MPI.Comm, preset: str, monkeypatch: pytest
         expected = direct.run(0.01, 3)
     partition = distribute.partition
 
-    def all_to_the_last(comm: MPI.Comm, graph: Any, n: int) -> tuple[Any, str]:
-        owners, name = partition(comm, graph, n)
+    def all_to_the_last(comm: MPI.Comm, graph: Any, n: int, places: Any) -> tuple[Any, str]:
+        owners, name = partition(comm, graph, n, places)
         return (None if owners is None else np.full(n, comm.size - 1)), name
 
     monkeypatch.setattr(distribute, "partition", all_to_the_last)

@@ -1,0 +1,111 @@
+"""What a user of PETSc chooses and sees of contact: preconditioners, ``-contact_monitor``, ``-ksp_view``."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import direct_solver, gathered, grid, scene_of
+
+from lyra_petsc.stepping.simulation import SteppedScene
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+SIDE, CELLS, STEPS = 0.2, 6, 6
+PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
+SCENE: dict[str, Any] = {
+    "mesh": grid(SIDE, SIDE, CELLS, CELLS) | {"transform": {"translate": [0.0, 0.0, 0.012]}},
+    "material": {"cloth": "gray-interlock", "damping": 0.01},
+    "initial": {"velocity": [0.5, 0.0, -1.0]},
+    "gravity": [0.0, 0.0, -9.81],
+    "contact": {"gap": 0.01, "friction": 0.3},
+    "obstacles": {"floor": PLANE},
+    "time": {"end": 1.0, "step": 0.005},
+}
+"""A sheet thrown on a floor, every vertex of which touches."""
+
+KINDS: dict[str, dict[str, str]] = {
+    "jacobi": {"pc_type": "jacobi"},
+    "pbjacobi": {"pc_type": "pbjacobi"},
+    "bjacobi": {"pc_type": "bjacobi"},
+    "asm": {"pc_type": "asm", "pc_asm_type": "basic"},  # symmetric, as conjugate gradients need it
+    "gamg": {"pc_type": "gamg"},
+    "mg": {"pc_type": "mg"},
+    "mumps": {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
+    "the program's choice": {},
+}
+
+
+def thrown(comm: MPI.Comm, options: dict[str, str]) -> Array:
+    """Positions (V, 3) after the steps, in mesh order; every vertex has come to touch."""
+    for name, value in options.items():
+        PETSc.Options().setValue(name, value)
+    simulation = SteppedScene(comm, scene_of(SCENE))
+    contacts = 0.0
+    for _ in range(STEPS):
+        simulation.step()
+        contacts = max(contacts, simulation.ledger.columns()["contacts"])
+    assert contacts >= (CELLS + 1) ** 2
+    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    simulation.destroy()
+    for name in options:
+        PETSc.Options().delValue(name)
+    return x
+
+
+@pytest.fixture(scope="module")
+def expected() -> Array:
+    return thrown(MPI.COMM_SELF, direct_solver(MPI.COMM_SELF))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_preconditioner_serves_contact(comm: MPI.Comm, kind: str, expected: Array) -> None:
+    if kind == "mumps" and not PETSc.Sys.hasExternalPackage("mumps"):
+        pytest.skip("PETSc has no MUMPS")
+    x = thrown(comm, KINDS[kind] | {"ksp_rtol": "1e-10"})
+    np.testing.assert_allclose(x, expected, rtol=0.0, atol=1e-7 * SIDE)
+
+
+def test_the_monitor_tells_of_contact_and_friction(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
+    PETSc.Options().setValue("contact_monitor", "")
+    PETSc.Options().setValue("ksp_view", "")
+    simulation = SteppedScene(comm, scene_of(SCENE))
+    touching, iterations, weights = [], [], []
+    capfd.readouterr()
+    for _ in range(STEPS):
+        iterations.append(simulation.step().newton_iterations)
+        columns = simulation.ledger.columns()
+        touching.append((columns["contacts"], columns["smallest_gap"]))
+        weights.append(simulation.ledger.obstacle_forces(1)[0, 2])
+    PETSc.Sys.syncFlush(comm)
+    out = capfd.readouterr().out
+    simulation.destroy()
+    lines = [line for line in out.splitlines() if " CONTACT " in line]
+    if comm.rank > 0:
+        assert lines == []
+        return
+    numbers = [int(line.split()[0]) for line in lines]
+    ends = [at for at, number in enumerate(numbers) if at + 1 == len(numbers) or numbers[at + 1] == 0]
+    assert [numbers[at] for at in ends] == iterations  # a line for each iterate
+    most_rubbing = 0
+    for at, (contacts, gap) in zip(ends, touching, strict=True):
+        line = lines[at]
+        assert f"CONTACT {contacts:.0f} contacts" in line
+        assert float(re.findall(r"smallest gap (\S+) m", line)[0]) == pytest.approx(gap, rel=1e-5)
+        stick, slide = map(int, re.findall(r"(\d+) stick, (\d+) slide", line)[0])
+        most_rubbing = max(most_rubbing, stick + slide)
+    assert most_rubbing == (CELLS + 1) ** 2
+    now = float(re.findall(r"now (\S+) N", lines[-1])[0])
+    assert now == pytest.approx(abs(weights[-1]), rel=0.05)
+    assert float(re.findall(r"step limit (\S+);", lines[-1])[0]) == 1.0
+    shown = re.findall(r"blocks: (\d+) of the mesh, (\d+) of pairs that act \((.*)\)", out)
+    assert shown
+    assert "contact " in shown[-1][2]
+    assert "friction " in shown[-1][2]
