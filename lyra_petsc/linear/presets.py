@@ -73,6 +73,15 @@ BETWEEN_RANKS: dict[str, dict[str, Value]] = {
 }
 """What a preset needs besides on more than one rank."""
 
+WITH_CHOSEN: dict[str, dict[str, Value]] = {
+    # the kind that is symmetric, without which conjugate gradients hardly come on
+    "asm": {"pc_asm_type": "basic"},
+    "gasm": {"pc_gasm_type": "basic"},
+    # else the shell DM of the SNES is asked for fields, which has none
+    "fieldsplit": {"pc_fieldsplit_dm_splits": False},
+}
+"""What goes with a ``-pc_type`` of the user's."""
+
 CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
 """Krylov methods that only multiply by their operator, and can monitor the true residual."""
 
@@ -174,14 +183,10 @@ def options_of(name: str, ranks: int) -> dict[str, Value]:
         return PRESETS[next(iter(_factorisations(ranks)), "cholesky")] | {"pc_type": chosen}
     if chosen == PETSc.PC.Type.MG:  # which means our cycle
         return PRESETS["multigrid"]
-    if (
-        chosen == PETSc.PC.Type.FIELDSPLIT
-    ):  # else the shell DM of the SNES is asked for fields, which has none
-        return {"ksp_type": "cg", "pc_fieldsplit_dm_splits": False}
     for preset in ("block-jacobi", "gamg", "multigrid"):
         if PRESETS[preset]["pc_type"] == chosen:
             return options_of(preset, ranks)
-    return {"ksp_type": "cg"}
+    return {"ksp_type": "cg"} | WITH_CHOSEN.get(chosen, {})
 
 
 def matrix_type(preset: str) -> str:

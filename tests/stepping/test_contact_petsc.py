@@ -35,7 +35,8 @@ KINDS: dict[str, dict[str, str]] = {
     "jacobi": {"pc_type": "jacobi"},
     "pbjacobi": {"pc_type": "pbjacobi"},
     "bjacobi": {"pc_type": "bjacobi"},
-    "asm": {"pc_type": "asm", "pc_asm_type": "basic"},  # symmetric, as conjugate gradients need it
+    "asm": {"pc_type": "asm"},
+    "gasm": {"pc_type": "gasm"},
     "gamg": {"pc_type": "gamg"},
     "mg": {"pc_type": "mg"},
     "mumps": {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"},
