@@ -184,7 +184,8 @@ class ToleranceControl(StepControl):
 class LoadControl(StepControl):
     """Increments of the load factor: larger after an easy step, halved after a failure.
 
-    ``step`` is the first increment, ``largest`` the largest; ``factor`` may grow beyond 1.
+    ``step`` is the first increment, and the largest one after an event, ``largest`` the largest of all;
+    ``factor`` may grow beyond 1.
     """
 
     EASY = 12
@@ -195,6 +196,11 @@ class LoadControl(StepControl):
     ) -> None:
         super().__init__(step, end, None, events, smallest)
         self._largest = largest
+
+    def next_end(self, time: float) -> float:
+        if time in self._events:  # where motions and loads may turn: equilibria lead elsewhere
+            self.factor = min(self.factor, 1.0)
+        return super().next_end(time)
 
     def succeeded(self, iterations: int) -> None:
         larger = 2.0 * self.factor if iterations <= self.EASY else self.factor
