@@ -125,19 +125,19 @@ CHANGES: list[Change] = [
         STEPPING + "energy_balance.py",
         "setattr(self.budget, name, float(value))",
         "setattr(self.budget, name, 0.0)",
-        (RESUME + "[beuler-2]",),
+        (RESUME + "[beuler-9]",),
     ),
     Change(
         STEPPING + "simulation.py",
         'self.estimated_error = float(memory["estimated_error"])',
         "self.estimated_error = 0.0",
-        (RESUME + "[beuler, adaptive-2]",),
+        (RESUME + "[beuler, adaptive-9]",),
     ),
     Change(
         STEPPING + "simulation.py",
         'self.totals |= {name: int(number) for name, number in memory.get("totals", {}).items()}',
         "pass",
-        (RESUME + "[midpoint-2]",),
+        (RESUME + "[midpoint-9]",),
     ),
     Change(
         STEPPING + "simulation.py",
@@ -149,7 +149,7 @@ CHANGES: list[Change] = [
         STEPPING + "simulation.py",
         'self.local_error.restore(arrays, memory["integrator"])',
         "pass",
-        (RESUME + "[bdf2, adaptive-2]",),
+        (RESUME + "[bdf2, adaptive-1]",),
     ),
     Change(
         STEPPING + "extrapolation.py",
@@ -167,7 +167,7 @@ CHANGES: list[Change] = [
         OUTPUT + "history.py",
         'return int(line.split(",", 1)[0]) <= last_step',
         'return int(line.split(",", 1)[0]) < last_step',
-        (RESUME + "[beuler-2]",),
+        (RESUME + "[beuler-9]",),
     ),
     Change(
         OUTPUT + "checkpoint.py",

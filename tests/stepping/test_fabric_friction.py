@@ -121,7 +121,7 @@ def falling(integrator: str, step: float = 0.002) -> dict[str, Any]:
         "material": FABRIC | {"friction_moment": MOMENT, "friction_force": FORCE},
         "gravity": [0.0, 0.0, -9.81],
         "handles": [{"group": "left", "clamp": True}],
-        "time": {"end": 0.08, "step": step, "integrator": integrator},
+        "time": {"end": 0.05, "step": step, "integrator": integrator},
         "solver": {"force_tolerance": 1e-11, "step_tolerance": 1e-10},
         "petsc": {"ksp_rtol": 1e-10},
     }

@@ -55,7 +55,9 @@ def at_end(integrator: str, steps: int, comm: MPI.Comm, **time: float) -> Array:
     "integrator", [name if name != "bdf2" else pytest.param(name, marks=pytest.mark.quick) for name in ORDERS]
 )
 def test_observed_order(integrator: str, comm: MPI.Comm) -> None:
-    shapes = [at_end(integrator, steps, comm) for steps in (40, 80, 160)]
+    # with longer steps backward Euler does not show its order yet
+    coarsest = 40 if integrator == "beuler" else 20
+    shapes = [at_end(integrator, factor * coarsest, comm) for factor in (1, 2, 4)]
     first, second = (float(np.abs(shapes[i + 1] - shapes[i]).max()) for i in range(2))
     assert np.log2(first / second) == pytest.approx(ORDERS[integrator], abs=0.1)
 
@@ -106,7 +108,7 @@ LYING = MOVING | {
 def test_second_order_while_something_touches(integrator: str, comm: MPI.Comm) -> None:
     shapes = []
     # with longer ones its first step is repeated by shorter ones, as it makes energy
-    for steps in (160, 320, 640) if integrator == "bdf2" else (40, 80, 160):
+    for steps in (80, 160, 320) if integrator == "bdf2" else (30, 60, 120):
         time = {"end": END, "step": END / steps, "integrator": integrator}
         simulation = SteppedScene(comm, scene_of(LYING | {"time": time}))
         weight, carried = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum())), 0.0
