@@ -19,9 +19,13 @@ from lyra_petsc.scene.materials.library import measured
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "fabrics.md"
-PICTURE = "fabrics.png"
+SHEETS = PAGE.with_suffix("")
 MADE = "<!-- made by scripts/docs/fabrics.py; change the program, not this page -->"
 CLOTHS = [*measured(), "aluminium", "paper"]
+
+SHAPES = ("cantilever", "loop")
+CURVES = ("tensile", "shear", "bending", *SHAPES)
+"""Tests with curves, and those whose curves are shapes."""
 
 COLUMNS = {
     "EMT [%]": ("tensile", "EMT"),
@@ -67,22 +71,32 @@ def cell(found: list[Record], quantity: str) -> str:
     return " / ".join(words)
 
 
-def picture(folder: Path) -> bool:
-    """All shadows beside each other; whether there are any."""
+def sheet(folder: Path, cloth: str) -> bool:
+    """Curves and shadow of a cloth beside each other; whether there are any."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    shadows = {cloth: r.shadow for cloth in CLOTHS for r in records(folder, cloth, "cusick") if r.shadow}
-    if not shadows:
+    found = {test: records(folder, cloth, test) for test in (*CURVES, "cusick")}
+    if not any(found.values()):
         return False
-    figure = Figure(figsize=(7.2, 1.9 * math.ceil(len(shadows) / 4)), layout="constrained")
+    figure = Figure(figsize=(10.0, 2.0), layout="constrained")
     FigureCanvasAgg(figure)
-    for number, (cloth, shadow) in enumerate(shadows.items(), 1):
-        axes = figure.add_subplot(math.ceil(len(shadows) / 4), 4, number)
-        axes.set_title(cloth, fontsize=7)
-        axes.axis("off")
-        axes.imshow(shadow, cmap="Greys", origin="lower", vmin=0, vmax=1.4)
-    figure.savefig(PAGE.with_name(PICTURE), dpi=80, metadata={"Software": None})
+    panels = figure.subplots(1, len(found))
+    for axes, (test, of_test) in zip(panels, found.items(), strict=True):
+        axes.set_title(test, fontsize=8)
+        axes.tick_params(labelsize=6)
+        for record, style in zip(of_test, ("-", "--"), strict=False):
+            if record.shadow:
+                axes.axis("off")
+                axes.imshow(record.shadow, cmap="Greys", origin="lower", vmin=0, vmax=1.4)
+            for curve in record.curves:
+                axes.plot(curve.x, curve.y, "k" + style, linewidth=1.0)
+                axes.set_xlabel(curve.x_label, fontsize=7)
+                axes.set_ylabel(curve.y_label, fontsize=7)
+        if test in SHAPES:
+            axes.set_aspect("equal", "datalim")
+    SHEETS.mkdir(exist_ok=True)
+    figure.savefig(SHEETS / f"{cloth}.png", dpi=80, metadata={"Software": None})
     return True
 
 
@@ -107,8 +121,10 @@ def page(folder: Path) -> None:
     for cloth in CLOTHS:
         cells = [cell(records(folder, cloth, test), quantity) for test, quantity in columns.values()]
         lines.append(f"| {cloth} | " + " | ".join(cells) + " |")
-    if picture(folder):
-        lines += ["", f"![Shadows of the drape test]({PICTURE})"]
+    lines += ["", "## Sheets", "", "Warp solid, weft dashed; the shadow is that of the last start."]
+    for cloth in CLOTHS:
+        if sheet(folder, cloth):
+            lines += ["", f"### {cloth}", "", f"![Tests of {cloth}]({SHEETS.name}/{cloth}.png)"]
     PAGE.write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
