@@ -124,7 +124,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """What has been imported stays: no later collection of garbage, one a parallel test, need look at it."""
+    """Leave what imports made out of garbage collections, with one of which each parallel test ends."""
     gc.collect()
     gc.freeze()
 

@@ -171,8 +171,7 @@ class EdgeCouplings:
 
     def take(self, values: Array, least: float, out: EdgeValues, wide: EdgeValues | None = None) -> None:
         """Copy block rows (n_blocks, 9); entries up to ``least`` become 0, but in ``wide``."""
-        nothing = EdgeValues(np.empty((0, 9)), np.empty((0, 3 * GROUP)), np.empty((0, 1)))
-        whole = nothing if wide is None else wide
+        whole = wide or EdgeValues(np.empty((0, 9)), np.empty((0, 3 * GROUP)), np.empty((0, 1)))
         where = self._block, self._triple, self._number
         _take(*where, values, values.reshape(-1), least, wide is not None, *out, *whole)
 

@@ -199,7 +199,7 @@ def forward_ahead(  # type: ignore[no-untyped-def]
 
 
 def memory_needed(couplings: EdgeCouplings, product: ProductWithEdges | None) -> int:
-    """In numbers of double precision, by sweeps and by a product with the same rows."""
+    """How many float64 numbers the copies of rows for sweeps, and for a product with these rows, take."""
     return -(-couplings.n_values // 2) + (0 if product is None else couplings.n_values)
 
 
@@ -312,7 +312,7 @@ class SweepsWithEdges:
         backward_vertices(*rows, self._inverse, x, self.r, self.of_edges)
 
     def backward_again(self, x: Floats, number: int) -> None:
-        """Sweep over the vertices for the time ``number``, from 0; every second time over edges too."""
+        """Sweep over the vertices once more, and if ``number`` is even over the edges before that."""
         if number % EDGES_EVERY == 0:
             self._moved[:] = 0.0
             self.backward(self._moved)
@@ -328,12 +328,12 @@ class SweepsWithEdges:
         subtract_ghosts(self._edges_beside, *self._rows, self._values.blocks, x, self.of_edges)
 
     def correct(self, x: Floats) -> bool:
-        """Add to x (n_local, 3) what the diagonal makes of the residual of owned edges; whether it does."""
+        """Add to x (n_local, 3) the residual of owned edges over the diagonal; True, as x has changed."""
         correct_edges(self._first, self._inverse_of_edges, x, self.of_edges)
         return True
 
     def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
-        """Sweep over the vertices, ``number`` sweeps before the last; every second time over edges too."""
+        """Sweep over the vertices, and if ``number`` is even over the edges after that."""
         blocks, groups, numbers = self._values
         rows = *self._rows, *self._groups, blocks, groups
         if number % EDGES_EVERY:

@@ -274,11 +274,11 @@ class BlockSweeps:
         backward(*self._rows, self._blocks, self._inverse, x, self.r)
 
     def inertia(self) -> Array | None:
-        """Of use where sweeps may be worth to be repeated: nowhere."""
+        """None: more sweeps are not worth their time here."""
         return None
 
     def backward_again(self, x: Floats, number: int) -> None:
-        """Sweep once more, for whichever time, from where the residual is that of x, b − A x."""
+        """Sweep once more, from where the residual is that of x, b − A x; ``number`` does not matter."""
         if self._moved is None:
             self._moved = np.zeros_like(x)
         self._moved[:] = 0.0
@@ -290,9 +290,9 @@ class BlockSweeps:
         subtract_ghosts(self._beside, *self._rows, self._blocks, x, self.r)
 
     def correct(self, x: Floats) -> bool:
-        """Whether something is added to x (n_local, 3) beside what coarser levels find: nothing."""
+        """False: x (n_local, 3) needs no correction beside that of coarser levels."""
         return False
 
     def forward(self, b: Floats, x: Floats, number: int = 0) -> None:
-        """Sweep, whichever follow; see the function."""
+        """Sweep; see the function. ``number`` does not matter."""
         forward(*self._rows, self._blocks, self._inverse, b, x, self.r)

@@ -45,11 +45,11 @@ class _Product:
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, rows: Array, told: Callable[[], list[str]] | None
+        self, points: Points, pattern: BlockPattern, rows: Array, summary: Callable[[], list[str]] | None
     ) -> None:
-        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: what is told of
-        # has PETSc objects of its own, and must not be freed then
-        self._told = None if told is None else weakref.WeakMethod(told)
+        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: the summary's
+        # object has PETSc objects of its own, and must not be freed then
+        self._summary = None if summary is None else weakref.WeakMethod(summary)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
         edges = pattern.edge_couplings
@@ -81,8 +81,9 @@ class _Product:
     def view(self, mat: PETSc.Mat, viewer: PETSc.Viewer) -> None:
         """Show the entries, as ``-ksp_view_mat`` asks, or for ``-ksp_view`` how they are kept; collective."""
         if viewer.getType() == PETSc.Viewer.Type.ASCII and viewer.getFormat() in SUMMARIES:
-            told = None if self._told is None else self._told()
-            lines = ["block rows of the program, of which one half is stored", *(told() if told else [])]
+            summary = None if self._summary is None else self._summary()
+            lines = ["block rows of the program, of which one half is stored"]
+            lines += summary() if summary else []
             viewer.printfASCII("".join(f"  {line}\n" for line in lines))
             return
         whole = AssembledMatrix(self._all_points, self._pattern, "aij")
@@ -99,7 +100,7 @@ class BlockMatrix:
     ----------
     points : Points
     pattern : BlockPattern
-    told : method or None
+    summary : method or None
         Further lines of ``-ksp_view``; collective. Its object is not kept alive.
 
     Attributes
@@ -117,7 +118,7 @@ class BlockMatrix:
     kind = "python"
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, told: Callable[[], list[str]] | None = None
+        self, points: Points, pattern: BlockPattern, summary: Callable[[], list[str]] | None = None
     ) -> None:
         rows = 3 * points.n_owned
         self.mat = PETSc.Mat().create(points.comm)
@@ -127,7 +128,7 @@ class BlockMatrix:
         self.rows = np.zeros((pattern.n_blocks, 3, 3))
         self.followers: list[Callable[[Array], None]] = []
         self._diagonal = pattern.indptr[:-1]
-        made = _Product(points, pattern, self.rows, told)
+        made = _Product(points, pattern, self.rows, summary)
         self.product = made.multiply
         self.mat.setPythonContext(made)
         _set_vec_type(self.mat)

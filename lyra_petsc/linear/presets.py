@@ -74,13 +74,13 @@ BETWEEN_RANKS: dict[str, dict[str, Value]] = {
 """What a preset needs besides on more than one rank."""
 
 WITH_CHOSEN: dict[str, dict[str, Value]] = {
-    # the kind that is symmetric, without which conjugate gradients hardly come on
+    # the kind that is symmetric, without which conjugate gradients hardly converge
     "asm": {"pc_asm_type": "basic"},
     "gasm": {"pc_gasm_type": "basic"},
     # else the shell DM of the SNES is asked for fields, which has none
     "fieldsplit": {"pc_fieldsplit_dm_splits": False},
 }
-"""What goes with a ``-pc_type`` of the user's."""
+"""Further options with a ``-pc_type`` that the user chose."""
 
 CONJUGATE_GRADIENTS = ("cg", "fcg", "pipecg", "groppcg")
 """Krylov methods that only multiply by their operator, and can monitor the true residual."""

@@ -23,8 +23,8 @@ MOST_ENTRIES = 2_000_000
 """Entries of a scene once its YAML anchors are expanded."""
 
 
-def read_text(path: Path, *, largest: float = LARGEST_SCENE) -> str:
-    """The text of a file.
+def read_text(path: Path, *, largest: float = LARGEST_SCENE, remedy: str = "") -> str:
+    """The text of a file; ``remedy`` says what to do where it is too large.
 
     Raises
     ------
@@ -40,7 +40,8 @@ def read_text(path: Path, *, largest: float = LARGEST_SCENE) -> str:
             raise InputError("is not a regular file", file=path)
         size = path.stat().st_size
         if size > largest:
-            raise InputError(f"holds {size} bytes; at most {largest} are read", file=path)
+            words = f"holds {size} bytes; at most {largest} are read"
+            raise InputError(f"{words}; {remedy}" if remedy else words, file=path)
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"is not UTF-8 text (byte {error.start})", file=path) from None

@@ -163,7 +163,7 @@ class EnergyGuard:
                 layout.update_ghosts(values)
         x1, v1, at = system.x, system.v, system.prescribed.at
         moved, gained = x1[:n] - x0[:n], v1[:n] - v0[:n]
-        works, least = self._least_heat(x1 - x0, works)
+        works, heat_beside = self._with_least_heat(x1 - x0, works)
         change = 0.5 * float(np.einsum("i,ij,ij", system.mass, gained, gained))
         # what the ledger's kinetic energies hold beyond the free coordinates
         driven = [0.5 * float(np.vdot(system.mass.take(at // 3), v.take(at) ** 2)) for v in (v0, v1)]
@@ -171,13 +171,13 @@ class EnergyGuard:
         work += self._handle_work(x0, x1, moved, works)
         pulled = self._of_targets(x0, x1)
         reach = max(float(x1.max(initial=0.0)), -float(x1.min(initial=0.0)))
-        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2, least)
+        local = (*driven, change, work, *pulled, works.moving, self._stiff * reach**2, heat_beside)
         sums = [float(value) for value in layout.summed(*local)]
-        slower, faster, change, work, rise, from_targets, *springs, moving, stiff, least = sums
+        slower, faster, change, work, rise, from_targets, *springs, moving, stiff, heat_beside = sums
         slower, faster = before.kinetic - slower, after.kinetic - faster
         work += from_targets
         plain = after.elastic - before.elastic - moving
-        heat, fall = works.heat + least, after.potential - before.potential
+        heat, fall = works.heat + heat_beside, after.potential - before.potential
         gain = faster - slower + plain + rise + fall + heat - work
         energy, energy_before = faster + after.elastic + springs[1], slower + before.elastic + springs[0]
         sizes = energy + energy_before + before.kinetic + after.kinetic
@@ -197,9 +197,10 @@ class EnergyGuard:
             noise=noise,
         )
 
-    def _least_heat(self, moved: Array, works: Works) -> tuple[Works, float]:
-        """Works with the damping of uniform motion along ``moved`` (n_local, 3), and this rank's part of how
-        much more heat [J] that makes than the forces at the stage."""
+    def _with_least_heat(self, moved: Array, works: Works) -> tuple[Works, float]:
+        """The works with the damping forces of uniform motion along ``moved`` (n_local, 3), and what this
+        rank must add to their heat [J] for it to be that of this motion.
+        """
         system = self._system
         if not system.damping.acts or system.integrator.order == 1 or system.integrator.by_stage:
             return works, 0.0

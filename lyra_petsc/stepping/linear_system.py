@@ -79,11 +79,11 @@ class LinearSystem:
         if is_set("mat_type") or self._one_matrix:
             self.operator = AssembledMatrix(layout, pattern, kind)
         else:
-            self.operator = BlockMatrix(layout, pattern, self._equations.told_of_blocks)
+            self.operator = BlockMatrix(layout, pattern, self._equations.block_summary)
         self.preconditioner = self.operator
         if self.cycles:
             if self._regularised or isinstance(self.operator, AssembledMatrix):
-                self.preconditioner = BlockMatrix(layout, pattern, self._equations.told_of_blocks)
+                self.preconditioner = BlockMatrix(layout, pattern, self._equations.block_summary)
             self._multigrid = self._levels()
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE
@@ -107,9 +107,9 @@ class LinearSystem:
 
             below = VertexEquations(self._equations)
         product = self.preconditioner.product
-        shared = (
-            None if isinstance(product, HalfStored) or self.preconditioner is not self.operator else product
-        )
+        shared = None
+        if self.preconditioner is self.operator and not isinstance(product, HalfStored):
+            shared = product
         hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, shared)
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
@@ -152,13 +152,12 @@ class LinearSystem:
         convex : bool
             The Hessian was positive definite when it was last seen.
         """
-        self._set_both(v, blend, keep=keep, convex=convex)
+        self.set_operator(v, blend)
+        if self.preconditioner is not self.operator:
+            self._set_preconditioner(v, keep=keep, convex=convex)
         self._equations.forget_directors()
 
-    def _set_both(self, v: Array, blend: float, *, keep: bool, convex: bool) -> None:
-        self.set_operator(v, blend)
-        if self.preconditioner is self.operator:
-            return
+    def _set_preconditioner(self, v: Array, *, keep: bool, convex: bool) -> None:
         if not self._regularised:
             self.preconditioner.set(self.operator.rows, self.shift.value)
             return

@@ -674,8 +674,10 @@ class StageEquations:
         parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
         return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
 
-    def told_of_blocks(self) -> list[str]:
-        """Lines on the elements with changing stencils, and the blocks they add to the matrix; collective."""
+    def block_summary(self) -> list[str]:
+        """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
+        collective.
+        """
         near, frozen = self.active.near, self.active.frozen
         if not near:
             return []

@@ -38,8 +38,8 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
-from lyra_petsc.kernels.scatter import AHEAD, add_element
-from lyra_petsc.kernels.vectors import add_outer, fetch
+from lyra_petsc.kernels.scatter import AHEAD, add_element, fetch_ahead
+from lyra_petsc.kernels.vectors import add_outer
 from lyra_petsc.terms.hinge import cross, dot, minus
 
 VERTEX_TRIANGLE, EDGE_EDGE, VERTEX_PLANE, VERTEX_INSIDE = 0, 1, 2, 3
@@ -654,19 +654,11 @@ def add_hessians(x, others, kind, points, offset, gap, stiffness, parallel, met,
     room = np.empty((4, 3)), np.empty((2, 4)), np.empty((2, 3)), np.empty((4, 4, 3, 3)), np.zeros(12)
     blocks = values.reshape(-1, 9)
     for n in range(len(met[0])):
-        _fetch_ahead(n, met[0], offsets, blocks)
+        fetch_ahead(met[0][Index(min(n + AHEAD, len(met[0]) - 1))], offsets, blocks, 10, 0)
         _add_hessian(
             n, x, others, kind, points, offset, gap, stiffness, parallel,
             met, blend, offsets, room, values, blocks,
         )  # fmt: skip
-
-
-@leaf()
-def _fetch_ahead(n, at, offsets, blocks):  # type: ignore[no-untyped-def]
-    """Let the blocks of a later pair come into the caches."""
-    later = at[Index(min(n + AHEAD, len(at) - 1))]
-    for m in range(10):
-        fetch(blocks, offsets[later, m] >> 1)
 
 
 @leaf()

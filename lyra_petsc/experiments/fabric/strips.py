@@ -21,6 +21,7 @@ from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import ShellMaterial
+from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
@@ -95,7 +96,7 @@ LONGEST, PULLS = 1.0, 30
 TENSION = 10.0 * GF_PER_CM
 """Of a shear test [N/m]"""
 
-SHEARED, SHEARS = 8.0, 16
+SHEARED, SHEARS = KES_ANGLE, 16
 """Largest angle [°], and steps to it"""
 
 WIDE = 15 * CLAMPED
@@ -225,7 +226,7 @@ def shear(bench: Bench, fabric: Fabric, degrees: float) -> Record:
 # -- KES-F 2 ---------------------------------------------------------------------------------------------
 
 LENGTH = 0.01
-CURVED, TURNS = 250.0, 10
+CURVED, TURNS = 100.0 * KES_CURVATURE, 10
 """Largest curvature [1/m], and steps to it"""
 
 

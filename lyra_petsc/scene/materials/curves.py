@@ -43,9 +43,9 @@ def read_curve(path: Path) -> list[Place]:
         If it cannot be read, or a line has not two numbers.
     """
     found: list[Place] = []
-    if path.is_file() and path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"is too large; thin the curve out to at most {MOST_POINTS} points", file=path)
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    remedy = f"thin the curve out to at most {MOST_POINTS} points"
+    text = read_text(path, largest=LARGEST_FILE, remedy=remedy)
+    for number, line in enumerate(text.splitlines(), start=1):
         columns = re.sub("[;,\"']", " ", line.split("#")[0]).split()
         try:
             strain, force = map(float, columns)

@@ -77,7 +77,7 @@ class NoHistory:
         """Remember the step that led from x, v; ``free`` marks the coordinates nothing prescribed."""
 
     def shift_past(self, change: Array) -> None:
-        """Let remembered positions be measured from others: they change by ``change`` (n_owned, 3) [m]."""
+        """Add ``change`` (n_owned, 3) [m] to remembered positions, as their reference is another."""
 
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
