@@ -18,8 +18,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
+from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.linear.block_rows import BlockRows
-from lyra_petsc.linear.pattern import MISSING, BlockPattern, union
+from lyra_petsc.linear.pattern import BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
@@ -109,7 +110,7 @@ class Discretisation:
         self.rows = self.fixed
         self.place: Ints | None = None
         self._rows_of = layout  # that ``rows`` were made for
-        self._located = False  # whether the pattern has the offsets of the present stencils
+        self._located: set[str] = set()  # terms of whose present stencils the pattern has the offsets
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
         self._found: dict[Elastic, tuple[Ints, Ints | Array]] = {}
@@ -148,12 +149,11 @@ class Discretisation:
             if layout is not self._fixed_layout:
                 layout.destroy()
             self.layout = layout = self._fixed_layout.with_ghosts(more)
-        changed = others
         for term in self._changing if others else asked:
             elements = self._elements(*self._found[term])
-            changed |= not np.array_equal(elements.stencil, term.stencil)
+            if others or not np.array_equal(elements.stencil, term.stencil):
+                self._located.discard(term.name)
             term.take(elements)
-        self._located &= not changed
         return others
 
     def _renewed(self, here: Array, to: Array) -> list[Elastic]:
@@ -296,13 +296,13 @@ class Discretisation:
         first = stencil[:, 0]
         counted = (first >= layout.start) & (first < layout.start + layout.n_owned)
         # one order of the elements on any search, so that the same elements are the same stencil
-        order = np.lexsort((*what.T[:TELLING][::-1], *stencil.T[::-1], ~counted))
-        local = layout.local(stencil[order].ravel()).reshape(stencil.shape).astype(np.int32)
-        return Elements(
-            local,
-            {"what": what[order].astype(np.float64), "number": stencil[order].astype(np.float64)},
-            int(counted.sum()),
-        )
+        parts = np.flatnonzero(counted), np.flatnonzero(~counted)
+        order = np.concatenate([ascending(part, stencil, what, TELLING) for part in parts])
+        if (order[1:] < order[:-1]).any():
+            stencil, what = stencil[order], what[order]
+        local = layout.local(stencil.ravel()).reshape(stencil.shape).astype(np.int32)
+        data = {"what": what.astype(np.float64, copy=False), "number": stencil.astype(np.float64)}
+        return Elements(local, data, len(parts[0]))
 
     def renew_pattern(self, acting: Mapping[Elastic, NDArray[np.bool_]]) -> bool:
         """Let ``rows`` have the blocks of those elements that act (E,); whether they are others than before.
@@ -314,13 +314,12 @@ class Discretisation:
             return False
         n_local = self.layout.n_local
         stencils = {term.name: term.stencil for term in self._changing}
+        pattern = self.rows.pattern
         fits = fits_layout = self._rows_of is self.layout  # another may have as many rows
-        if fits and not self._located:
-            self.rows.pattern.locate(stencils)
-            self._located = True
         if fits:
-            offsets = self.rows.pattern.offsets
-            fits = not any((offsets[term.name][acting[term]] == MISSING).any() for term in self._changing)
+            pattern.locate({name: stencil for name, stencil in stencils.items() if name not in self._located})
+            self._located = set(stencils)
+            fits = not any(pattern.lacks(term.name, acting[term]) for term in self._changing)
         if not self.layout.comm.allreduce(int(not fits), MPI.MAX):
             return False
         # with those of elements that do not act yet: some soon will
@@ -331,7 +330,7 @@ class Discretisation:
         pattern, self.place = self.fixed.pattern.extended(self._extra, n_local)
         self.rows = BlockRows(pattern)
         pattern.locate(stencils)
-        self._rows_of, self._located = self.layout, True
+        self._rows_of, self._located = self.layout, set(stencils)
         return True
 
     def destroy(self) -> None:

@@ -53,6 +53,16 @@ def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
                 pair += 1
 
 
+@cached()
+def _lacks(offsets, acting):  # type: ignore[no-untyped-def]
+    for e in range(len(offsets)):
+        if acting[e]:
+            for pair in range(offsets.shape[1]):
+                if offsets[e, pair] == MISSING:
+                    return True
+    return False
+
+
 class BlockPattern:
     """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
 
@@ -103,6 +113,10 @@ class BlockPattern:
         """Take the offsets of further elements; `MISSING` where a coupling has no block."""
         for name, stencil in stencils.items():
             self.offsets[name] = self.offsets_of(stencil)
+
+    def lacks(self, name: str, acting: NDArray[np.bool_]) -> bool:
+        """Whether a coupling of those elements of `locate` that act (E,) has no block."""
+        return bool(_lacks(self.offsets[name], acting))
 
     def offsets_of(self, coupling: Coupling) -> Offsets:
         """Offsets of elements; `MISSING` where a coupling has no block."""

@@ -389,7 +389,7 @@ class ContactBarrier(Elastic):
             found = *numbers, np.empty((room, 4)), np.empty(room), np.empty((room, 5))
             met = contact_pairs.meeting(x, places, *of, least, found)
             if met <= room:
-                return least, *(part[:met].copy() for part in found)
+                return least, *(part[:met] for part in found)
             self._room = met + met // 4
 
     @property

@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
 from lyra_petsc.terms import friction_pairs
 from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
-from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE
+from lyra_petsc.terms.contact_pairs import EDGE_EDGE
+from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, SLID
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
 
@@ -33,25 +35,20 @@ ELASTIC = 0.01
 
 
 class Pairs(NamedTuple):
-    """Pairs in contact at an accepted state, those that this rank counts.
+    """Pairs in contact at an accepted state, those that this rank counts, with ascending keys.
 
     Attributes
     ----------
     key : (E, 10)
         Numbers of the vertices, kind, obstacle, its points (0 for vertices): what tells a pair from others.
-    slip : (E, 3)
-        Elastic part of the way so far [m].
-    slid : (E,)
-        Whether it slid in the last step.
-    geometry : (E, 14)
-        β (0 for obstacles' points), unit normals, Σ β_i x_i [m], where an obstacle is touched [m], normal
+    what : (E, 24)
+        The key without the vertices; elastic part of the way so far [m]; 1 if it slid in the last step; β (0
+        for obstacles' points), unit normals, Σ β_i x_i [m], where an obstacle is touched [m], normal
         force [N].
     """
 
     key: Ints
-    slip: Array
-    slid: Mask
-    geometry: Array
+    what: Array
 
 
 class ObstacleMoves(NamedTuple):
@@ -71,9 +68,7 @@ class ObstacleMoves(NamedTuple):
 
 
 def _no_pairs() -> Pairs:
-    return Pairs(
-        np.empty((0, 10), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.bool_), np.empty((0, 14))
-    )
+    return Pairs(np.empty((0, 10), dtype=np.int64), np.empty((0, COLUMNS)))
 
 
 class CoulombFriction(Elastic):
@@ -90,9 +85,9 @@ class CoulombFriction(Elastic):
         assert scene.contact is not None
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
-        self._pairs = _no_pairs()
+        self._pairs = self._known = _no_pairs()
         self.stale = False
-        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, 24))}))
+        super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
     def set_up(self, contact: ContactBarrier) -> None:
         """Know the contact whose pairs rub."""
@@ -104,62 +99,44 @@ class CoulombFriction(Elastic):
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
-        columns = np.split(elements.data["what"].reshape(-1, 24), [6, 9, 10, 14, 17, 20, 23], axis=1)
-        what, slip, slid, *geometry = (np.ascontiguousarray(part) for part in columns)
-        self._beta, self._normal, self._still, self._foot, force = geometry
-        self._start = self._still
-        self._slip, self._obstacle = slip, what[:, 1].astype(np.int64)
-        numbers = elements.data.get("number", np.empty((0, 4)))
-        self._key = np.column_stack([numbers, what]).astype(np.int64)
-        self._force = self._limit = self._spring = force[:, 0]
-        if len(force):
+        what = elements.data["what"].reshape(-1, COLUMNS)
+        n = len(what)
+        self._beta, vectors = np.empty((n, 4)), np.empty((4, n, 3))
+        self._normal, self._still, self._slip, self._foot = vectors
+        friction_pairs.unpack(what, self._beta, self._normal, self._still, self._slip, self._foot)
+        self._start, self._obstacle = self._still, what[:, 1].astype(np.int64)
+        self._force = self._limit = self._spring = what[:, FORCE].copy()
+        if n:
             static, kinetic = self._coefficients[self._obstacle].T
-            self._limit = np.where(slid[:, 0] > 0.5, kinetic, static) * force[:, 0]
+            self._limit = np.where(what[:, SLID] > 0.5, kinetic, static) * self._force
             self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
         self._moved: list[tuple[Array, Array]] | None = None  # what the starts are of
 
     # -- pairs -------------------------------------------------------------------------------------
 
     def known(self) -> tuple[Ints, Array]:
-        self.stale, p = False, self._pairs
-        return p.key[:, :4], np.column_stack([p.key[:, 4:], p.slip, p.slid, p.geometry])
+        self.stale, self._known = False, self._pairs
+        return self._pairs.key[:, :4], self._pairs.what
 
-    def _renew(self, x: Array, places: Array) -> None:
-        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points."""
-        contact, old = self._contact, self._pairs
-        beta, normal, force, met = contact.touching(x, places, contact.n_owned)
-        points, number, kind = contact.points[met], contact.number[met].copy(), contact.kind[met]
-        sheet = points >= 0
-        start = np.einsum("ei,eik->ek", np.where(sheet, beta, 0.0), x[contact.stencil[met]])
-        points = np.where(sheet, 0, points)
-        # before a vertex of a sheet only what is nearest tells a triangle
-        vertex = np.flatnonzero((kind == VERTEX_TRIANGLE) & sheet[:, 0])
-        nearest = beta[vertex, 1:] != 0.0
-        first = 1 + nearest.argmax(axis=1)[:, None]
-        for of in (number, points):
-            given = of[vertex]
-            of[vertex, 1:] = np.where(nearest, given[:, 1:], np.take_along_axis(given, first, axis=1))
-        beta = np.where(sheet, beta, 0.0)
-        key = np.column_stack([number, kind, contact.obstacle[met], points])
-        side = beta.sum(axis=1)[:, None]  # 1 or −1 where the other side is an obstacle
-        foot = np.where(np.abs(side) > 0.5, start * side, 0.0)
-        slip, slid = np.zeros((len(met), 3)), np.zeros(len(met), dtype=np.bool_)
-        if len(old.key) and len(met):
-            same = np.empty(len(met), dtype=np.int64)
-            friction_pairs.find(key, old.key, old.slip, same)
-            went = same >= 0
-            slip[went], slid[went] = old.slip[same[went]], old.slid[same[went]]
-            slip -= np.sum(slip * normal, axis=1, keepdims=True) * normal
-        self._pairs = Pairs(key, slip, slid, np.column_stack([beta, normal, start, foot, force]))
-        self.stale = True
+    def _renew(self, x: Array, places: Array, old: Pairs) -> None:
+        """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
+        contact = self._contact
+        beta, normal, force, at = contact.touching(x, places, contact.n_owned)
+        key = np.empty((len(at), 10), dtype=np.int64)
+        friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
+        order = ascending(np.arange(len(at)), key, key[:, 4:], key.shape[1] - 4)
+        key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
+        friction_pairs.find(key, old.key, old.what, same)
+        touching = at[order], beta[order], normal[order], force[order]
+        friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
+        self._pairs, self.stale = Pairs(key, what), True
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
-        self._renew(x, frozen.places)
+        self._renew(x, frozen.places, self._pairs)
 
     def element_state(self) -> tuple[Ints, Array]:
         """Vertices of counted pairs; their kind, obstacle, its points, slip [m], and whether they slid."""
-        p = self._pairs
-        return p.key[:, :4], np.column_stack([p.key[:, 4:], p.slip, p.slid]).astype(np.float64)
+        return self._pairs.key[:, :4], self._pairs.what[:, : SLID + 1]
 
     def restore_elements(self, vertices: Ints, values: Array, own: range) -> None:
         vertices, what = vertices.copy(), values[:, :6].astype(np.int64)
@@ -171,9 +148,11 @@ class CoulombFriction(Elastic):
         vertices[edges & ~sheets, 2:] = vertices[edges & ~sheets, :1]
         swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
-        # `take_pairs` finds the rest
         key = np.column_stack([vertices, what])
-        self._pairs = Pairs(key, slip, values[:, 9] > 0.5, np.empty((len(key), 14)))
+        order = ascending(np.arange(len(key)), key, key[:, 4:], key.shape[1] - 4)
+        # `take_pairs` finds the rest
+        rest = np.zeros((len(key), COLUMNS - values.shape[1]))
+        self._pairs = Pairs(key[order], np.column_stack([what, slip, values[:, 9], rest])[order])
 
     # -- a step ------------------------------------------------------------------------------------
 
@@ -240,9 +219,9 @@ class CoulombFriction(Elastic):
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
         np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
-        mine = slice(self.n_owned)
-        self._pairs = self._pairs._replace(key=self._key[mine], slip=slip[mine], slid=slides[mine])
-        self._renew(x, frozen.places)
+        old = self._known.what.copy()
+        old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
+        self._renew(x, frozen.places, Pairs(self._known.key, old))
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
         # what obstacles take along in the load step would go that way twice

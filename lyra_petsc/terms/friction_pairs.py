@@ -26,6 +26,9 @@ from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_outer
 from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
+SLIP, SLID, BETA, NORMAL, START, FOOT, FORCE, COLUMNS = 6, 9, 10, 14, 17, 20, 23, 24
+"""Where each begins in a row of what is known of pairs, `friction.Pairs`, and how long it is."""
+
 
 @leaf()
 def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped-def]
@@ -116,6 +119,64 @@ def slide(x, stencil, beta, normal, start, slip, stiffness, limit, heat, slides)
             slip[e, k] = u[k]
 
 
+@kernel()
+def keys(points, number, kind, obstacle, beta, at, out):  # type: ignore[no-untyped-def]
+    """What tells pairs ``at`` (E,) with β (E, 4) from others, into out (E, 10).
+
+    Before a vertex of a sheet only what is nearest tells a triangle.
+    """
+    for m in range(len(at)):
+        e, nearest = at[m], 1
+        before = kind[e] == VERTEX_TRIANGLE and points[e, 0] >= 0
+        while before and nearest < 3 and beta[m, nearest] == 0.0:
+            nearest += 1
+        nearest = 1 if beta[m, nearest] == 0.0 else nearest
+        out[m, 4], out[m, 5] = kind[e], obstacle[e]
+        for i in range(4):
+            of = nearest if before and i > 0 and beta[m, i] == 0.0 else i
+            out[m, i], out[m, 6 + i] = number[e, of], min(points[e, of], 0)
+
+
+@kernel()
+def describe(x, stencil, points, keys, touching, same, old, what):  # type: ignore[no-untyped-def]
+    """What is known of pairs with keys (E, 10), into what (E, 24), at positions x (n_local, 3).
+
+    ``touching`` are their numbers among ``stencil`` and ``points``, β, unit normals and normal forces; those
+    with a number in ``same`` (E,) of 0 or more go on that row of ``old`` (M, 24).
+    """
+    numbers, beta, normal, force = touching
+    for m in range(len(numbers)):
+        e, side, along = numbers[m], 0.0, 0.0
+        for k in range(6):
+            what[m, k] = keys[m, 4 + k]
+        for i in range(4):
+            share = beta[m, i] if points[e, i] >= 0 else 0.0
+            what[m, BETA + i] = share
+            side += share
+        for k in range(3):
+            start = 0.0
+            for i in range(4):
+                start += what[m, BETA + i] * x[Index(stencil[e, i]), k]
+            what[m, NORMAL + k], what[m, START + k] = normal[m, k], start
+            what[m, FOOT + k] = side * start if abs(side) > 0.5 else 0.0  # where the other is an obstacle
+            what[m, SLIP + k] = old[same[m], SLIP + k] if same[m] >= 0 else 0.0
+            along += what[m, SLIP + k] * normal[m, k]
+        for k in range(3):
+            what[m, SLIP + k] -= along * normal[m, k]
+        what[m, SLID], what[m, FORCE] = old[same[m], SLID] if same[m] >= 0 else 0.0, force[m]
+
+
+@kernel()
+def unpack(what, beta, normal, start, slip, foot):  # type: ignore[no-untyped-def]
+    """Columns of what (E, 24) into arrays of their own, (E, 4) and (E, 3)."""
+    for e in range(len(what)):
+        for i in range(4):
+            beta[e, i] = what[e, BETA + i]
+        for k in range(3):
+            normal[e, k], start[e, k] = what[e, NORMAL + k], what[e, START + k]
+            slip[e, k], foot[e, k] = what[e, SLIP + k], what[e, FOOT + k]
+
+
 @leaf()
 def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
     """How alike two pairs with keys (10,) in rows a and b and the same first vertex are; −1: one does not go
@@ -149,10 +210,10 @@ def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def find(keys, among, slip, place):  # type: ignore[no-untyped-def]
+def find(keys, among, what, place):  # type: ignore[no-untyped-def]
     """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does.
 
-    Of several that are as much alike the one with the longer ``slip`` (M, 3).
+    Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 24).
     """
     room = 1
     while room < 2 * len(among):
@@ -168,7 +229,7 @@ def find(keys, among, slip, place):  # type: ignore[no-untyped-def]
             if among[b, 0] == keys[a, 0]:
                 fits, length = _alike(keys, a, among, b), 0.0
                 for k in range(3):
-                    length += slip[b, k] * slip[b, k]
+                    length += what[b, SLIP + k] * what[b, SLIP + k]
                 if fits >= 0 and (fits > best or (fits == best and length > longest)):
                     place[a], best, longest = b, fits, length
             b = following[b]
