@@ -74,8 +74,8 @@ class Flat(NamedTuple):
     inverse : (F, 2, 2)
         Of each triangle the inverse of the sides that leave its first corner, in the material plane [1/m].
     pairs : (m, 2)
-        Patches that have a vertex in common, or are one, which a convex part holds: the smaller first, in
-        ascending order.
+        Patches next to each other, or the same, which a convex part holds: the smaller first, in ascending
+        order.
     around, height : (m + 1,), (m,)
         Where the patches that this part reaches begin in ``reached``, and the smallest altitude [m] in them.
     reached : (k,)
@@ -113,18 +113,20 @@ def flat(triangles: Ints, uv: Array, patch: Ints) -> Flat:
     at = np.unique(np.column_stack([corners, np.repeat(patch, 3)]), axis=0)
     begins = np.flatnonzero(np.diff(at[:, 0], prepend=-1))
     sizes = np.diff(begins, append=len(at))
-    pairs = [np.repeat(np.arange(n)[:, None], 2, axis=1)]
+    sharing = [np.repeat(np.arange(n)[:, None], 2, axis=1)]
     for apart in range(1, int(sizes.max(initial=1))):
         some = np.flatnonzero(np.arange(len(at)) + apart < np.repeat(begins + sizes, sizes))
-        pairs.append(np.column_stack([at[some, 1], at[some + apart, 1]]))
-    pairs = np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)
+        sharing.append(np.column_stack([at[some, 1], at[some + apart, 1]]))
+    pairs: Ints = np.unique(np.sort(np.concatenate(sharing), axis=1), axis=0)
 
     # boxes in the plane, sheets at heights of their own
     sheet = _pieces(n, pairs)
     corner = np.minimum.reduceat(uv.min(axis=1)[order], first[:-1]) if n else np.empty((0, 2))
     other = np.maximum.reduceat(uv.max(axis=1)[order], first[:-1]) if n else np.empty((0, 2))
     boxes = np.column_stack([corner, sheet]), np.column_stack([other, sheet])
-    parts = np.minimum(*boxes[0][pairs.T]), np.maximum(*boxes[1][pairs.T])
+    pairs, between = _with_others_beside(pairs, boxes, float(np.median(longest)) if n else 0.0)
+    three = np.column_stack([pairs, between]).T
+    parts = np.minimum.reduce(boxes[0][three]), np.maximum.reduce(boxes[1][three])
     table = edge_table(triangles)
     sides = table.sides[table.first[table.sizes == 1]]
     ends = uv[sides // 3, sides % 3], uv[sides // 3, (sides + 1) % 3]
@@ -146,6 +148,33 @@ def flat(triangles: Ints, uv: Array, patch: Ints) -> Flat:
     some, sizes = np.asarray(height > 0.0), np.diff(around)
     around = np.append(0, np.cumsum(sizes[some]))
     return Flat(order, first, inverse, pairs[some], around, height[some], met[np.repeat(some, sizes), 1])
+
+
+def _with_others_beside(pairs: Ints, boxes: tuple[Array, Array], reach: float) -> tuple[Ints, Ints]:
+    """Pairs (m, 2) of patches that meet, and those within ``reach`` [m] that another patch meets both of; in
+    ascending order. And a patch that meets both, of several one that leaves the box around all three small.
+
+    What has no patch in between may be another turn of a spiral, over the first in the material plane.
+    """
+    n = len(boxes[0])
+    beside = near(boxes, reach=reach)
+    beside = beside[~np.isin(beside @ [n, 1], pairs @ [n, 1])]
+    both = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    begin = np.searchsorted(both[:, 0], np.arange(n + 1))
+    sizes = np.diff(begin)[beside[:, 0]]
+    which = np.repeat(np.arange(len(beside)), sizes)
+    shift = np.repeat(begin[beside[:, 0]] - np.cumsum(sizes) + sizes, sizes)
+    between = both[np.arange(len(which)) + shift, 1]
+    meets = np.isin(beside[which, 1] * n + between, both @ [n, 1])
+    which, between = which[meets], between[meets]
+    three = np.column_stack([beside[which], between]).T
+    extent = (np.maximum.reduce(boxes[1][three]) - np.minimum.reduce(boxes[0][three])).max(axis=1)
+    order = np.lexsort((extent, which))
+    first = order[np.diff(which[order], prepend=-1) > 0]
+    every = np.concatenate([pairs, beside[which[first]]])
+    others = np.concatenate([pairs[:, 0], between[first]])
+    order = np.lexsort(every.T[::-1])
+    return every[order], others[order]
 
 
 def _pieces(n: int, pairs: Ints) -> Ints:

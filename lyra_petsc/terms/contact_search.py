@@ -108,11 +108,13 @@ class SheetSearch:
         if not len(met):
             return np.empty((0, 7), dtype=np.int64)
         mean, whole = np.empty((n, 3)), np.empty((n, 7))
-        _means(way, self.triangles.corners, self.triangles.first, mean)
+        asked = np.zeros(n, dtype=np.bool_)
+        asked[met] = True
+        _means(way, self.triangles.corners, self.triangles.first, asked, mean)
         given = []
         for of in (self.vertices, self.edges, self.triangles):
             around = np.empty((7, len(of.corners)))
-            _around(x, way, of.corners, of.first, mean, around, whole)  # last of the triangles, all of it
+            _around(x, way, of.corners, of.first, asked, mean, around, whole)  # last of triangles, all of it
             given.append((of.corners, of.first, around))
         while True:
             out = np.empty((self._room, 7), dtype=np.int64)
@@ -149,9 +151,9 @@ def _boxes(x, way, corners, first, low, high):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _means(way, corners, first, out):  # type: ignore[no-untyped-def]
-    """The mean way (P, 3) [m] of each patch."""
-    for p in range(len(out)):
+def _means(way, corners, first, asked, out):  # type: ignore[no-untyped-def]
+    """The mean way (P, 3) [m] of each patch asked for (P,)."""
+    for p in np.flatnonzero(asked):
         out[p] = 0.0
         for at in range(first[p], first[p + 1]):
             for i in corners[at]:
@@ -163,11 +165,11 @@ def _means(way, corners, first, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _around(x, way, corners, first, mean, out, whole):  # type: ignore[no-untyped-def]
+def _around(x, way, corners, first, asked, mean, out, whole):  # type: ignore[no-untyped-def]
     """Low and high corners [m] of simplices, and how far [m] they go at most beside the mean of their patch,
-    into out (7, n); the same of all of a patch into whole (P, 7).
+    into out (7, n); the same of all of a patch into whole (P, 7). Of patches asked for (P,).
     """
-    for p in range(len(whole)):
+    for p in np.flatnonzero(asked):
         whole[p, :3], whole[p, 3:6], whole[p, 6] = np.inf, -np.inf, 0.0
         for at in range(first[p], first[p + 1]):
             farthest = 0.0
