@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lyra_petsc.mesh.near import near as patches_near
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distances
 from lyra_petsc.terms.contact_search import SheetSearch
 
@@ -150,3 +151,13 @@ def test_parts_of_a_sheet_that_hardly_bends_are_not_compared(which: str) -> None
     assert (kept >= 0.1).all()
     crumpled = np.random.default_rng(1).normal(size=x.shape)
     assert not search.kept(crumpled, 0.0 * x, alone, 0.1, 0.05).any()
+
+
+def test_patches_beside_each_other_keep_their_distance_without_a_common_vertex() -> None:
+    uv, triangles = grid(30, 20)
+    search, x = SheetSearch(triangles, uv[triangles]), np.column_stack([uv, 0.0 * uv[:, 0]])
+    search.take(x, np.arange(len(x)), triangles)
+    pairs = patches_near(search.boxes(x, 0.0 * x), reach=0.1)
+    patch = [set(search.triangles.of(np.array([n])).ravel()) for n in range(len(search.triangles.first) - 1)]
+    assert any(not patch[i] & patch[j] for i, j in pairs)
+    assert (search.kept(x, 0.0 * x, pairs, 0.1, 0.05) >= 0.1).all()
