@@ -47,6 +47,9 @@ output: {every: 0.02}
 
 DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
 
+REDUNDANT = ("-ksp_type", "preonly", "-pc_type", "redundant")
+"""Factors on any number of ranks, which wait for each other less often than in an iterative method."""
+
 PICTURES = ("matplotlib", "jinja2")
 """Packages without which reports have no pictures."""
 

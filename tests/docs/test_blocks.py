@@ -26,7 +26,7 @@ from lyra_petsc.scene.text import parse_json, parse_yaml
 END = 0.05
 """Seconds that runs are shortened to."""
 
-COARSE = "size = 0.1"
+COARSE = "size = 0.2"
 """Edges [m] of meshes made from the scripts that pages show: most pages run one."""
 
 PATIENCE = 300.0
@@ -62,7 +62,7 @@ PYTHON = f"""\
 [ "$1 $2" = "-m lyra_petsc" ] && {{ shift 2; exec lyra-petsc "$@"; }}
 exec {sys.executable} "$@"
 """
-RUN_SH = 'exec mpirun -n "${RANKS:-2}" lyra-petsc run "$@"\n'
+RUN_SH = 'exec ${RANKS:+mpirun -n "$RANKS"} lyra-petsc run "$@"\n'
 LYRA_SH = 'exec lyra-petsc "$@"\n'
 
 ALL = {page: blocks_of(page) for page in PAGES}
