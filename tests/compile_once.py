@@ -19,7 +19,7 @@ def compile_once() -> None:
     from numba.core.dispatcher import Dispatcher
 
     compile_it = Dispatcher.compile
-    name = f"lyra-petsc-tests-{os.getuid()}.lock"
+    name = f"lyra-petsc-tests-{os.getuid()}-{crc32(__file__.encode()):x}.lock"
     file = os.open(Path(tempfile.gettempdir(), name), os.O_CREAT | os.O_RDWR, 0o600)
 
     def compile_alone(dispatcher: Any, signature: Any) -> Any:

@@ -16,6 +16,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,12 @@ RANK = Path(__file__).with_name("rank.py")
 PATIENCE = 60.0
 """Seconds after which a program counts as hanging."""
 
+SESSIONS = tempfile.mkdtemp(prefix="lyra-")
+"""Folder of Open MPI's sessions: jobs of other processes that end at the same time remove a common one."""
+atexit.register(shutil.rmtree, SESSIONS, ignore_errors=True)
+
 LAUNCHER = {
+    "OMPI_MCA_orte_tmpdir_base": SESSIONS,
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
