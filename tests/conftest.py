@@ -17,19 +17,17 @@ shown by rank 0, and a rank whose partners never come to that agreement ends the
 from __future__ import annotations
 
 import faulthandler
-import fcntl
 import gc
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TextIO
-from zlib import crc32
+from typing import TextIO
 
 import numpy as np
 import pytest
+from compile_once import compile_once
 from mpi4py import MPI
 
 WAIT_FOR_OTHERS = 20.0  # s that a failed rank gives the others to finish the test
@@ -63,29 +61,6 @@ def petsc_options() -> Iterator[None]:
 def shared_tmp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty folder of this test, the same on every rank."""
     return Path(WORLD.bcast(tmp_path_factory.mktemp("shared") if WORLD.rank == 0 else None, root=0))
-
-
-def compile_once() -> None:
-    """Let processes that need a kernel for the first time wait for the one that compiles it.
-
-    All processes of pytest-xdist begin with the same empty cache; what one has compiled the others load.
-    """
-    from numba.core.dispatcher import Dispatcher
-
-    compile_it = Dispatcher.compile
-    name = f"lyra-petsc-tests-{os.getuid()}.lock"
-    file = os.open(Path(tempfile.gettempdir(), name), os.O_CREAT | os.O_RDWR, 0o600)
-
-    def compile_alone(dispatcher: Any, signature: Any) -> Any:
-        function = dispatcher.py_func
-        place = crc32(f"{function.__module__}.{function.__qualname__}".encode())
-        fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
-        try:
-            return compile_it(dispatcher, signature)
-        finally:
-            fcntl.lockf(file, fcntl.LOCK_UN, 1, place)
-
-    Dispatcher.compile = compile_alone
 
 
 @pytest.hookimpl(trylast=True)  # the terminal exists by then

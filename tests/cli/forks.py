@@ -1,9 +1,9 @@
-"""The program with half of its imports done: forks for each command line that it reads, tells how it left.
+"""The program with half of its imports done: forks for each command line that ``rank.py`` or a test asks for.
 
-A line of the standard input asks for a run: arguments, folder, environment. The answers are its process
-number and, when it has ended and nothing that it started can speak for it, its exit code and its words.
-Neither MPI nor PETSc have been loaded here: each of the forked processes starts them as any other does,
-and ends in no other way.
+It listens on the socket that is its standard input. A message holds arguments, folder and environment, and
+descriptors for stdout and stderr; the answer is the exit code, negative for a signal. Who closes the
+connection before has the process killed. Neither MPI nor PETSc have been loaded here: each of the forked
+processes starts them as any other does, also one of several under mpirun, and ends in no other way.
 """
 
 from __future__ import annotations
@@ -14,9 +14,14 @@ import importlib
 import json
 import os
 import select
+import signal
+import socket
 import sys
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from compile_once import compile_once
 
 ROOT = Path(__file__).parents[2]
 
@@ -66,42 +71,47 @@ def become(asked: dict[str, Any], out: int, err: int) -> None:
     sys.argv = [str(ROOT / "lyra_petsc" / "__main__.py"), *asked["arguments"]]
 
 
-def heard(*files: int) -> list[str]:
-    """All that comes out of pipes until their other ends are closed."""
-    words = {file: bytearray() for file in files}
-    still = list(files)
-    while still:
-        for file in select.select(still, [], [])[0]:
-            piece = os.read(file, 2**16)
-            words[file] += piece
-            if not piece:
-                still.remove(file)
-                os.close(file)
-    return [text.decode() for text in words.values()]
-
-
-def serve() -> None:
-    """Fork for each line; returns in the forked processes alone."""
-    for line in sys.stdin:
-        asked = json.loads(line)
-        if asked["arguments"][:1] and asked["arguments"][0] in REPORTING:
-            load(*DRAWING)
-        (out, to_out), (err, to_err) = os.pipe(), os.pipe()
-        pid = os.fork()
-        if pid == 0:
-            become(asked, to_out, to_err)
-            os.close(out)
-            os.close(err)
-            return
-        os.close(to_out)
-        os.close(to_err)
-        print(pid, flush=True)
-        words = heard(out, err)
-        print(json.dumps([os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), *words]), flush=True)
+def attend(connection: socket.socket, asked: dict[str, Any], out: int, err: int) -> None:
+    """Fork, wait and answer; returns in the forked process alone."""
+    pid = os.fork()
+    if pid == 0:
+        connection.close()
+        become(asked, out, err)
+        return
+    os.close(out)
+    os.close(err)
+    ended = os.pidfd_open(pid)
+    if ended not in select.select([connection, ended], [], [])[0]:  # nobody waits for it any more
+        os.kill(pid, signal.SIGKILL)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    with contextlib.suppress(OSError):
+        connection.send(json.dumps(code).encode())
     os._exit(0)
 
 
+def serve() -> None:
+    """Fork for each connection; returns in the forked processes alone."""
+    listener = socket.socket(fileno=os.dup(0))
+    while True:
+        connection, _ = listener.accept()
+        with contextlib.suppress(ChildProcessError):  # leave none of those that have ended behind
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        message, files, *_ = socket.recv_fds(connection, 2**18, 2)
+        asked = json.loads(message)
+        if asked["arguments"][:1] and asked["arguments"][0] in REPORTING:
+            load(*DRAWING)
+        if os.fork() == 0:
+            listener.close()
+            attend(connection, asked, *files)
+            return
+        connection.close()
+        for file in files:
+            os.close(file)
+
+
 load(*(f"lyra_petsc.{name}" for name in EARLY))
+compile_once()
 assert not {"mpi4py.MPI", "petsc4py.PETSc"} & set(sys.modules)
 serve()
 

@@ -1,7 +1,7 @@
 """Starts the program as a user does: another process, or several under mpirun.
 
-A run on one rank that nobody looks at before its end is forked from a process that has done half of the
-imports (see ``forks``), which take longer than most of these runs.
+A run that nobody looks at before its end is forked, on each of its ranks, from a process that has done half
+of the imports (see ``forks``), which take longer than most of these runs.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import os
 import select
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,10 +26,16 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[2]
+RANK = Path(__file__).with_name("rank.py")
 PATIENCE = 60.0
 """Seconds after which a program counts as hanging."""
 
+SESSIONS = tempfile.mkdtemp(prefix="lyra-")
+"""Folder of Open MPI's sessions: jobs of other processes that end at the same time remove a common one."""
+atexit.register(shutil.rmtree, SESSIONS, ignore_errors=True)
+
 LAUNCHER = {
+    "OMPI_MCA_orte_tmpdir_base": SESSIONS,
     "OMPI_ALLOW_RUN_AS_ROOT": "1",
     "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
@@ -46,6 +54,9 @@ output: {every: 0.02}
 """A hanging square of 25 vertices and five steps; states at 0, 0.02, 0.04 and 0.05 s."""
 
 DIRECT = ("-ksp_type", "preonly", "-pc_type", "lu")
+
+REDUNDANT = ("-ksp_type", "preonly", "-pc_type", "redundant")
+"""Factors on any number of ranks, which wait for each other less often than in an iterative method."""
 
 PICTURES = ("matplotlib", "jinja2")
 """Packages without which reports have no pictures."""
@@ -155,57 +166,65 @@ class Forks:
     """Starts ``forks`` and asks it for runs."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-        self._heard = b""
+        self._name = ""
+
+    @property
+    def name(self) -> str:
+        """Of the socket on which it listens."""
+        if not self._name:
+            name = f"lyra-petsc-tests-{os.getpid()}"
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+                listener.bind("\0" + name)
+                listener.listen(16)
+                process = subprocess.Popen(
+                    [sys.executable, str(Path(__file__).with_name("forks.py"))],
+                    # else numba has stdout's colours reset at the end, where only bad input is met too
+                    env=environment({"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}),
+                    stdin=listener,
+                    stdout=subprocess.DEVNULL,
+                    start_new_session=True,
+                    preexec_fn=heed_signals,
+                )
+            atexit.register(process.kill)
+            self._name = name
+        return self._name
 
     def run(
         self, arguments: Sequence[object], folder: Path, extra: Mapping[str, str] | None, patience: float
     ) -> Left:
-        """A run to its end."""
-        if self._process is None:
-            self._process = subprocess.Popen(
-                [sys.executable, str(Path(__file__).with_name("forks.py"))],
-                env=environment(),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                bufsize=0,
-                start_new_session=True,
-                preexec_fn=heed_signals,
-            )
-            atexit.register(self._process.kill)
-        assert self._process.stdin is not None
-        asked = {
-            "arguments": [str(argument) for argument in arguments],
-            "folder": str(folder),
-            "environment": environment(extra),
-        }
-        self._process.stdin.write(json.dumps(asked).encode() + b"\n")
-        pid = self._answer(PATIENCE)
-        answer = self._answer(patience)
-        hangs = answer is None
-        if hangs:
-            os.killpg(pid, signal.SIGKILL)
-            answer = self._answer(PATIENCE)
-        code, *words = answer
-        out, err = (text.replace("\r\n", "\n").replace("\r", "\n") for text in words)
-        if hangs:
-            pytest.fail(f"hangs: {asked['arguments']}\n{out}\n{err}")
-        return Left(code, out, err)
+        """A run on one rank to its end; one that hangs is killed and fails the test."""
+        words = [str(argument) for argument in arguments]
+        asked = {"arguments": words, "folder": str(folder), "environment": environment(extra)}
+        (out, to_out), (err, to_err) = os.pipe(), os.pipe()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.connect("\0" + self.name)
+            socket.send_fds(connection, [json.dumps(asked).encode()], [to_out, to_err])
+            os.close(to_out)
+            os.close(to_err)
+            said, ended = heard({out, err}, patience)
+            connection.settimeout(patience if ended else 0.0)
+            try:
+                code = json.loads(connection.recv(64))
+            except OSError:
+                pytest.fail(f"hangs: {words}\n{said[out]}\n{said[err]}")
+        return Left(code, said[out], said[err])
 
-    def _answer(self, patience: float) -> Any:
-        """What the next line says; None if none comes in time."""
-        assert self._process is not None
-        assert self._process.stdout is not None
-        deadline = time.monotonic() + patience
-        while b"\n" not in self._heard:
-            left = max(0.0, deadline - time.monotonic())
-            if not select.select([self._process.stdout], [], [], left)[0]:
-                return None
-            piece = self._process.stdout.read(2**16)
-            assert piece, "the process that forks has ended"
-            self._heard += piece
-        line, _, self._heard = self._heard.partition(b"\n")
-        return json.loads(line)
+
+def heard(files: set[int], patience: float) -> tuple[dict[int, str], bool]:
+    """What comes out of pipes until their other ends are closed, and whether they were in time."""
+    pieces = {file: bytearray() for file in files}
+    deadline = time.monotonic() + patience
+    still = set(files)
+    while still and (left := deadline - time.monotonic()) > 0.0:
+        for file in select.select(still, [], [], left)[0]:
+            piece = os.read(file, 2**16)
+            pieces[file] += piece
+            if not piece:
+                still.remove(file)
+    for file in files:
+        os.close(file)
+    texts = {file: bytes(piece).decode() for file, piece in pieces.items()}
+    return {f: text.replace("\r\n", "\n").replace("\r", "\n") for f, text in texts.items()}, not still
 
 
 FORKS = Forks()
@@ -226,8 +245,10 @@ def lyra(
     **keywords: Any,
 ) -> Left:
     """Run the program in ``folder`` to its end."""
-    if ranks == 1 and not keywords:
-        return FORKS.run(arguments, folder, extra, patience)
+    if not keywords:
+        if ranks == 1:
+            return FORKS.run(arguments, folder, extra, patience)
+        keywords = {"program": ("-IS", str(RANK), FORKS.name)}
     return finish(start(arguments, folder, ranks, extra, **keywords), patience)
 
 

@@ -145,7 +145,7 @@ def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
     assert "★" not in (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
 
 
-LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.001", "--repeats", "1", "--out", "out"]
+LONG = ["study", "scene.yaml", "--vary", "dt=0.02,0.002", "--repeats", "1", "--out", "out"]
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, 
     write_scene(tmp_path, HANGING)
     process = start(LONG, tmp_path)
     wait_until((tmp_path / "out" / "cases" / "dt0.02" / "result.json").exists, process)
-    wait_until((tmp_path / "out" / "cases" / "dt0.001" / "history.csv").exists, process)
+    wait_until((tmp_path / "out" / "cases" / "dt0.002" / "history.csv").exists, process)
     process.send_signal(number)
     stopped = finish(process)
     assert stopped.code == code
@@ -176,7 +176,7 @@ def test_a_stopped_study_goes_on_without_repeating(tmp_path: Path, number: int, 
     assert results(tmp_path / "out") == after
     assert len(read_csv(tmp_path / "out" / "study.csv")) == 2
     # a wider sweep runs what is new
-    done(["study", "--out", "out", "--resume", "--vary", "dt=0.01,0.02,0.001"], tmp_path)
+    done(["study", "--out", "out", "--resume", "--vary", "dt=0.01,0.02,0.002"], tmp_path)
     wider = results(tmp_path / "out")
     assert {name: wider[name] for name in after} == after
     assert len(read_csv(tmp_path / "out" / "study.csv")) == 3
@@ -231,7 +231,7 @@ def test_two_studies_in_one_folder_are_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_run_as_reference(tmp_path: Path) -> None:
     write_scene(tmp_path, HANGING)
-    fine = ["run", "scene.yaml", "--set", "time.step=0.0005", "--out", "fine"]
+    fine = ["run", "scene.yaml", "--set", "time.step=0.001", "--out", "fine"]
     done(fine, tmp_path)
     words = ["study", "scene.yaml", "--vary", "dt=0.01", "--repeats", "1", "--out", "out"]
     done([*words, "--reference", "run:fine"], tmp_path)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
-import socketserver
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import click
 import pytest
 from blocks import PAGES, ROOT, Block, blocks_of, commands_of
-from launch import FORKS, environment
+from launch import FORKS, RANK, environment
 
 from lyra_petsc.cli.arguments import split
 from lyra_petsc.cli.verbs import verbs
@@ -26,7 +22,7 @@ from lyra_petsc.scene.text import parse_json, parse_yaml
 END = 0.05
 """Seconds that runs are shortened to."""
 
-COARSE = "size = 0.1"
+COARSE = "size = 0.2"
 """Edges [m] of meshes made from the scripts that pages show: most pages run one."""
 
 PATIENCE = 300.0
@@ -41,28 +37,20 @@ BASE = {
 
 PROGRAM = f"""\
 #!{sys.executable} -IS
-# the program as installed, on one rank by way of the test; runs are shortened, but for load factors
-import json, os, socket, sys
+# the program as installed, started by the tests' forks; runs are shortened, but for load factors
+import os, sys
 words = sys.argv[1:]
 scenes = [open(word).read() for word in words if word.endswith(".yaml") and os.path.exists(word)]
 if words[:1] == ["run"] and not any("analysis: static" in scene for scene in scenes):
     words += ["--set", "time.end={END}"]
-if "OMPI_COMM_WORLD_SIZE" in os.environ:
-    os.execv(sys.executable, [sys.executable, "-m", "lyra_petsc", *words])
-test = socket.socket(socket.AF_UNIX)
-test.connect(os.environ["TEST_SOCKET"])
-test.sendall(json.dumps([words, os.getcwd(), dict(os.environ)]).encode() + b"\\n")
-code, out, err = json.loads(test.makefile().read())
-sys.stdout.write(out)
-sys.stderr.write(err)
-sys.exit(code)
+os.execv(sys.executable, [sys.executable, "-IS", {str(RANK)!r}, os.environ["TEST_FORKS"], *words])
 """
 PYTHON = f"""\
 #!/bin/sh
 [ "$1 $2" = "-m lyra_petsc" ] && {{ shift 2; exec lyra-petsc "$@"; }}
 exec {sys.executable} "$@"
 """
-RUN_SH = 'exec mpirun -n "${RANKS:-2}" lyra-petsc run "$@"\n'
+RUN_SH = 'exec ${RANKS:+mpirun -n "$RANKS"} lyra-petsc run "$@"\n'
 LYRA_SH = 'exec lyra-petsc "$@"\n'
 
 ALL = {page: blocks_of(page) for page in PAGES}
@@ -83,17 +71,8 @@ def coarse(script: str) -> str:
 LANGUAGES = {"", "sh", "yaml", "json", "python", "geo", "text", "diff"}
 
 
-class Commands(socketserver.StreamRequestHandler):
-    """Runs what ``PROGRAM`` is asked for in a process that needs no imports, which take longest."""
-
-    def handle(self) -> None:
-        words, folder, variables = json.loads(self.rfile.readline())
-        left = FORKS.run(words, Path(folder), variables, PATIENCE)
-        self.wfile.write(json.dumps([left.code, left.out, left.err]).encode())
-
-
 @pytest.fixture
-def checkout(tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
+def checkout(tmp_path: Path) -> tuple[Path, dict[str, str]]:
     """What a reader has: a checkout with ``.venv`` and an installed program; and the environment."""
     folder = tmp_path / "lyra_petsc"
     folder.mkdir()
@@ -111,11 +90,8 @@ def checkout(tmp_path: Path) -> Iterator[tuple[Path, dict[str, str]]]:
     for name, text in (("lyra-petsc", PROGRAM), ("python", PYTHON)):
         (programs / name).write_text(text, encoding="utf-8")
         (programs / name).chmod(0o755)
-    variables = environment({"TEST_SOCKET": str(tmp_path / "test")})
-    with socketserver.UnixStreamServer(variables["TEST_SOCKET"], Commands) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield folder, {**variables, "PATH": f"{programs}:{variables['PATH']}"}
-        server.shutdown()
+    variables = environment({"TEST_FORKS": FORKS.name})
+    return folder, {**variables, "PATH": f"{programs}:{variables['PATH']}"}
 
 
 @pytest.mark.slow

@@ -175,7 +175,7 @@ def test_schema_and_loader_agree_on_drawn_scenes(validator: Any, monkeypatch: py
 
     @hypothesis.seed(6)
     @hypothesis.settings(
-        max_examples=300,
+        max_examples=150,
         deadline=None,
         database=None,
         phases=[hypothesis.Phase.generate],

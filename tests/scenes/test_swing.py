@@ -64,7 +64,7 @@ def distance(a: Array, b: Array) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("c11", STIFFNESSES)
+@pytest.mark.parametrize("c11", [STIFFNESSES[0], STIFFNESSES[-1]])
 @pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
 def test_second_order_integrators_follow_the_free_edge(integrator: str, c11: float) -> None:
     edges = [edge_after(MPI.COMM_SELF, integrator, c11, frequency, 0.4)[0] for frequency in (60, 120)]

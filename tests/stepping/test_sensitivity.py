@@ -19,6 +19,9 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
+STEP = 2e-4
+"""Relative change of a number to both sides."""
+
 TIGHT = {"force_tolerance": 1e-12, "step_tolerance": 1e-14}
 
 # pulled from the first step on, so that no strain crosses 0, where the damping's K⁺ has a kink
@@ -182,26 +185,14 @@ def tangents(scene: Scene, numbers: Mapping[str, float]) -> dict[str, Array]:
 
 
 def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Array:
-    """Derivative of `end` along relative changes of numbers, of fourth order."""
+    """Derivative of `end` along relative changes of numbers."""
 
     def at(factor: float) -> Array:
         changes = {key: value * (1.0 + factor * step) for key, value in direction.items()}
         return end(scene.changed(changes))
 
-    slope: Array = (8.0 * (at(1.0) - at(-1.0)) - (at(2.0) - at(-2.0))) / (12.0 * step)
+    slope: Array = (at(1.0) - at(-1.0)) / (2.0 * step)
     return slope
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_all_numbers_at_once(integrator: str) -> None:
-    numbers = of_integrator(integrator, NUMBERS)
-    pulled = scene(integrator)
-    found = tangents(pulled, numbers)
-    expected = difference(pulled, numbers, 1e-3)
-    # what belongs to one number must not hide behind another: each is of some size
-    assert min(np.linalg.norm(each) for each in found.values()) > 1e-7
-    error = np.linalg.norm(sum(found.values()) - expected)
-    assert error < 1e-6 * np.sqrt(sum(np.sum(each**2) for each in found.values()))
 
 
 @pytest.mark.slow
@@ -210,7 +201,8 @@ def test_each_number(integrator: str) -> None:
     pulled, numbers = scene(integrator), of_integrator(integrator, NUMBERS)
     found = tangents(pulled, numbers)
     for key, value in numbers.items():
-        expected = difference(pulled, {key: value}, 1e-3)
+        expected = difference(pulled, {key: value}, STEP)
+        assert np.linalg.norm(expected) > 1e-7, key
         assert np.linalg.norm(found[key] - expected) < 1e-6 * np.linalg.norm(expected), key
 
 
@@ -221,7 +213,7 @@ def test_directors(integrator: str, material: Mapping[str, Any], numbers: Mappin
 
 
 def agree(pulled: Scene, numbers: Mapping[str, float]) -> None:
-    found, expected = tangents(pulled, numbers), difference(pulled, numbers, 1e-3)
+    found, expected = tangents(pulled, numbers), difference(pulled, numbers, STEP)
     scale = np.sqrt(sum(np.sum(each**2) for each in found.values()))
     assert np.linalg.norm(sum(found.values()) - expected) < 1e-6 * scale
 

@@ -21,7 +21,8 @@ LONG = (
     "post-buckling", "lateral-buckling", "elastica-tip", "elastica-weight", "elastica-roll-up",
     "elastica-overhang", "slit-annulus", "sze-end-moment", "pinched-cylinder", "open-cylinder",
     "hinged-roof", "incline", "rest", "capstan", "collision", "layers", "ruck", "pole",
-    "table-edge", "cusick",
+    "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
+    "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane",
 )  # fmt: skip
 """Cases whose finest resolutions take long."""
 
