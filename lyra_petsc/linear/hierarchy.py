@@ -16,7 +16,6 @@ from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
-    from lyra_petsc.linear.edge_couplings import ProductWithEdges
     from lyra_petsc.terms.edge_turns import EdgeTurns
 
 Array = NDArray[np.float64]
@@ -98,16 +97,13 @@ class Level:
         Interpolates from the next coarser level, and makes its block rows.
     turns : EdgeTurns or None
         How unknowns of edges, that nothing is interpolated to, follow the vertices.
-    product : ProductWithEdges or None
-        With the same block rows, where edges carry unknowns.
     memory : (n,) float64 or None
-        For what the sweeps and this product copy.
+        For what the sweeps copy, where edges carry unknowns.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
         self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
-        self.product: ProductWithEdges | None = None
         self.memory: Array | None = None
 
 
@@ -122,8 +118,6 @@ class Hierarchy:
         Between the levels, finest first.
     below : WithoutEdges, optional
         Where edges carry unknowns.
-    product : ProductWithEdges, optional
-        With the finest level's rows.
 
     Attributes
     ----------
@@ -136,17 +130,12 @@ class Hierarchy:
         pattern: BlockPattern,
         interpolations: Sequence[InterpolationRows],
         below: WithoutEdges | None = None,
-        product: ProductWithEdges | None = None,
     ) -> None:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
-        level.product = product
-        if below is not None and pattern.edge_couplings is not None:
-            from lyra_petsc.linear.edge_sweeps import memory_needed  # of use for nothing else
-
-            # what is below is there before the copies are
-            needed = memory_needed(pattern.edge_couplings, product)
-            level.memory = np.empty(max(needed, 9 * below.pattern.n_blocks))
+        if below is not None:
+            # what is below is there before the copies, in single precision, are
+            level.memory = np.empty(9 * max(-(-pattern.n_stored // 2), below.pattern.n_blocks))
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds

@@ -55,7 +55,7 @@ class VertexEquations:
         """Keep what depends on the prescribed unknowns (n_local, 3): mostly they stay the same."""
         term = self._bent
         assert term.edges is not None
-        self._held, self._beside = held.copy(), self._rows.beside(held)[0]
+        self._held, self._beside = held.copy(), self._rows.beside(held)
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
         self.turns.hold(held)
 

@@ -274,7 +274,7 @@ class MidEdge(Elastic):
     ) -> None:
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
-        constants = *self._constants, self.of_edges.length, self.edges
+        constants = *self._constants, self.of_edges.length
         midedge_energy.add_hessian(
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
         )
