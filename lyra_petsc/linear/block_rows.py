@@ -150,11 +150,13 @@ class BlockRows:
     def beside(self, mask: NDArray[np.bool_]) -> Beside:
         """What has a prescribed coordinate in its row or column; mask (n_local, 3)."""
         pattern, held = self.pattern, mask.any(axis=1)
+        zeros = edges = np.empty(0, dtype=np.int64)
+        sizes = np.empty((0, 3), dtype=np.int64)
+        if not held.any():
+            return Beside(zeros, zeros, edges, sizes, zeros)
         rows = np.repeat(np.arange(pattern.n_owned), np.diff(pattern.indptr))
         blocks = np.flatnonzero(held[pattern.columns] | held[rows])
         changing = (9 * blocks[:, None] + np.arange(9)).ravel()
-        zeros = edges = np.empty(0, dtype=np.int64)
-        sizes = np.empty((0, 3), dtype=np.int64)
         if pattern.edge_couplings is not None:
             zeros, edges, sizes = pattern.edge_couplings.beside(mask, pattern.n_blocks)
             changing = np.concatenate([changing, zeros, edges])

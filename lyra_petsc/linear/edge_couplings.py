@@ -60,12 +60,12 @@ class Numbers(NamedTuple):
 
     Attributes
     ----------
-    indptr : (n + 1,)
+    indptr : (n + 1,) int32, int64 where there are too many
         Of places from that of the first edge on; the first of a row is its diagonal.
     places : (n_numbers,) int32
     """
 
-    indptr: Ints
+    indptr: NDArray[Any]
     places: NDArray[np.int32]
 
 
@@ -135,7 +135,7 @@ class EdgeCouplings:
         diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
         one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
         indptr = begins(np.bincount(one - 3 * first, minlength=len(diagonal)))
-        self.numbers = Numbers(indptr, other.astype(np.int32))
+        self.numbers = Numbers(indptr.astype(index_type(len(other))), other.astype(np.int32))
 
     # -- where values stand --------------------------------------------------------------------------
 
@@ -163,8 +163,8 @@ class EdgeCouplings:
 
     def diagonal(self, n_blocks: int) -> Ints:
         """Where the edges' own numbers stand, those of padding too."""
-        found: Ints = self.first_number(n_blocks) + self.numbers.indptr[:-1]
-        return found
+        own: Ints = self.numbers.indptr[:-1].astype(np.int64)
+        return own + self.first_number(n_blocks)
 
     def parts(self, values: NDArray[Any], n_blocks: int) -> EdgeValues:
         """Views of values (n_stored, 3, 3)."""
@@ -204,7 +204,7 @@ class EdgeCouplings:
         of_numbers = held[edge] | held[places]
         of_numbers[indptr[:-1]] = False
         zeros = np.concatenate([of_groups, self.first_number(n_blocks) + np.flatnonzero(of_numbers)])
-        edges = np.flatnonzero(held[3 * self.n_vertices : 3 * self._n])
+        edges: Ints = np.flatnonzero(held[3 * self.n_vertices : 3 * self._n])
         return zeros, own[edges], own.reshape(-1, 3)[edges // 3]
 
     # -- in blocks -----------------------------------------------------------------------------------
@@ -234,8 +234,9 @@ class EdgeCouplings:
 
         def place(row: Ints, column: Ints) -> Ints:
             """Values of a block stand column by column."""
-            found: Ints = 9 * np.searchsorted(keys, (row // 3) * n_local + column // 3)
-            return found + 3 * (column % 3) + row % 3
+            block = np.searchsorted(keys, (row // 3) * n_local + column // 3)
+            found: Ints = 9 * block + 3 * (column % 3) + row % 3
+            return found
 
         row, column, edge, other = self._coupled()
         # of an edge that fills up a group the coupling is 0 there

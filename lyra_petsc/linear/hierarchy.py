@@ -35,8 +35,8 @@ class Surface:
 
     Attributes
     ----------
-    x : (n_local, 3)
-        Positions [m] that interpolation follows.
+    x : (n_vertices, 3)
+        Positions [m] of the owned vertices that interpolation follows.
     triangles : (F, 3)
         Local numbering.
     """
@@ -118,6 +118,8 @@ class Hierarchy:
         Between the levels, finest first.
     below : WithoutEdges, optional
         Where edges carry unknowns.
+    spare : bool
+        The finest level's block rows are of no use once it has taken them: ``below`` may have their room.
 
     Attributes
     ----------
@@ -130,10 +132,13 @@ class Hierarchy:
         pattern: BlockPattern,
         interpolations: Sequence[InterpolationRows],
         below: WithoutEdges | None = None,
+        *,
+        spare: bool = False,
     ) -> None:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
-        if below is not None:
+        self._spare = spare and below is not None and below.pattern.n_blocks <= pattern.n_stored
+        if below is not None and not self._spare:
             # what is below is there before the copies, in single precision, are
             level.memory = np.empty(9 * max(-(-pattern.n_stored // 2), below.pattern.n_blocks))
         self.levels = [level]
@@ -147,7 +152,8 @@ class Hierarchy:
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
         """Of each level, finest first, the block rows that those of the finest make; collective.
 
-        Each is made when it is asked for, and the one before should be freed by then.
+        Each is made when it is asked for, and the one before should be freed by then; the finest ones are
+        overwritten where they are spare.
 
         Parameters
         ----------
@@ -169,6 +175,8 @@ class Hierarchy:
             below = finest.galerkin.project(self._below.values(held, finest.memory), free)
         for level in self.levels:
             yield values, free
+            if self._below is not None and self._spare and level is finest:
+                values = self._below.values(held, values.reshape(-1))
             if below is not None:
                 (values, free), below = below, None
             elif level.galerkin is not None:
@@ -191,7 +199,7 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
-    parts = comm.gather((surface.x[:n], corners, layout.original))
+    parts = comm.gather((surface.x, corners, layout.original))
     shares: list[list[InterpolationRows]] = []
     if parts is not None:
         x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))

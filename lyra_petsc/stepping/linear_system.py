@@ -105,7 +105,8 @@ class LinearSystem:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)
-        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below)
+        spare = self.preconditioner is not self.operator
+        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
     def attach(self, ksp: PETSc.KSP) -> None:
