@@ -66,6 +66,8 @@ class BlockPattern:
     couplings : mapping of name → (E, n) int, Across or WithEdges
         Local rows that elements couple; only these get an entry, and the diagonal.
     n_owned, n_local : int
+    n_diagonal : int, optional
+        Rows, the first ones, that have a diagonal block, if others have none at all.
 
     Attributes
     ----------
@@ -86,10 +88,12 @@ class BlockPattern:
         Those of owned edges, where there are such elements.
     """
 
-    def __init__(self, couplings: Couplings, n_owned: int, n_local: int) -> None:
+    def __init__(
+        self, couplings: Couplings, n_owned: int, n_local: int, n_diagonal: int | None = None
+    ) -> None:
         self.edges = {name: part for name, part in couplings.items() if isinstance(part, WithEdges)}
         self.edge_couplings: EdgeCouplings | None = None
-        self.n_diagonal = n_owned
+        self.n_diagonal = n_owned if n_diagonal is None else n_diagonal
         if self.edges:
             from lyra_petsc.linear.edge_couplings import EdgeCouplings  # of use for nothing else
 
@@ -248,7 +252,7 @@ def _with(couplings: Couplings, keys: Ints, n_diagonal: int, n_owned: int, n_loc
 
     def stored(part: Ints) -> Ints:
         part = part[part < n_owned * n_local]
-        if n_diagonal == n_owned:
+        if not any(isinstance(coupling, WithEdges) for coupling in couplings.values()):
             return part
         column = part % n_local
         return part[(column < n_diagonal) | (column >= n_owned)]

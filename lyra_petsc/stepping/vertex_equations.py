@@ -46,7 +46,7 @@ class VertexEquations:
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
-        self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
+        self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local, layout.n_vertices))
         self.pattern = self._rows.pattern
         self.turns = EdgeTurns(self._bent, layout.n_owned)
         self._hold(np.zeros((layout.n_local, 3), dtype=bool))

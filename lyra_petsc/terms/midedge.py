@@ -136,6 +136,7 @@ class MidEdge(Elastic):
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:
+        self.forget()  # by other frames directors are others
         self.frames = self._carried(frozen, x)
 
     @property
