@@ -48,6 +48,7 @@ def differences(f: Callable[[Array], Array | float], y: Array, h: float) -> Arra
 def expanded(pattern: BlockPattern, values: Array, n_local: int) -> Array:
     """Block rows of which one half is stored as a dense matrix (n_owned, 3, n_local, 3)."""
     out = np.zeros((pattern.n_owned, 3, n_local, 3))
+    pattern, values = pattern.whole, pattern.in_blocks(values)
     rows = np.repeat(np.arange(pattern.n_owned), np.diff(pattern.indptr))
     for row, column, block in zip(rows, pattern.columns, values, strict=True):
         out[row, :, column, :] = block.T  # stored column by column
@@ -69,7 +70,7 @@ def hessian(
     """What a term adds to block rows, as a dense matrix (n_owned, 3, n, 3), at positions or velocities."""
     n = len(at)
     pattern = BlockPattern(term.couplings, n if n_owned is None else n_owned, n)
-    values = np.zeros((pattern.n_blocks, 3, 3))
+    values = np.zeros((pattern.n_stored, 3, 3))
     if isinstance(term, Viscous):
         term.add_hessian(at, frozen, pattern.offsets, values)
     else:

@@ -1,7 +1,8 @@
 """Element blocks added to block rows, where the ``offsets`` of the pattern say.
 
 An element's offsets are those of its pairs of points (0, 0), (0, 1), …, (n − 1, n − 1): twice the number of
-the block that the pair is added to, plus 1 where it is added transposed; negative where others have it.
+the block that the pair is added to, plus 1 where it is added transposed; negative where others have it. Where
+edges carry unknowns they are those of ``edge_couplings.offsets_of``.
 """
 
 from __future__ import annotations
@@ -45,33 +46,27 @@ def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-de
 
 
 @cached(fastmath={"contract", "nsz"})
-def add_mixed_elements(weight, blocks, vertices, edges, offsets, values):  # type: ignore[no-untyped-def]
+def add_mixed_elements(weight, blocks, n, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the Hessians (E, 3 n + m, 3 n + m) of elements of n vertices and m edge unknowns.
 
-    ``vertices`` (E, n) are rows, ``edges`` (E, m) places in the flat form of arrays over rows; offsets are
-    those of the pairs of n + m rows, of which several may be one and the same.
+    Offsets are those of the pairs of n + m rows.
     """
-    n, m = vertices.shape[1], edges.shape[1]
+    flat, m = values.reshape(-1), blocks.shape[1] - 3 * n
     for e in range(offsets.shape[0]):
         pair = 0
         for a in range(n + m):
-            first_a, size_a = (3 * a, 3) if a < n else (2 * n + a, 1)
-            row_a, at_a = (vertices[e, a], 0) if a < n else (edges[e, a - n] // 3, edges[e, a - n] % 3)
             for b in range(a, n + m):
-                first_b, size_b = (3 * b, 3) if b < n else (2 * n + b, 1)
-                row_b, at_b = (vertices[e, b], 0) if b < n else (edges[e, b - n] // 3, edges[e, b - n] % 3)
                 at = offsets[e, pair]
                 pair += 1
                 if at < 0:
                     continue
-                for i in range(size_a):
-                    for j in range(size_b):
-                        value = weight[e] * blocks[e, first_a + i, first_b + j]
-                        p, q = at_a + i, at_b + j
-                        # values of a block stand column by column
-                        if at & 1:
-                            values[at >> 1, q, p] += value
-                        else:
-                            values[at >> 1, p, q] += value
-                            if a != b and row_a == row_b:
-                                values[at >> 1, q, p] += value
+                if a >= n:
+                    flat[at] += weight[e] * blocks[e, 2 * n + a, 2 * n + b]
+                    continue
+                for i in range(3):
+                    if b >= n:
+                        flat[(at >> 2) + i * ((at & 3) + 1)] += weight[e] * blocks[e, 3 * a + i, 2 * n + b]
+                        continue
+                    for j in range(3):
+                        p, q = (j, i) if at & 1 else (i, j)
+                        values[at >> 1, p, q] += weight[e] * blocks[e, 3 * a + i, 3 * b + j]

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
 from lyra_petsc.linear.pattern import BlockPattern
+
+if TYPE_CHECKING:
+    from lyra_petsc.linear.edge_couplings import ProductWithEdges
 
 Array = NDArray[np.float64]
 
@@ -32,6 +37,15 @@ def half_stored(indptr, ends, columns, blocks, x, sums, out):  # type: ignore[no
         out[row, 0], out[row, 1], out[row, 2] = s0 + sums[row, 0], s1 + sums[row, 1], s2 + sums[row, 2]
 
 
+def product_of(pattern: BlockPattern, values: Array) -> HalfStored | ProductWithEdges:
+    """What multiplies by values (n_stored, 3, 3), which are read where they stand."""
+    if pattern.edge_couplings is None:
+        return HalfStored(pattern, values)
+    from lyra_petsc.linear.edge_couplings import ProductWithEdges  # of use for nothing else
+
+    return ProductWithEdges(pattern, values)
+
+
 class HalfStored:
     """Products with symmetric block rows of which one half is stored.
 
@@ -45,9 +59,6 @@ class HalfStored:
         self._rows = pattern.indptr, pattern.ends, pattern.columns, values.reshape(-1, 9)
         self._shape = pattern.n_owned, 4
         self._kept = np.empty(self._shape) if pattern.n_owned <= MOST_KEPT else None
-
-    def changed(self) -> None:
-        """The values are others: they are read where they stand."""
 
     def __call__(self, x: Array, out: Array) -> None:
         """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""

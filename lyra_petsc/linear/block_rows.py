@@ -5,38 +5,26 @@ Of a symmetric matrix, in the half storage of ``pattern``.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.linear.block_product import HalfStored
+from lyra_petsc.linear.block_product import product_of
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import Elastic
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 
 @cached()
-def _scale(indptr, source, factor, diagonal, values):  # type: ignore[no-untyped-def]
-    """values = factor · source, plus the diagonal (n_owned,) times the identity."""
-    for row in range(len(indptr) - 1):
-        first = indptr[row]
-        for k in range(first, indptr[row + 1]):
-            for i in range(3):
-                for j in range(3):
-                    values[k, i, j] = factor * source[k, i, j]
-        for i in range(3):
-            values[first, i, i] += diagonal[row]
-
-
-@cached()
-def _set_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
-    """Set the diagonal (n_owned,) times the identity in values that are 0."""
+def _add_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
+    """Add the diagonal times the identity to the first blocks of rows."""
     for row in range(len(indptr) - 1):
         for i in range(3):
-            values[indptr[row], i, i] = diagonal[row]
+            values[indptr[row], i, i] += diagonal[row]
 
 
 @cached()
@@ -63,12 +51,34 @@ def _constrain(indptr, columns, touched, mask, values):  # type: ignore[no-untyp
                         values[k, i, j] = size if row == c and i == j else 0.0
 
 
+class Beside(NamedTuple):
+    """What couples to prescribed unknowns, and these themselves, in the flat form of values.
+
+    Attributes
+    ----------
+    rows : (n,)
+        Of blocks, ascending.
+    zeros : (m,)
+        Couplings of edges.
+    edges, sizes : (k,), (k, 3)
+        Prescribed edges' own, and those of the three edges in their rows.
+    changing : (l,)
+        All, those of blocks too.
+    """
+
+    rows: Ints
+    zeros: Ints
+    edges: Ints
+    sizes: Ints
+    changing: Ints
+
+
 class BlockRows:
     """Adds element Hessians into block rows, and works on these rows.
 
     Attributes
     ----------
-    values : (n_blocks, 3, 3) float64
+    values : (n_stored, 3, 3) float64
         In the order of ``pattern``, column by column. All methods that take ``values`` work on such an array.
     """
 
@@ -76,8 +86,8 @@ class BlockRows:
         self.pattern = pattern
 
     def zeros(self) -> Array:
-        """A new array of values (n_blocks, 3, 3), all zero."""
-        return np.zeros((self.pattern.n_blocks, 3, 3))
+        """A new array of values (n_stored, 3, 3), all zero."""
+        return np.zeros((self.pattern.n_stored, 3, 3))
 
     def add_stiffness(
         self,
@@ -97,35 +107,68 @@ class BlockRows:
     def set_diagonal(self, diagonal: Array, values: Array) -> None:
         """Let ``values`` be ``diagonal`` (n_owned,) times the identity."""
         values.fill(0.0)
-        _set_diagonal(self.pattern.indptr, diagonal, values)
+        self.add_diagonal(diagonal, values)
+
+    def add_diagonal(self, diagonal: Array, values: Array) -> None:
+        """Add ``diagonal`` (n_owned,) times the identity."""
+        pattern = self.pattern
+        _add_diagonal(pattern.indptr[: pattern.n_diagonal + 1], diagonal, values)
+        if pattern.edge_couplings is not None:
+            at = pattern.edge_couplings.diagonal(pattern.n_blocks)
+            values.reshape(-1)[at] += np.repeat(diagonal[pattern.n_diagonal :], 3)
+
+    def enlarge(self, values: Array, factor: float) -> None:
+        """Multiply the diagonal blocks, and of edges their own entries, by a factor."""
+        pattern = self.pattern
+        values[pattern.indptr[: pattern.n_diagonal]] *= factor
+        if pattern.edge_couplings is not None:
+            values.reshape(-1)[pattern.edge_couplings.diagonal(pattern.n_blocks)] *= factor
 
     def scale(self, source: Array, factor: float, diagonal: Array, values: Array) -> None:
         """Let ``values`` be factor × source + ``diagonal`` (n_owned,) times the identity."""
-        _scale(self.pattern.indptr, source, factor, diagonal, values)
+        np.multiply(source, factor, out=values)
+        self.add_diagonal(diagonal, values)
 
     def add_at(self, source: Array, place: NDArray[np.int64], values: Array) -> None:
-        """Add blocks (n, 3, 3) to those of ``values`` at ``place`` (n,), none of them twice."""
+        """Add blocks (n, 3, 3) to those of ``values`` at ``place`` (n,), none of them twice, and couplings of
+        edges to these.
+        """
         _add_at(source, place, values)
+        edges = self.pattern.edge_couplings
+        if edges is not None:
+            begin, end = (edges.first_group(n) for n in (self.pattern.n_blocks, len(place)))
+            values.reshape(-1)[begin : begin + edges.n_values] += source.reshape(-1)[
+                end : end + edges.n_values
+            ]
 
     def product(self, values: Array, x: Array) -> Array:
         """Rows (n_owned, 3) of the product with x (n_local, 3), ghosts up to date."""
         out = np.empty((self.pattern.n_owned, 3))
-        HalfStored(self.pattern, values)(x, out)
+        product_of(self.pattern, values)(x, out)
         return out
 
-    def beside(self, mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Blocks whose row or column has a prescribed coordinate, and before them their rows.
+    def beside(self, mask: NDArray[np.bool_]) -> Beside:
+        """What has a prescribed coordinate in its row or column; mask (n_local, 3)."""
+        pattern, held = self.pattern, mask.any(axis=1)
+        zeros = edges = np.empty(0, dtype=np.int64)
+        sizes = np.empty((0, 3), dtype=np.int64)
+        if not held.any():
+            return Beside(zeros, zeros, edges, sizes, zeros)
+        rows = np.repeat(np.arange(pattern.n_owned), np.diff(pattern.indptr))
+        blocks = np.flatnonzero(held[pattern.columns] | held[rows])
+        changing = (9 * blocks[:, None] + np.arange(9)).ravel()
+        if pattern.edge_couplings is not None:
+            zeros, edges, sizes = pattern.edge_couplings.beside(mask, pattern.n_blocks)
+            changing = np.concatenate([changing, zeros, edges])
+        return Beside(np.unique(rows[blocks]), zeros, edges, sizes, changing)
 
-        Numbers, ascending; mask (n_local, 3).
-        """
-        held = mask.any(axis=1)
-        rows = np.repeat(np.arange(self.pattern.n_owned), np.diff(self.pattern.indptr))
-        blocks = np.flatnonzero(held[self.pattern.columns] | held[rows])
-        return np.unique(rows[blocks]), blocks
-
-    def constrain(self, values: Array, mask: NDArray[np.bool_], rows: NDArray[np.int64]) -> None:
+    def constrain(self, values: Array, mask: NDArray[np.bool_], beside: Beside) -> None:
         """Decouple prescribed coordinates, with a positive diagonal of the size of their neighbours.
 
         That size is what multigrid and incomplete factors need.
         """
-        _constrain(self.pattern.indptr, self.pattern.columns, rows, mask, values)
+        _constrain(self.pattern.indptr, self.pattern.columns, beside.rows, mask, values)
+        flat = values.reshape(-1)
+        sizes = np.abs(flat[beside.sizes]).max(axis=1, initial=0.0)
+        flat[beside.zeros] = 0.0
+        flat[beside.edges] = sizes

@@ -1,14 +1,15 @@
-"""Couplings of edges one by one, where block rows hold three edges in a row.
+"""Couplings of edges one by one, behind the blocks of a pattern.
 
-Of the 3 × 3 blocks of vertices and edges four tenths are zero in any matrix, of those of edges seven tenths:
-products and sweeps work on a copy without them. Among owned rows it has, of two blocks or numbers that are
-each other's transpose one:
+In blocks of 3 × 3, with edges in rows of three, four tenths of the numbers of vertices and edges would be
+zero in any matrix, of those of edges seven tenths. So owned rows have, of two numbers that are each other's
+transpose one:
 
-- 3 × 3 blocks of vertices,
+- 3 × 3 blocks of vertices, which are the pattern's,
 - of each vertex, 3 × 4 blocks with groups of four of its edges; what is too much in the last is zero,
 - numbers of edges.
 
-Couplings to ghosts, of which there are few, stay 3 × 3 blocks.
+Couplings to ghosts, of which there are few, are 3 × 3 blocks of the pattern. Values are one array: blocks,
+groups, numbers.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
-from lyra_petsc.linear.block_product import HalfStored
-from lyra_petsc.linear.pattern import begins, index_type
+from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, index_type, union
 
 if TYPE_CHECKING:
-    from lyra_petsc.linear.pattern import BlockPattern
+    from collections.abc import Sequence
+
+    from lyra_petsc.terms.term import Offsets, WithEdges
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -32,24 +34,11 @@ Ints = NDArray[np.int64]
 GROUP = 4
 """Edges of a vertex in one block."""
 
+ALIGNED = 4
+"""Groups begin where the number of blocks before them would be a multiple of this: at 16 bytes."""
+
 AHEAD_EDGES = 32
 """Blocks of four edges by which they are fetched before they are used."""
-
-
-class Blocks(NamedTuple):
-    """3 × 3 blocks as a pattern has them, but those with owned edges.
-
-    Attributes
-    ----------
-    indptr : (n_owned + 1,)
-    ends : (n_owned,)
-        Where a row's blocks in columns of ghosts begin.
-    columns : (n_blocks,)
-    """
-
-    indptr: Ints
-    ends: Ints
-    columns: NDArray[np.int32]
 
 
 class Groups(NamedTuple):
@@ -71,113 +60,17 @@ class Numbers(NamedTuple):
 
     Attributes
     ----------
-    indptr : (n + 1,)
+    indptr : (n + 1,) int32, int64 where there are too many
         Of places from that of the first edge on; the first of a row is its diagonal.
     places : (n_numbers,) int32
     """
 
-    indptr: Ints
+    indptr: NDArray[Any]
     places: NDArray[np.int32]
 
 
-class EdgeCouplings:
-    """Which couplings there are, and where a pattern has them.
-
-    Parameters
-    ----------
-    pattern : BlockPattern
-        With elements that couple edges.
-
-    Attributes
-    ----------
-    n_vertices : int
-        Owned rows before the first one of edges.
-    blocks, groups, numbers
-    """
-
-    def __init__(self, pattern: BlockPattern) -> None:
-        n, n_local = pattern.n_owned, pattern.n_local
-        vertices = np.concatenate([part.vertices for part in pattern.edges])
-        edges = np.concatenate([part.edges for part in pattern.edges])
-        owned = edges < 3 * n
-        self.n_vertices = first = int(edges.min(initial=3 * n, where=owned) // 3)
-        rows = np.repeat(np.arange(n, dtype=np.int64), np.diff(pattern.indptr))
-        keys = rows * n_local + pattern.columns
-        kept = (pattern.columns >= n) | (pattern.columns < first)
-        self._block = np.flatnonzero(kept).astype(index_type(pattern.n_blocks))
-        sums = begins(kept)
-        ends = sums[pattern.ends]
-        self.blocks = Blocks(sums[pattern.indptr], ends, pattern.columns[kept])
-
-        def number(row: Ints, place: Ints) -> Ints:
-            """Where the pattern's flat form has the first coupling of a row with a place."""
-            block = np.searchsorted(keys, row * n_local + place // 3)
-            return 9 * block + 3 * (place % 3)
-
-        pairs = [
-            vertices[:, a].astype(np.int64) * (3 * n) + edges[:, b]
-            for a in range(vertices.shape[1])
-            for b in range(edges.shape[1])
-        ]
-        inside = [
-            owned[:, b] & (vertices[:, a] < n)
-            for a in range(vertices.shape[1])
-            for b in range(edges.shape[1])
-        ]
-        vertex, place = np.divmod(_once(pairs, inside), 3 * n)
-        count = np.bincount(vertex, minlength=first)
-        groups = begins(-(-count // GROUP))
-        at = GROUP * groups[vertex] + np.arange(len(vertex)) - begins(count)[vertex]
-        places = np.zeros(GROUP * groups[-1], dtype=np.int32)
-        self._triple = np.full(GROUP * groups[-1], -1, dtype=index_type(9 * pattern.n_blocks))
-        places[at], self._triple[at] = place, number(vertex, place)
-        # in place of edges that are not there, one that is near
-        places = places.reshape(-1, GROUP)
-        places = np.where(self._triple.reshape(-1, GROUP) < 0, places[:, :1], places)
-        self.groups = Groups(groups, places)
-
-        pairs = [
-            np.minimum(edges[:, a], edges[:, b]).astype(np.int64) * (3 * n)
-            + np.maximum(edges[:, a], edges[:, b])
-            for a in range(edges.shape[1])
-            for b in range(a)
-        ]
-        inside = [owned[:, a] & owned[:, b] for a in range(edges.shape[1]) for b in range(a)]
-        diagonal = np.arange(3 * first, 3 * n, dtype=np.int64) * (3 * n + 1)
-        one, other = np.divmod(_once([*pairs, diagonal], [*inside, np.ones(len(diagonal), bool)]), 3 * n)
-        indptr = begins(np.bincount(one - 3 * first, minlength=len(diagonal)))
-        self._number = (number(one // 3, other) + one % 3).astype(self._triple.dtype)
-        self.numbers = Numbers(indptr, other.astype(np.int32))
-
-    @property
-    def n_numbers(self) -> int:
-        """Of the whole rows, zeros in the groups among them."""
-        inside = 9 * int(np.count_nonzero(self.blocks.columns < self.n_vertices)) + len(self.numbers.places)
-        inside += 3 * self.groups.places.size
-        beyond = len(self.blocks.columns) - int(np.count_nonzero(self.blocks.columns < self.n_vertices))
-        return 2 * inside + 9 * beyond - 9 * self.n_vertices - len(self.numbers.indptr) + 1
-
-    @property
-    def n_values(self) -> int:
-        """How many values there are."""
-        return int(9 * len(self._block) + 3 * self.groups.places.size + len(self._number))
-
-    def within(self, memory: NDArray[Any]) -> EdgeValues:
-        """Room for values in ``memory`` (at least n_values,)."""
-        first = 3 * self.groups.places.size
-        last = first + 9 * len(self._block)
-        groups, blocks = memory[:first].reshape(-1, 3 * GROUP), memory[first:last].reshape(-1, 9)
-        return EdgeValues(blocks, groups, memory[last : self.n_values].reshape(-1, 1))
-
-    def take(self, values: Array, least: float, out: EdgeValues, wide: EdgeValues | None = None) -> None:
-        """Copy block rows (n_blocks, 9); entries up to ``least`` become 0, but in ``wide``."""
-        whole = wide or EdgeValues(np.empty((0, 9)), np.empty((0, 3 * GROUP)), np.empty((0, 1)))
-        where = self._block, self._triple, self._number
-        _take(*where, values, values.reshape(-1), least, wide is not None, *out, *whole)
-
-
 class EdgeValues(NamedTuple):
-    """Values of the couplings.
+    """Values of a pattern's couplings.
 
     Attributes
     ----------
@@ -193,36 +86,234 @@ class EdgeValues(NamedTuple):
     numbers: NDArray[Any]
 
 
-def _once(keys: list[Ints], chosen: list[NDArray[np.bool_]]) -> Ints:
-    """Of keys (n,) those chosen, ascending."""
-    found: Ints = np.unique(np.concatenate([key[there] for key, there in zip(keys, chosen, strict=True)]))
-    return found
+class EdgeCouplings:
+    """Which couplings of owned edges there are.
+
+    Parameters
+    ----------
+    elements : sequence of WithEdges
+    n_owned : int
+        Block rows that this rank owns.
+
+    Attributes
+    ----------
+    n_vertices : int
+        Owned rows before the first one of edges.
+    groups, numbers
+    """
+
+    def __init__(self, elements: Sequence[WithEdges], n_owned: int) -> None:
+        self._n, beyond = n_owned, 3 * n_owned
+        least = (int(part.edges.min(initial=beyond)) for part in elements)
+        self.n_vertices = first = min(beyond, *least) // 3
+
+        def keys(part: WithEdges) -> tuple[list[Ints], list[Ints]]:
+            """Of vertices and edges, and of two edges: one times ``beyond`` plus the place of the other."""
+            mixed, edges = [], []
+            places = part.edges.astype(np.int64)
+            for b, place in enumerate(places.T):
+                for vertex in part.vertices.T:
+                    there = (place < beyond) & (vertex < n_owned)
+                    mixed.append(vertex[there].astype(np.int64) * beyond + place[there])
+                for other in places.T[:b]:
+                    there = (place < beyond) & (other < beyond)
+                    lesser, greater = np.minimum(place, other)[there], np.maximum(place, other)[there]
+                    edges.append(lesser * beyond + greater)
+            return mixed, edges
+
+        found = [keys(part) for part in elements]
+        vertex, place = np.divmod(union(*(key for mixed, _ in found for key in mixed)), max(beyond, 1))
+        count = np.bincount(vertex, minlength=first)
+        groups = begins(-(-count // GROUP))
+        at = GROUP * groups[vertex] + np.arange(len(vertex)) - begins(count)[vertex]
+        places = np.full(GROUP * groups[-1], -1, dtype=np.int32)
+        places[at] = place
+        # in place of edges that are not there, one that is near
+        places = places.reshape(-1, GROUP)
+        self.groups = Groups(groups, np.where(places < 0, places[:, :1], places))
+
+        diagonal = np.arange(3 * first, beyond, dtype=np.int64) * (beyond + 1)
+        one, other = np.divmod(union(diagonal, *(key for _, edges in found for key in edges)), max(beyond, 1))
+        indptr = begins(np.bincount(one - 3 * first, minlength=len(diagonal)))
+        self.numbers = Numbers(indptr.astype(index_type(len(other))), other.astype(np.int32))
+
+    # -- where values stand --------------------------------------------------------------------------
+
+    @property
+    def n_values(self) -> int:
+        """Of groups and numbers."""
+        return int(3 * self.groups.places.size + len(self.numbers.places))
+
+    @property
+    def n_numbers(self) -> int:
+        """In whole rows, both of those that are each other's transpose, and zeros in groups."""
+        return 2 * self.n_values - len(self.numbers.indptr) + 1
+
+    def first_group(self, n_blocks: int) -> int:
+        """Where groups begin behind so many blocks, in the flat form of values."""
+        return 9 * ALIGNED * -(-n_blocks // ALIGNED)
+
+    def first_number(self, n_blocks: int) -> int:
+        """Where numbers begin."""
+        return self.first_group(n_blocks) + 3 * self.groups.places.size
+
+    def room(self, n_blocks: int) -> int:
+        """Blocks (3 × 3) that all values have the size of."""
+        return -(-(self.first_group(n_blocks) + self.n_values) // 9)
+
+    def diagonal(self, n_blocks: int) -> Ints:
+        """Where the edges' own numbers stand, those of padding too."""
+        own: Ints = self.numbers.indptr[:-1].astype(np.int64)
+        return own + self.first_number(n_blocks)
+
+    def parts(self, values: NDArray[Any], n_blocks: int) -> EdgeValues:
+        """Views of values (n_stored, 3, 3)."""
+        flat, first, last = values.reshape(-1), self.first_group(n_blocks), self.first_number(n_blocks)
+        blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
+        return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
+
+    def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> Offsets:
+        """Where the couplings (a, b), b ≥ a, of elements go, the vertices being the first of their points.
+
+        Of two vertices as in the pattern; of a vertex and an edge four times the place of the first of three
+        numbers in the flat form of values, plus how far apart they are, less one; of two edges the place of
+        their number. −1 where other ranks have both.
+        """
+        stencil = elements.stencil
+        n = stencil.shape[1]
+        first = self.first_group(pattern.n_blocks)
+        kind = index_type(4 * (first + self.n_values))
+        out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=kind)
+        rows = pattern.indptr, pattern.columns, *self.groups, *self.numbers
+        _look_up(*rows, first, self.first_number(pattern.n_blocks), stencil, elements.edges, out)
+        return out
+
+    # -- prescribed unknowns -------------------------------------------------------------------------
+
+    def beside(self, mask: NDArray[np.bool_], n_blocks: int) -> tuple[Ints, Ints, Ints]:
+        """Of prescribed unknowns, mask (n_local, 3), in the flat form of values: couplings with them (m,),
+        edges' own numbers (k,), and the own numbers (k, 3) of edges in the same rows.
+        """
+        held = mask.ravel()
+        vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
+        coupled = mask[vertex][:, :, None] | held[self.groups.places][:, None, :]
+        of_groups = self.first_group(n_blocks) + np.flatnonzero(coupled)
+        indptr, places = self.numbers
+        edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(indptr))
+        own = self.diagonal(n_blocks)
+        of_numbers = held[edge] | held[places]
+        of_numbers[indptr[:-1]] = False
+        zeros = np.concatenate([of_groups, self.first_number(n_blocks) + np.flatnonzero(of_numbers)])
+        edges: Ints = np.flatnonzero(held[3 * self.n_vertices : 3 * self._n])
+        return zeros, own[edges], own.reshape(-1, 3)[edges // 3]
+
+    # -- in blocks -----------------------------------------------------------------------------------
+
+    def _coupled(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Of all numbers of groups and of edges their rows and columns, places in the flat form."""
+        vertex = np.repeat(np.arange(self.n_vertices), np.diff(self.groups.indptr))
+        shape = (len(vertex), 3, GROUP)
+        row = np.broadcast_to((3 * vertex[:, None] + np.arange(3))[:, :, None], shape).ravel()
+        column = np.broadcast_to(self.groups.places[:, None, :], shape).ravel()
+        edge = np.repeat(np.arange(3 * self.n_vertices, 3 * self._n), np.diff(self.numbers.indptr))
+        return row, column.astype(np.int64), edge, self.numbers.places.astype(np.int64)
+
+    def whole(self, pattern: BlockPattern) -> BlockPattern:
+        """A pattern of blocks alone, in which owned edges are in rows of three."""
+        row, column, edge, other = (place // 3 for place in self._coupled())
+        keys = union(_keys_of(pattern), row * pattern.n_local + column, edge * pattern.n_local + other)
+        return BlockPattern.of_keys(keys, pattern.n_owned, pattern.n_local)
+
+    def in_blocks(self, pattern: BlockPattern, values: Array) -> Array:
+        """Values (n_stored, 3, 3) as that pattern has them, (n_blocks, 3, 3)."""
+        blocks, groups, numbers = self.parts(values, pattern.n_blocks)
+        keys, n_local = _keys_of(pattern.whole), pattern.n_local
+        out = np.zeros((len(keys), 9))
+        out[np.searchsorted(keys, _keys_of(pattern))] = blocks
+        flat = out.reshape(-1)
+
+        def place(row: Ints, column: Ints) -> Ints:
+            """Values of a block stand column by column."""
+            block = np.searchsorted(keys, (row // 3) * n_local + column // 3)
+            found: Ints = 9 * block + 3 * (column % 3) + row % 3
+            return found
+
+        row, column, edge, other = self._coupled()
+        # of an edge that fills up a group the coupling is 0 there
+        np.add.at(flat, place(row, column), groups.ravel())
+        flat[place(edge, other)] = numbers[:, 0]
+        together = edge // 3 == other // 3
+        flat[place(other[together], edge[together])] = numbers[together, 0]
+        return out.reshape(-1, 3, 3)
+
+
+def _keys_of(pattern: BlockPattern) -> Ints:
+    rows = np.repeat(np.arange(pattern.n_owned, dtype=np.int64), np.diff(pattern.indptr))
+    return rows * pattern.n_local + pattern.columns
+
+
+@cached(inline="always")
+def _block(indptr, columns, row, column):  # type: ignore[no-untyped-def]
+    """The number of a block, or `MISSING`."""
+    lo, hi = indptr[row], indptr[row + 1]
+    while hi - lo > 1:
+        middle = (lo + hi) // 2
+        if columns[middle] <= column:
+            lo = middle
+        else:
+            hi = middle
+    return lo if lo < hi and columns[lo] == column else MISSING
 
 
 @cached()
-def _take(  # type: ignore[no-untyped-def]
-    block, triple, number, values, flat, least, both, blocks, groups, numbers, wide, wide_groups, wide_numbers
+def _look_up(  # type: ignore[no-untyped-def]
+    indptr, columns, group_ptr, places, number_ptr, others, first_group, first_number, stencil, edges, out
 ):
-    for k in range(Index(len(block))):
-        b = Index(block[k])
-        for i in range(Index(9)):
-            value = values[b, i]
-            blocks[k, i] = value if abs(value) > least else 0.0
-            if both:
-                wide[k, i] = value
-    for k in range(Index(len(groups))):
-        for lane in range(Index(4)):
-            at = triple[Index(4) * k + lane]
-            for i in range(Index(3)):
-                value = flat[Index(at) + i] if at >= 0 else 0.0
-                groups[k, Index(4) * i + lane] = value if abs(value) > least else 0.0
-                if both:
-                    wide_groups[k, Index(4) * i + lane] = value
-    for k in range(Index(len(number))):
-        value = flat[Index(number[k])]
-        numbers[k, 0] = value if abs(value) > least else 0.0
-        if both:
-            wide_numbers[k, 0] = value
+    """Offsets (E, n (n + 1) / 2) of elements whose stencil (E, n) ends with the rows of edges (E, m)."""
+    n_owned, n_vertices = len(indptr) - 1, len(group_ptr) - 1
+    n = stencil.shape[1] - edges.shape[1]
+    for e in range(len(stencil)):
+        pair = 0
+        for a in range(stencil.shape[1]):
+            for b in range(a, stencil.shape[1]):
+                found = -1
+                one, other = stencil[e, a], stencil[e, b]
+                row, column = min(one, other), max(one, other)
+                if row < n_owned:
+                    if b < n or column >= n_owned:
+                        found = _block(indptr, columns, row, column)
+                    if b < n:
+                        if found >= 0:
+                            found = 2 * found + (1 if one < other else 0)
+                    elif column >= n_owned:
+                        if found >= 0:
+                            place = edges[e, b - n] % 3
+                            if a < n:
+                                found = (
+                                    4 * (9 * found + 3 * place) if one == row else 4 * (9 * found + place) + 2
+                                )
+                            else:
+                                before = edges[e, a - n] % 3
+                                i, j = (before, place) if one == row else (place, before)
+                                found = 9 * found + 3 * j + i
+                    elif a < n:
+                        found = MISSING
+                        for k in range(4 * group_ptr[one], 4 * group_ptr[one + 1]):
+                            if places[k // 4, k % 4] == edges[e, b - n]:
+                                found = 4 * (first_group + 12 * (k // 4) + k % 4) + 3
+                                break
+                    else:
+                        lesser, greater = edges[e, a - n], edges[e, b - n]
+                        if lesser > greater:
+                            lesser, greater = greater, lesser
+                        found = MISSING
+                        edge = lesser - 3 * n_vertices
+                        for k in range(number_ptr[edge], number_ptr[edge + 1]):
+                            if others[k] == greater:
+                                found = first_number + k
+                                break
+                out[e, pair] = found
+                pair += 1
 
 
 @cached(fastmath={"contract", "nsz"})
@@ -263,37 +354,22 @@ def multiply(  # type: ignore[no-untyped-def]
 
 
 class ProductWithEdges:
-    """Products with symmetric block rows of which one half is stored, some of them of edges.
-
-    For a copy some ten products must follow; it is made along with that of the sweeps.
+    """Products with symmetric values of which one half is stored, some of them of edges.
 
     Parameters
     ----------
-    couplings : EdgeCouplings
     pattern : BlockPattern
-    values : (n_blocks, 3, 3)
-        ``changed`` says that they are others.
+    values : (n_stored, 3, 3)
+        They are read where they stand.
     """
 
-    def __init__(self, couplings: EdgeCouplings, pattern: BlockPattern, values: Array) -> None:
-        self.couplings, self._whole = couplings, HalfStored(pattern, values)
-        self._rows = *couplings.blocks, *couplings.groups, *couplings.numbers
-        self._values: EdgeValues | None = None
-        self._current = False
-
-    def changed(self) -> None:
-        """The values are others."""
-        self._current = False
-
-    def copied(self, values: EdgeValues) -> EdgeValues:
-        """Where the caller copies the values as they are now."""
-        self._values, self._current = values, True
-        return values
+    def __init__(self, pattern: BlockPattern, values: Array) -> None:
+        couplings = pattern.edge_couplings
+        assert couplings is not None
+        rows = pattern.indptr, pattern.ends, pattern.columns, *couplings.groups, *couplings.numbers
+        self._rows = *rows, *couplings.parts(values, pattern.n_blocks)
+        self._n_vertices = couplings.n_vertices
 
     def __call__(self, x: Array, out: Array) -> None:
         """Put into out (n_owned, 3) the product with x (n_local, 3), ghosts up to date."""
-        if self._current and self._values is not None:
-            sums = np.empty((self.couplings.n_vertices, 4))
-            multiply(*self._rows, *self._values, x, sums, out)
-        else:
-            self._whole(x, out)
+        multiply(*self._rows, x, np.empty((self._n_vertices, 4)), out)

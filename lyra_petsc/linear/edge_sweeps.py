@@ -20,15 +20,17 @@ from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.edge_couplings import AHEAD_EDGES
 from lyra_petsc.linear.gauss_seidel import (
+    NEGLIGIBLE,
     flushed,
     invert_diagonal,
     negligible,
     solved,
+    store,
     subtract_ghosts,
 )
 
 if TYPE_CHECKING:
-    from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
+    from lyra_petsc.linear.edge_couplings import EdgeCouplings
     from lyra_petsc.linear.pattern import BlockPattern
 
 Array = NDArray[np.float64]
@@ -198,11 +200,6 @@ def forward_ahead(  # type: ignore[no-untyped-def]
         scatter(blocks, columns, r, lo, Index(ends[row]), (-y0, -y1, -y2))
 
 
-def memory_needed(couplings: EdgeCouplings, product: ProductWithEdges | None) -> int:
-    """How many float64 numbers the copies of rows for sweeps, and for a product with these rows, take."""
-    return -(-couplings.n_values // 2) + (0 if product is None else couplings.n_values)
-
-
 class SweepsWithEdges:
     """``gauss_seidel.BlockSweeps`` where edges carry unknowns.
 
@@ -210,10 +207,8 @@ class SweepsWithEdges:
     ----------
     pattern : BlockPattern
     couplings : EdgeCouplings
-    product : ProductWithEdges, optional
-        With the same rows.
-    memory : (n,), optional
-        Where the copies of rows are.
+    memory : (n,) float64, optional
+        Where the copy of rows is, in single precision.
 
     Attributes
     ----------
@@ -229,42 +224,44 @@ class SweepsWithEdges:
         self,
         pattern: BlockPattern,
         couplings: EdgeCouplings,
-        product: ProductWithEdges | None = None,
         memory: Array | None = None,
     ) -> None:
-        self._couplings, self._indptr, self._product = couplings, pattern.indptr, product
-        self._rows, self._groups = couplings.blocks, couplings.groups
+        self._couplings, self._n_blocks = couplings, pattern.n_blocks
+        self._rows = pattern.indptr, pattern.ends, pattern.columns
+        self._groups = couplings.groups
         self._numbers, self._first = couplings.numbers, 3 * couplings.n_vertices
         n, n_local = couplings.n_vertices, pattern.n_local
-        beside = np.flatnonzero(self._rows.ends < self._rows.indptr[1:])
+        beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
         self._weight = self._of_all_alike(pattern, n)
-        memory = np.empty(memory_needed(couplings, product)) if memory is None else memory
-        n_wide = 0 if product is None else couplings.n_values
-        self._wide = None if product is None else couplings.within(memory)
-        self._values = couplings.within(memory[n_wide:].view(np.float32))
+        room = 9 * pattern.n_stored
+        memory = np.empty(-(-room // 2)) if memory is None else memory
+        self._copy = memory.view(np.float32)[:room].reshape(-1, 9)
+        self._values = couplings.parts(self._copy, pattern.n_blocks)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._moved = np.zeros((n_local, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
         self.r = np.zeros((n_local, 4), dtype=np.float32)
         self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
-        self.flops = 2.0 * couplings.n_numbers
+        self.flops = 18.0 * pattern.n_couplings
 
     def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
         """Weights of the blocks of n vertices in the product of the matrix with a common movement of all."""
         of_edges = np.zeros(pattern.n_local, dtype=bool)
-        for part in pattern.edges:
+        for part in pattern.edges.values():
             of_edges[part.edges // 3] = True
-        begin = self._rows.indptr[: n + 1]
-        columns = self._rows.columns[: begin[-1]]
+        begin = pattern.indptr[: n + 1]
+        columns = pattern.columns[: begin[-1]]
         weight = np.where(columns < n, 2, np.where(of_edges[columns], 0, 1)).astype(np.int8)
         weight[begin[:-1]] = 1
         return weight
 
     def diagonal(self, values: Array, rows: Ints) -> Array:
-        """What is inverted (n, 9) of rows (n,) of block rows (n_blocks, 9): of edges the diagonal alone."""
-        found: Array = values[self._indptr[rows]]
-        found[rows >= len(self._inverse)] *= np.eye(3).ravel()
+        """What is inverted (n, 9) of rows (n,) of block rows (n_stored, 9): of edges the diagonal alone."""
+        found, edges = np.zeros((len(rows), 9)), rows >= len(self._inverse)
+        found[~edges] = values[self._rows[0][rows[~edges]]]
+        own = self._couplings.diagonal(self._n_blocks).reshape(-1, 3)[rows[edges] - len(self._inverse)]
+        found[np.flatnonzero(edges)[:, None], [0, 4, 8]] = values.reshape(-1)[own]
         return found
 
     def inertia(self) -> Array:
@@ -278,11 +275,12 @@ class SweepsWithEdges:
         return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
     def set(self, values: Array) -> None:
-        """Take block rows (n_blocks, 9)."""
-        self._couplings.take(values, negligible(self._indptr, values), self._values, self._wide)
-        if self._product is not None and self._wide is not None:
-            self._product.copied(self._wide)
-        invert_diagonal(self._indptr, values, self._inverse)
+        """Take block rows (n_stored, 9)."""
+        begin = self._rows[0][: len(self._inverse) + 1]
+        own = values.reshape(-1)[self._couplings.diagonal(self._n_blocks)]
+        least = NEGLIGIBLE * float(own.min(initial=np.inf, where=own > 0.0))
+        store(values, min(least, negligible(begin, values)), self._copy)
+        invert_diagonal(begin, values, self._inverse)
         invert_numbers(self._numbers.indptr, self._values.numbers, self._inverse_of_edges)
 
     def shrink(self, rows: Ints, factor: Array) -> None:
@@ -293,7 +291,7 @@ class SweepsWithEdges:
 
     def begin(self, b: Floats) -> None:
         """Let the residual be b (n_local, 3): x is zero."""
-        n, n_owned = len(self._inverse), len(self._rows.ends)
+        n, n_owned = len(self._inverse), len(self._rows[1])
         self.r[:n, :3] = b[:n]
         self.r[n_owned:] = 0.0  # to which turns of edges are added
         self.of_edges[n:n_owned] = b[n:n_owned]
@@ -340,5 +338,5 @@ class SweepsWithEdges:
             forward_ahead(*rows, self._inverse, b, x, self.r)
             return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
-        beyond = self._rows.indptr, self._rows.columns, blocks, len(self._inverse)
+        beyond = self._rows[0], self._rows[2], blocks, len(self._inverse)
         forward_edges(*beyond, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)

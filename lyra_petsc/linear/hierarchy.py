@@ -16,7 +16,6 @@ from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.mesh.points import Layout, Points
 
 if TYPE_CHECKING:
-    from lyra_petsc.linear.edge_couplings import ProductWithEdges
     from lyra_petsc.terms.edge_turns import EdgeTurns
 
 Array = NDArray[np.float64]
@@ -36,8 +35,8 @@ class Surface:
 
     Attributes
     ----------
-    x : (n_local, 3)
-        Positions [m] that interpolation follows.
+    x : (n_vertices, 3)
+        Positions [m] of the owned vertices that interpolation follows.
     triangles : (F, 3)
         Local numbering.
     """
@@ -98,16 +97,13 @@ class Level:
         Interpolates from the next coarser level, and makes its block rows.
     turns : EdgeTurns or None
         How unknowns of edges, that nothing is interpolated to, follow the vertices.
-    product : ProductWithEdges or None
-        With the same block rows, where edges carry unknowns.
     memory : (n,) float64 or None
-        For what the sweeps and this product copy.
+        For what the sweeps copy, where edges carry unknowns.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
         self.points, self.pattern, self.turns = points, pattern, turns
         self.galerkin: Galerkin | None = None
-        self.product: ProductWithEdges | None = None
         self.memory: Array | None = None
 
 
@@ -122,8 +118,8 @@ class Hierarchy:
         Between the levels, finest first.
     below : WithoutEdges, optional
         Where edges carry unknowns.
-    product : ProductWithEdges, optional
-        With the finest level's rows.
+    spare : bool
+        The finest level's block rows are of no use once it has taken them: ``below`` may have their room.
 
     Attributes
     ----------
@@ -136,17 +132,15 @@ class Hierarchy:
         pattern: BlockPattern,
         interpolations: Sequence[InterpolationRows],
         below: WithoutEdges | None = None,
-        product: ProductWithEdges | None = None,
+        *,
+        spare: bool = False,
     ) -> None:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
-        level.product = product
-        if below is not None and pattern.edge_couplings is not None:
-            from lyra_petsc.linear.edge_sweeps import memory_needed  # of use for nothing else
-
-            # what is below is there before the copies are
-            needed = memory_needed(pattern.edge_couplings, product)
-            level.memory = np.empty(max(needed, 9 * below.pattern.n_blocks))
+        self._spare = spare and below is not None and below.pattern.n_blocks <= pattern.n_stored
+        if below is not None and not self._spare:
+            # what is below is there before the copies, in single precision, are
+            level.memory = np.empty(9 * max(-(-pattern.n_stored // 2), below.pattern.n_blocks))
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
@@ -158,7 +152,8 @@ class Hierarchy:
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
         """Of each level, finest first, the block rows that those of the finest make; collective.
 
-        Each is made when it is asked for, and the one before should be freed by then.
+        Each is made when it is asked for, and the one before should be freed by then; the finest ones are
+        overwritten where they are spare.
 
         Parameters
         ----------
@@ -180,6 +175,8 @@ class Hierarchy:
             below = finest.galerkin.project(self._below.values(held, finest.memory), free)
         for level in self.levels:
             yield values, free
+            if self._below is not None and self._spare and level is finest:
+                values = self._below.values(held, values.reshape(-1))
             if below is not None:
                 (values, free), below = below, None
             elif level.galerkin is not None:
@@ -202,7 +199,7 @@ def interpolations(layout: Layout, surface: Surface, most: int) -> list[Interpol
     comm, n = layout.comm, layout.n_vertices
     first_owned = surface.triangles[:, 0] < n  # each triangle is sent once
     corners = layout.vertex_numbers(layout.global_number[surface.triangles[first_owned]])
-    parts = comm.gather((surface.x[:n], corners, layout.original))
+    parts = comm.gather((surface.x, corners, layout.original))
     shares: list[list[InterpolationRows]] = []
     if parts is not None:
         x, triangles, original = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))

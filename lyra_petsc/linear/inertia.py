@@ -47,12 +47,13 @@ class Inertia:
     ----------
     layout : Layout
     pattern : BlockPattern
-    values : (n_blocks, 3, 3)
+    values : (n_stored, 3, 3)
         Its block rows, prescribed unknowns decoupled with a positive diagonal.
     """
 
     def __init__(self, layout: Layout, pattern: BlockPattern, values: Array) -> None:
-        self._layout, self._values = layout, values
+        self._layout, self._values, pattern = layout, pattern.in_blocks(values), pattern.whole
+        values = self._values
         self._diagonal = pattern.indptr[:-1]
         entries = np.abs(values[self._diagonal][:, range(3), range(3)])
         self._largest = float(layout.comm.allreduce(float(entries.max(initial=0.0)), MPI.MAX))

@@ -5,20 +5,17 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.linear.block_product import MOST_KEPT, HalfStored
+from lyra_petsc.linear.block_product import MOST_KEPT, product_of
+from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
 from lyra_petsc.mesh.points import Points
-
-if TYPE_CHECKING:
-    from lyra_petsc.linear.edge_couplings import ProductWithEdges
 
 Array = NDArray[np.float64]
 
@@ -52,16 +49,8 @@ class _Product:
         self._summary = None if summary is None else weakref.WeakMethod(summary)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
-        edges = pattern.edge_couplings
-        self.multiply: HalfStored | ProductWithEdges
-        if edges is None:
-            self.multiply = HalfStored(pattern, rows)
-            self._operations = 2.0 * 9.0 * pattern.n_couplings
-        else:
-            from lyra_petsc.linear.edge_couplings import ProductWithEdges  # of use for nothing else
-
-            self.multiply = ProductWithEdges(edges, pattern, rows)
-            self._operations = 2.0 * edges.n_numbers
+        self._multiply = product_of(pattern, rows)
+        self._operations = 2.0 * 9.0 * pattern.n_couplings
         n_local = points.n_local if self._points is not None else 0
         self._local = np.empty((n_local, 3)) if n_local <= MOST_KEPT else None
 
@@ -73,7 +62,7 @@ class _Product:
             local[: len(values)] = values
             self._points.update_ghosts(local)
             values = local
-        self.multiply(values, y.getArray().reshape(-1, 3))
+        self._multiply(values, y.getArray().reshape(-1, 3))
         PETSc.Log.logFlops(self._operations)
 
     multTranspose = mult  # it is symmetric
@@ -107,10 +96,8 @@ class BlockMatrix:
     ----------
     mat : PETSc.Mat
         Of type ``python``.
-    rows : (n_blocks, 3, 3) float64
+    rows : (n_stored, 3, 3) float64
         Its block rows; ``set`` tells PETSc that they changed.
-    product : HalfStored or ProductWithEdges
-        With them.
     followers : list of callables
         Are given the block rows whenever they change.
     """
@@ -125,30 +112,27 @@ class BlockMatrix:
         self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
         self.mat.setType(PETSc.Mat.Type.PYTHON)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self.rows = np.zeros((pattern.n_blocks, 3, 3))
+        self._blocks = BlockRows(pattern)
+        self.rows = self._blocks.zeros()
         self.followers: list[Callable[[Array], None]] = []
-        self._diagonal = pattern.indptr[:-1]
-        made = _Product(points, pattern, self.rows, summary)
-        self.product = made.multiply
-        self.mat.setPythonContext(made)
+        self.mat.setPythonContext(_Product(points, pattern, self.rows, summary))
         _set_vec_type(self.mat)
         self.mat.setUp()
         # what PETSc frees when Python is gone must not call it
         self._detach = weakref.finalize(self, self.mat.setType, PETSc.Mat.Type.SHELL)
 
     def set(self, values: Array, larger: float = 0.0) -> None:
-        """Replace all entries by block rows ``values`` (n_blocks, 3, 3), mostly ``rows`` themselves;
+        """Replace all entries by block rows ``values`` (n_stored, 3, 3), mostly ``rows`` themselves;
         collective.
 
-        Diagonal blocks become ``larger`` by this fraction.
+        Diagonal blocks, and of edges their own entries, become ``larger`` by this fraction.
         """
         if values is not self.rows:
             self.rows[:] = values
         if larger > 0.0:
-            self.rows[self._diagonal] *= 1.0 + larger
+            self._blocks.enlarge(self.rows, 1.0 + larger)
         for follower in self.followers:
             follower(self.rows)
-        self.product.changed()
         self.mat.assemble()
         self.mat.stateIncrease()
 
@@ -176,7 +160,7 @@ class AssembledMatrix:
     Attributes
     ----------
     mat : PETSc.Mat
-    rows : (n_blocks, 3, 3) float64
+    rows : (n_stored, 3, 3) float64
         Where to put new block rows together for ``set``.
     """
 
@@ -190,7 +174,8 @@ class AssembledMatrix:
         if not diagonal:
             self._set_from_options(prefix)
         self.kind = str(self.mat.getType()).removeprefix("seq").removeprefix("mpi")
-        self._n_blocks, self._diagonal, self._only_diagonal = pattern.n_blocks, pattern.indptr[:-1], diagonal
+        self._pattern, pattern = pattern, pattern.whole
+        self._diagonal, self._only_diagonal = pattern.indptr[:-1], diagonal
         self._rows: Array | None = None
         if diagonal:
             keys = diagonal_keys(points.n_owned, points.n_local)
@@ -238,14 +223,15 @@ class AssembledMatrix:
     @property
     def rows(self) -> Array:
         if self._rows is None:
-            self._rows = np.zeros((self._n_blocks, 3, 3))
+            self._rows = np.zeros((self._pattern.n_stored, 3, 3))
         return self._rows
 
     def set(self, values: Array, larger: float = 0.0) -> None:
-        """Replace all entries by block rows ``values`` (n_blocks, 3, 3); collective.
+        """Replace all entries by block rows ``values`` (n_stored, 3, 3); collective.
 
         Diagonal blocks become ``larger`` by this fraction.
         """
+        values = self._pattern.in_blocks(values)
         kept = values[self._diagonal]
         if self._only_diagonal:
             values = (1.0 + larger) * kept

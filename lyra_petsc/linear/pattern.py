@@ -1,6 +1,8 @@
 """Block sparsity from the stencils of the active terms, and where each element block goes.
 
-The matrices are symmetric: of two blocks that are each other's transpose one is stored.
+The matrices are symmetric: of two blocks that are each other's transpose one is stored. Where edges carry
+unknowns, those of owned edges are not in blocks, of which they would leave half zero, but behind these, one
+by one (``edge_couplings``).
 """
 
 from __future__ import annotations
@@ -67,33 +69,48 @@ class BlockPattern:
     """Compressed block rows of the owned points; columns in local numbering (owned, then ghosts).
 
     A row holds the columns from its own on: the upper triangle among owned points, and all ghosts. Values of
-    a block stand column by column, as PETSc keeps them.
+    a block stand column by column, as PETSc keeps them. Of owned edges there are only blocks with ghosts.
 
     Parameters
     ----------
     couplings : mapping of name → (E, n) int, Across or WithEdges
         Local rows that elements couple; only these get an entry, and the diagonal.
     n_owned, n_local : int
+    n_diagonal : int, optional
+        Rows, the first ones, that have a diagonal block, if others have none at all.
 
     Attributes
     ----------
     n_owned, n_local : int
+    n_diagonal : int
+        How many rows, the first ones, have a diagonal block: all but those of edges.
     indptr : (n_owned + 1,) int64
-        The first block of a row is the diagonal one.
+        The first block of such a row is the diagonal one.
     columns : (n_blocks,) int32
         Local column of each block, ascending within a row.
     offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
         Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
         index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
-        both rows. Of `Across` (E,).
-    edges : tuple of WithEdges
+        both rows. Of `Across` (E,). Of `WithEdges` see ``edge_couplings.offsets_of``.
+    edges : dict of name → WithEdges
         Elements that couple edges.
+    edge_couplings : EdgeCouplings or None
+        Those of owned edges, where there are such elements.
     """
 
-    def __init__(self, couplings: Couplings, n_owned: int, n_local: int) -> None:
-        keys = _with(couplings, diagonal_keys(n_owned, n_local), n_owned, n_local)
+    def __init__(
+        self, couplings: Couplings, n_owned: int, n_local: int, n_diagonal: int | None = None
+    ) -> None:
+        self.edges = {name: part for name, part in couplings.items() if isinstance(part, WithEdges)}
+        self.edge_couplings: EdgeCouplings | None = None
+        self.n_diagonal = n_owned if n_diagonal is None else n_diagonal
+        if self.edges:
+            from lyra_petsc.linear.edge_couplings import EdgeCouplings  # of use for nothing else
+
+            self.edge_couplings = EdgeCouplings(list(self.edges.values()), n_owned)
+            self.n_diagonal = self.edge_couplings.n_vertices
+        keys = _with(couplings, diagonal_keys(self.n_diagonal, n_local), self.n_diagonal, n_owned, n_local)
         self._set(keys, n_owned, n_local)
-        self.edges = tuple(part for part in couplings.values() if isinstance(part, WithEdges))
         self.offsets: dict[str, Offsets] = {}
         for name, coupling in couplings.items():
             # terms on the same triangles are wont to have them in the same order
@@ -120,6 +137,9 @@ class BlockPattern:
 
     def offsets_of(self, coupling: Coupling) -> Offsets:
         """Offsets of elements; `MISSING` where a coupling has no block."""
+        if isinstance(coupling, WithEdges):
+            assert self.edge_couplings is not None
+            return self.edge_couplings.offsets_of(coupling, self)
         stencil = _stencil(coupling)
         n = stencil.shape[1]
         out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
@@ -141,9 +161,12 @@ class BlockPattern:
         keys = np.empty(len(own) + len(more), dtype=np.int64)
         keys[place], keys[np.arange(len(more)) + np.searchsorted(own, more)] = own, more
         made = BlockPattern.of_keys(keys, self.n_owned, n_local)
-        made.edges = self.edges
+        made.edges, made.edge_couplings, made.n_diagonal = self.edges, self.edge_couplings, self.n_diagonal
         kind = index_type(2 * len(keys))
         for name, offsets in self.offsets.items():
+            if name in self.edges:
+                made.offsets[name] = made.offsets_of(self.edges[name])
+                continue
             moved = 2 * place[offsets >> 1] + (offsets & 1)
             made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
         return made, place
@@ -153,7 +176,7 @@ class BlockPattern:
         """The pattern with these blocks, ascending row · n_local + column, which no elements add to."""
         made = cls.__new__(cls)
         made._set(keys, n_owned, n_local)
-        made.offsets, made.edges = {}, ()
+        made.offsets, made.edges, made.edge_couplings, made.n_diagonal = {}, {}, None, n_owned
         return made
 
     def _set(self, keys: Ints, n_owned: int, n_local: int) -> None:
@@ -175,19 +198,27 @@ class BlockPattern:
         ends: Ints = self.indptr[:-1] + np.diff(begins(owned)[self.indptr])
         return ends
 
-    @cached_property
-    def edge_couplings(self) -> EdgeCouplings | None:
-        """Couplings of edges one by one, where elements have some."""
-        if not self.edges:
-            return None
-        from lyra_petsc.linear.edge_couplings import EdgeCouplings  # of use for nothing else
-
-        return EdgeCouplings(self)
+    @property
+    def n_stored(self) -> int:
+        """How many blocks (3 × 3) take as much room as all values, those of edges too."""
+        return self.n_blocks if self.edge_couplings is None else self.edge_couplings.room(self.n_blocks)
 
     @property
     def n_couplings(self) -> int:
-        """Blocks of the whole rows, both of those that are each other's transpose."""
-        return self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_owned
+        """Blocks of the whole rows, both of those that are each other's transpose; of couplings of edges as
+        many as have so many numbers.
+        """
+        found = self.n_blocks + int(np.count_nonzero(self.columns < self.n_owned)) - self.n_diagonal
+        return found if self.edge_couplings is None else found + self.edge_couplings.n_numbers // 9
+
+    @cached_property
+    def whole(self) -> BlockPattern:
+        """The pattern of blocks alone, in which owned edges are in rows of three."""
+        return self if self.edge_couplings is None else self.edge_couplings.whole(self)
+
+    def in_blocks(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values (n_stored, 3, 3) as ``whole`` has them."""
+        return values if self.edge_couplings is None else self.edge_couplings.in_blocks(self, values)
 
 
 def begins(counts: NDArray[Any]) -> Ints:
@@ -218,7 +249,11 @@ def _stencil(coupling: Coupling) -> NDArray[np.int32]:
 
 
 def _same(one: Coupling | None, other: Coupling) -> bool:
-    return one is not None and type(one) is type(other) and np.array_equal(_stencil(one), _stencil(other))
+    if one is None or type(one) is not type(other) or not np.array_equal(_stencil(one), _stencil(other)):
+        return False
+    return not (isinstance(one, WithEdges) and isinstance(other, WithEdges)) or np.array_equal(
+        one.edges, other.edges
+    )
 
 
 def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Ints:
@@ -226,14 +261,22 @@ def _keys(one: NDArray[np.int32], other: NDArray[np.int32], n_local: int) -> Int
     return key
 
 
-def _with(couplings: Couplings, keys: Ints, n_owned: int, n_local: int) -> Ints:
-    """The keys, and those of all couplings that this rank stores: row · n_local + column, ascending."""
+def _with(couplings: Couplings, keys: Ints, n_diagonal: int, n_owned: int, n_local: int) -> Ints:
+    """The keys, and those of couplings that this rank has blocks for: row · n_local + column, ascending."""
+
+    def stored(part: Ints) -> Ints:
+        part = part[part < n_owned * n_local]
+        if not any(isinstance(coupling, WithEdges) for coupling in couplings.values()):
+            return part
+        column = part % n_local
+        return part[(column < n_diagonal) | (column >= n_owned)]
+
     for coupling in couplings.values():
         stencil = _stencil(coupling)
         # one row of elements after the other: all couplings at once take much memory
         for _, pairs in groupby(_pairs(coupling), key=itemgetter(0)):
             found = (_keys(stencil[:, a], stencil[:, b], n_local) for a, b in pairs)
-            keys = union(keys, *(part[part < n_owned * n_local] for part in found))
+            keys = union(keys, *(stored(part) for part in found))
     return keys
 
 

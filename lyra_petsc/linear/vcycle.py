@@ -51,7 +51,7 @@ def _sweeps_of(level: Level) -> sweeps.BlockSweeps | SweepsWithEdges:
         return sweeps.BlockSweeps(pattern)
     from lyra_petsc.linear.edge_sweeps import SweepsWithEdges  # of use for nothing else
 
-    return SweepsWithEdges(pattern, pattern.edge_couplings, level.product, level.memory)
+    return SweepsWithEdges(pattern, pattern.edge_couplings, level.memory)
 
 
 class Smoother:

@@ -173,8 +173,11 @@ class Layout(Points):
         )
         self.original, self.edges = unknowns.vertices, unknowns.edges
         first = 3 * self.n_vertices
-        self.edge_places: Ints = first + np.arange(self.n_edges)
         self.padding: Ints = np.arange(first + self.n_edges, 3 * self.n_owned)
+
+    @property
+    def edge_places(self) -> Ints:
+        return 3 * self.n_vertices + np.arange(self.n_edges)
 
     @property
     def n_unknowns(self) -> int:

@@ -18,27 +18,28 @@ Array = NDArray[np.float64]
 
 
 class Multiple:
-    """Block rows that are factor · D + diagonal · I, but for blocks of which it keeps what they were.
+    """Block rows that are factor · D + diagonal · I, but for values of which it keeps what they were.
 
     Parameters
     ----------
-    values : (n_blocks, 3, 3)
+    values : (n_stored, 3, 3)
     factor : float
     diagonal : (n_owned,)
     changing : (n,) int
-        Blocks that will be others afterwards.
+        In the flat form, values that will be others afterwards.
     """
 
     def __init__(self, values: Array, factor: float, diagonal: Array, changing: NDArray[np.int64]) -> None:
         self._values, self._factor, self._diagonal = values, factor, diagonal
-        self._changing, self._kept = changing, values[changing]
+        self._flat = values.reshape(-1)
+        self._changing, self._kept = changing, self._flat[changing]
 
     def product(self, blocks: BlockRows, v: Array) -> Array:
         """D v (n_owned, 3) of v (n_local, 3)."""
-        now = self._values[self._changing]
-        self._values[self._changing] = self._kept
+        now = self._flat[self._changing]
+        self._flat[self._changing] = self._kept
         out = blocks.product(self._values, v)
-        self._values[self._changing] = now
+        self._flat[self._changing] = now
         out -= self._diagonal[:, None] * v[: len(out)]
         out /= self._factor
         return out
@@ -125,7 +126,7 @@ class Damping:
         return self._blocks.product(self._own(), v)
 
     def into(self, values: Array, diagonal: Array) -> None:
-        """Let ``values`` (n_blocks, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
+        """Let ``values`` (n_stored, 3, 3) be D + ``diagonal`` (n_owned,) · I."""
         self.let_go()
         rows, place = self._discretisation.rows, self._discretisation.place
         if self.acts and place is None:
@@ -141,8 +142,8 @@ class Damping:
         """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
 
         It is where all elements have one γ, and D was frozen at x: half the assembly of a semi-implicit step,
-        and D need not be stored beside it. Else False. The caller may change the blocks ``changing`` (n,)
-        afterwards.
+        and D need not be stored beside it. Else False. The caller may change ``changing`` (n,), in the
+        flat form, afterwards.
         """
         self.let_go()
         if not self._gamma or self._at is None or not np.array_equal(x, self._at):

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.linear import multigrid, presets
-from lyra_petsc.linear.block_product import HalfStored
 from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Surface, interpolations
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
 from lyra_petsc.linear.multigrid import Multigrid
@@ -106,11 +105,8 @@ class LinearSystem:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)
-        product = self.preconditioner.product
-        shared = None
-        if self.preconditioner is self.operator and not isinstance(product, HalfStored):
-            shared = product
-        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, shared)
+        spare = self.preconditioner is not self.operator
+        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
         return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
 
     def attach(self, ksp: PETSc.KSP) -> None:

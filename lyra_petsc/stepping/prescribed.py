@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.linear.block_rows import Beside, BlockRows
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.terms.prescribed_handles import Held
@@ -38,7 +38,7 @@ class Prescribed:
         self._discretisation, self.held, self._reference = discretisation, held, reference
         self._active: tuple[int, ...] | None = None
         self._span = (0.0, 0.0)
-        self._beside: tuple[BlockRows, Ints, Ints] | None = None
+        self._beside: tuple[BlockRows, Beside] | None = None
         own = np.zeros((discretisation.layout.n_owned, 3), dtype=bool)
         own.ravel()[discretisation.layout.padding] = True
         self._set(own)
@@ -61,22 +61,12 @@ class Prescribed:
         self._set(~self.free)
 
     @property
-    def blocks(self) -> Ints:
-        """Blocks of the present pattern that couple to prescribed unknowns."""
-        return self._coupled()[1]
-
-    @property
-    def rows(self) -> Ints:
-        """The block rows in which they are."""
-        return self._coupled()[0]
-
-    def _coupled(self) -> tuple[Ints, Ints]:
+    def beside(self) -> Beside:
+        """What the present matrix has of prescribed unknowns and of couplings to them."""
         rows = self._discretisation.rows
         if self._beside is None or self._beside[0] is not rows:
-            none = np.empty(0, dtype=np.int64)
-            found = rows.beside(self.mask) if self.mask.any() else (none, none)
-            self._beside = rows, *found
-        return self._beside[1:]
+            self._beside = rows, rows.beside(self.mask)
+        return self._beside[1]
 
     def begin_step(self, t0: float, t1: float, x: Array) -> bool:
         """Take the handles of the step t0..t1 [s] from x (n_owned, 3); whether they changed; collective."""

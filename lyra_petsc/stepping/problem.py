@@ -326,13 +326,17 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     for term in system.active.elastic:
         if term.registration.coarse:
             entry, name = registered(term.registration.coarse), f"coarse {term.name}"
-            coarse = cast("Elastic", made(entry, part.elements[name], scene, on_vertices))
+            # which are for forces and files
+            elements = part.elements[name].without("length", "rest_height")
+            coarse = cast("Elastic", made(entry, elements, scene, on_vertices))
             coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
             system.active.coarse[term] = coarse
     data, rows = part.vertex_data, slice(0, layout.n_vertices)
     system.x[rows] = data["position"]
     layout.update_ghosts(system.x)
-    surface = Surface(system.x.copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil)
+    surface = Surface(
+        system.x[rows].copy(), next(t for t in terms.values() if isinstance(t, Membrane)).stencil
+    )
     # handles start from the undisturbed shape
     system.begin(0.0)
     system.x[rows] = data.get("start", data["position"])

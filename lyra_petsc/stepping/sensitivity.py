@@ -583,14 +583,7 @@ def _product(system: StageEquations, values: Array, v: Array) -> Array:
     local = np.zeros((points.n_local, 3))
     local[: len(v)] = v
     points.update_ghosts(local)
-    edges = rows.pattern.edge_couplings
-    if edges is None:
-        return rows.product(values, local)
-    from lyra_petsc.linear.edge_couplings import ProductWithEdges  # of use for nothing else
-
-    out = np.zeros_like(v)
-    ProductWithEdges(edges, rows.pattern, values)(local, out)
-    return out
+    return rows.product(values, local)
 
 
 def _scenes(scene: Scene, number: Number, step: float) -> Iterator[tuple[float, float, Scene]]:

@@ -756,16 +756,17 @@ class StageEquations:
         inertia = self.stage.sigma * self.mass
         if self.active.edged:
             inertia += reach * self._least
-        blocks = self.prescribed.blocks
-        if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, blocks):
+        beside = self.prescribed.beside
+        changing = beside.changing
+        if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, changing):
             self.damping.into(values, inertia)
             for term in self.active.elastic:
                 rows.add_stiffness(term, x, self.active.frozen[term], blend, reach, values, predicted)
         if not lagged:
             for wind in self.active.viscous:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
-        if len(self.prescribed.rows):
-            rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
+        if len(changing):
+            rows.constrain(values, self.prescribed.mask, beside)
 
     def exact_hessian(self, values: Array) -> None:
         """Add to block rows (n_blocks, 3, 3) the exact Hessian [N/m] of all energies at the state.
@@ -782,8 +783,8 @@ class StageEquations:
             blocks = self.applied.factor * following_stiffness(load, self.x, self._force_of)
             offsets = rows.pattern.offsets_of(load.stencil)
             add_elements(np.ones(load.n_elements), blocks, offsets, values)
-        if len(self.prescribed.rows):
-            rows.constrain(values, self.prescribed.mask, self.prescribed.rows)
+        if len(self.prescribed.beside.changing):
+            rows.constrain(values, self.prescribed.mask, self.prescribed.beside)
 
     def _force_of(self, term: Term, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""

@@ -46,7 +46,7 @@ class VertexEquations:
         couplings: dict[str, Coupling] = {}
         for term in (*self._elastic, *self._viscous):
             couplings |= term.couplings
-        self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
+        self._rows = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local, layout.n_vertices))
         self.pattern = self._rows.pattern
         self.turns = EdgeTurns(self._bent, layout.n_owned)
         self._hold(np.zeros((layout.n_local, 3), dtype=bool))
@@ -55,7 +55,7 @@ class VertexEquations:
         """Keep what depends on the prescribed unknowns (n_local, 3): mostly they stay the same."""
         term = self._bent
         assert term.edges is not None
-        self._held, self._beside = held.copy(), self._rows.beside(held)[0]
+        self._held, self._beside = held.copy(), self._rows.beside(held)
         self._clamped = np.nonzero(held.ravel()[term.edges] & (term.stencil < self.pattern.n_owned))
         self.turns.hold(held)
 

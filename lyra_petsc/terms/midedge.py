@@ -20,7 +20,7 @@ Schöberl, Computers & Structures 225 (2019) 106109.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
+from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.midedge_shape import (
     Frames,
     against,
@@ -45,7 +46,7 @@ from lyra_petsc.terms.midedge_shape import (
 )
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, UpcomingStep
+from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, Term, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -112,6 +113,19 @@ class MidEdge(Elastic):
         self._constants = data["stiffness"], data["rest"], data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
+        self._membrane: Membrane | None = None  # of the same triangles
+
+    def connect(self, terms: Iterable[Term]) -> None:
+        membrane = next((term for term in terms if isinstance(term, Membrane)), None)
+        if membrane is not None and np.array_equal(membrane.stencil, self.stencil):
+            self._membrane, self.elements = membrane, self.elements.without("material")
+
+    @property
+    def _material(self) -> Array:
+        """The ways (E, 2, 2) from the first corner to the others in material axes [m]."""
+        if self._membrane is None:
+            return self.elements.data["material"]
+        return np.linalg.inv(self._membrane.elements.data["inverse"]).transpose(0, 2, 1)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -122,6 +136,7 @@ class MidEdge(Elastic):
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:
+        self.forget()  # by other frames directors are others
         self.frames = self._carried(frozen, x)
 
     @property
@@ -209,7 +224,7 @@ class MidEdge(Elastic):
     @property
     def areas(self) -> Array:
         """Of the triangles (E,) at rest [m²]."""
-        return areas(self.elements.data["material"])
+        return areas(self._material)
 
     @property
     def edge_places(self) -> Ints:
@@ -274,7 +289,7 @@ class MidEdge(Elastic):
     ) -> None:
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
-        constants = *self._constants, self.of_edges.length, self.edges
+        constants = *self._constants, self.of_edges.length
         midedge_energy.add_hessian(
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
         )
@@ -294,7 +309,7 @@ class MidEdge(Elastic):
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
         found = np.empty((self.n_elements, 3))
         tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), found)
-        of_tangents = curvatures_of_tangents(self.elements.data["material"])
+        of_tangents = curvatures_of_tangents(self._material)
         curvature: Array = np.einsum("eki,ei->ek", of_tangents, found)
         curvature[:, 2] *= 0.5
         return curvature

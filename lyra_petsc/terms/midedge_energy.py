@@ -32,8 +32,7 @@ import numpy as np
 
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
-from lyra_petsc.kernels.scatter import fetch_ahead
-from lyra_petsc.kernels.vectors import add_corners
+from lyra_petsc.kernels.vectors import add_corners, fetch
 from lyra_petsc.terms.hinge import cross, dot, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
 from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
@@ -259,54 +258,54 @@ def _nine(blocks, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _add_column(blocks, at, place, column, factor):  # type: ignore[no-untyped-def]
-    """Add factor times the coupling of a vertex with the edge at ``place`` to its block."""
+def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
+    """Add factor times the coupling of a vertex with an edge."""
     if at >= 0:
-        k, second = Index(at >> 1), Index(place) % Index(3)
-        if at & 1:  # values of a block stand column by column
-            first = Index(3) * second
-            blocks[k, first] += factor * column[0]
-            blocks[k, first + Index(1)] += factor * column[1]
-            blocks[k, first + Index(2)] += factor * column[2]
-        else:
-            blocks[k, second] += factor * column[0]
-            blocks[k, second + Index(3)] += factor * column[1]
-            blocks[k, second + Index(6)] += factor * column[2]
+        first, apart = Index(at >> 2), Index(at & 3) + Index(1)
+        flat[first] += factor * column[0]
+        flat[first + apart] += factor * column[1]
+        flat[first + apart + apart] += factor * column[2]
 
 
 @kernel(inline="always")
-def _add_columns(blocks, offsets, e, edge, place, one, two, factor):  # type: ignore[no-untyped-def]
+def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-untyped-def]
     """Add factor times the couplings of the corners 1 and 2 with an edge, and minus their sum of 0."""
     both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
-    _add_column(blocks, offsets[e, 3 + edge], place, both, -factor)
-    _add_column(blocks, offsets[e, 8 + edge], place, one, factor)
-    _add_column(blocks, offsets[e, 12 + edge], place, two, factor)
+    _add_column(flat, offsets[e, 3 + edge], both, -factor)
+    _add_column(flat, offsets[e, 8 + edge], one, factor)
+    _add_column(flat, offsets[e, 12 + edge], two, factor)
 
 
 @kernel(inline="always")
-def _add_number(blocks, at, place, other, value):  # type: ignore[no-untyped-def]
-    """Add the coupling of the edges at two places to their block."""
+def _add_number(flat, at, value):  # type: ignore[no-untyped-def]
+    """Add the coupling of two edges."""
     if at >= 0:
-        k, i, j = Index(at >> 1), Index(place) % Index(3), Index(other) % Index(3)
-        if at & 1:
-            i, j = j, i
-        blocks[k, Index(3) * i + j] += value
-        if place != other and Index(place) // Index(3) == Index(other) // Index(3):
-            blocks[k, Index(3) * j + i] += value
+        flat[Index(at)] += value
+
+
+@kernel(inline="always")
+def _fetch_ahead(e, offsets, values):  # type: ignore[no-untyped-def]
+    """Let what a later triangle is added to come into the caches, as if it were blocks (3 × 3)."""
+    later = min(e + AHEAD, offsets.shape[0] - 1)
+    for pair in (0, 1, 2, 6, 7, 11):
+        fetch(values, offsets[later, pair] >> 1)
+    for pair in (3, 4, 5, 8, 9, 10, 12, 13, 14):
+        fetch(values, (offsets[later, pair] >> 2) // 9)
+    for pair in (15, 18, 20):
+        fetch(values, offsets[later, pair] // 9)
 
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
-    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, friction, length, places, weight, offsets,
-    values
-):  # fmt: skip
+    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, friction, length, weight, offsets, values
+):
     """Add weight (E,) times the Hessians to block rows, where offsets (E, 21) say.
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
-    blocks, exact = values.reshape(-1, 9), 1.0 - blend
+    flat, exact = values.reshape(-1), 1.0 - blend
     for e in range(stencil.shape[0]):
-        fetch_ahead(e, offsets, values, 21, AHEAD)
+        _fetch_ahead(e, offsets, values)
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
@@ -383,14 +382,13 @@ def add_hessian(  # type: ignore[no-untyped-def]
         (b11, b12, b22), one, two, numbers = hessian
         factor = weight[e]
         add_corners(values, offsets, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
-        p, q, r = places[e, 0], places[e, 1], places[e, 2]
-        _add_columns(blocks, offsets, e, 0, p, one[0], two[0], factor)
-        _add_columns(blocks, offsets, e, 1, q, one[1], two[1], factor)
-        _add_columns(blocks, offsets, e, 2, r, one[2], two[2], factor)
+        _add_columns(flat, offsets, e, 0, one[0], two[0], factor)
+        _add_columns(flat, offsets, e, 1, one[1], two[1], factor)
+        _add_columns(flat, offsets, e, 2, one[2], two[2], factor)
         h00, h01, h02, h11, h12, h22 = numbers
-        _add_number(blocks, offsets[e, 15], p, p, factor * h00)
-        _add_number(blocks, offsets[e, 16], p, q, factor * h01)
-        _add_number(blocks, offsets[e, 17], p, r, factor * h02)
-        _add_number(blocks, offsets[e, 18], q, q, factor * h11)
-        _add_number(blocks, offsets[e, 19], q, r, factor * h12)
-        _add_number(blocks, offsets[e, 20], r, r, factor * h22)
+        _add_number(flat, offsets[e, 15], factor * h00)
+        _add_number(flat, offsets[e, 16], factor * h01)
+        _add_number(flat, offsets[e, 17], factor * h02)
+        _add_number(flat, offsets[e, 18], factor * h11)
+        _add_number(flat, offsets[e, 19], factor * h12)
+        _add_number(flat, offsets[e, 20], factor * h22)

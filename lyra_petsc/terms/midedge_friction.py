@@ -135,7 +135,7 @@ class MidEdgeFriction(Elastic):
     ) -> None:
         data, shape = self.elements.data, self._sheet.shape(x, frozen)
         length = self._sheet.of_edges.length
-        constants = *self._constants(self._sliding(x, frozen)), length, self.edges
+        constants = *self._constants(self._sliding(x, frozen)), length
         numbers = self._edges, data["sign"], shape
         midedge_energy.add_hessian(
             x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values

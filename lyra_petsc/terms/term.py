@@ -182,8 +182,7 @@ class Term(ABC):
             if self.edges is None:
                 add_elements(weight[lo:hi], blocks, at[lo:hi], values)
             else:
-                places = stencil[lo:hi], self.edges[rows][lo:hi]
-                add_mixed_elements(weight[lo:hi], blocks, *places, at[lo:hi], values)
+                add_mixed_elements(weight[lo:hi], blocks, n, at[lo:hi], values)
 
 
 class Elastic(Term):

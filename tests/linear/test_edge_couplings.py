@@ -1,12 +1,12 @@
-"""Rows with edges in a form without the zeros of their blocks: products and sweeps against dense ones."""
+"""Values of edges one by one behind blocks: products, sweeps and constraints against dense ones."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from oracle import expanded
 
 from lyra_petsc.kernels.scatter import add_mixed_elements
+from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
 from lyra_petsc.linear.edge_sweeps import SweepsWithEdges
 from lyra_petsc.linear.pattern import BlockPattern
@@ -31,9 +31,9 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     pattern = BlockPattern({"mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
     half = RNG.normal(size=(40, 12, 12))
     blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
-    values = np.zeros((pattern.n_blocks, 3, 3))
-    add_mixed_elements(np.ones(40), blocks, vertices, edges, pattern.offsets["mixed"], values)
-    values[pattern.indptr[:-1]] += 2.0 * np.eye(3)
+    values = np.zeros((pattern.n_stored, 3, 3))
+    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["mixed"], values)
+    BlockRows(pattern).add_diagonal(np.full(N_OWNED, 2.0), values)
     dense = expanded(pattern, values, N_LOCAL).reshape(3 * N_OWNED, 3 * N_LOCAL)
     return pattern, values, dense
 
@@ -51,26 +51,67 @@ def test_rows_without_edges_have_none() -> None:
 def test_the_product_is_the_dense_one() -> None:
     pattern, values, dense = mixed_rows()
     x, out = RNG.normal(size=(N_LOCAL, 3)), np.full((N_OWNED, 3), np.nan)
-    product = ProductWithEdges(couplings_of(pattern), pattern, values)
-    for copied in (False, True):
-        if copied:
-            couplings = couplings_of(pattern)
-            narrow = couplings.within(np.empty(couplings.n_values, dtype=np.float32))
-            wide = product.copied(couplings.within(np.empty(couplings.n_values)))
-            couplings.take(values.reshape(-1, 9), 0.0, narrow, wide)
+    product = ProductWithEdges(pattern, values)
+    for factor in (1.0, 2.0):
         product(x, out)
-        np.testing.assert_allclose(out.ravel(), dense @ x.ravel(), rtol=1e-12, atol=1e-12)
-    values *= 2.0
-    product.changed()
-    product(x, out)
-    np.testing.assert_allclose(out.ravel(), 2.0 * (dense @ x.ravel()), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(out.ravel(), factor * (dense @ x.ravel()), rtol=1e-12, atol=1e-12)
+        values *= 2.0
+
+
+def test_sums_and_multiples_are_the_dense_ones() -> None:
+    pattern, values, dense = mixed_rows()
+    rows, diagonal = BlockRows(pattern), RNG.normal(size=N_OWNED)
+    more = np.zeros_like(dense)
+    np.fill_diagonal(more, np.repeat(diagonal, 3))
+
+    def check(found: np.ndarray, expected: np.ndarray) -> None:
+        whole = expanded(pattern, found, N_LOCAL).reshape(dense.shape)
+        np.testing.assert_allclose(whole, expected, rtol=1e-13, atol=1e-13)
+
+    rows.scale(values, 3.0, diagonal, sums := rows.zeros())
+    check(sums, 3.0 * dense + more)
+    rows.set_diagonal(diagonal, sums)
+    check(sums, more)
+    rows.add_at(values, np.arange(pattern.n_blocks), sums)
+    check(sums, dense + more)
+    # beside couplings of vertices that were not there
+    pair = np.array([[0, 19], [3, N_LOCAL]], dtype=np.int32)
+    extended, place = pattern.extended(pattern.missing([pair], N_LOCAL + 1), N_LOCAL + 1)
+    BlockRows(extended).add_at(values, place, sums := BlockRows(extended).zeros())
+    wide = expanded(extended, sums, N_LOCAL + 1)
+    np.testing.assert_array_equal(wide[:, :, :N_LOCAL].reshape(dense.shape), dense)
+
+
+def test_prescribed_unknowns_are_decoupled() -> None:
+    pattern, values, dense = mixed_rows(definite=True)
+    rows, mask = BlockRows(pattern), np.zeros((N_LOCAL, 3), dtype=bool)
+    mask[[2, 5, N_VERTICES + 3, N_OWNED + 1, N_LOCAL - 1], [0, 1, 2, 0, 1]] = mask[[7, N_OWNED - 1]] = True
+    held, before, beside = mask.ravel(), values.copy(), rows.beside(mask)
+    rows.constrain(values, mask, beside)
+    found = expanded(pattern, values, N_LOCAL).reshape(dense.shape)
+    free = ~held[: 3 * N_OWNED, None] & ~held[None, :]
+    np.testing.assert_array_equal(found[free], dense[free])
+    own = np.diag(found)[held[: 3 * N_OWNED]]
+    assert own.min() > 0.0
+    assert np.count_nonzero(found[~free]) == len(own)
+    # nothing else has changed
+    flat, old = values.ravel(), before.ravel()
+    assert set(np.flatnonzero(flat != old)) <= set(beside.changing)
+
+
+def test_larger_diagonals() -> None:
+    pattern, values, dense = mixed_rows(definite=True)
+    BlockRows(pattern).enlarge(values, 1.5)
+    found = np.diag(expanded(pattern, values, N_LOCAL).reshape(dense.shape)) / np.diag(dense)
+    np.testing.assert_allclose(found, 1.5)
 
 
 def test_zeros_of_blocks_are_left_out() -> None:
     pattern, _, _ = mixed_rows()
     couplings = couplings_of(pattern)
     assert couplings.n_vertices == N_VERTICES
-    assert couplings.n_numbers < 0.7 * 9 * pattern.n_couplings
+    assert pattern.n_stored < 0.8 * pattern.whole.n_blocks
+    assert 9 * pattern.n_couplings < 0.8 * 9 * pattern.whole.n_couplings
 
 
 def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,12 +200,13 @@ def test_more_sweeps_over_the_vertices() -> None:
 
 
 def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
-    pattern, values, _ = mixed_rows(definite=True)
+    pattern, values, dense = mixed_rows(definite=True)
     sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
     rows = np.array([1, N_VERTICES + 1])
     vertex, edges = sweeps.diagonal(values.reshape(-1, 9), rows).reshape(2, 3, 3)
     np.testing.assert_array_equal(vertex, values[pattern.indptr[1]])
-    np.testing.assert_array_equal(edges, np.diag(np.diag(values[pattern.indptr[N_VERTICES + 1]])))
+    first = 3 * (N_VERTICES + 1)
+    np.testing.assert_array_equal(edges, np.diag(np.diag(dense)[first : first + 3]))
 
 
 def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
@@ -192,21 +234,25 @@ def test_rows_of_ghosts_alone() -> None:
     """A rank all of whose elements belong to others' rows but for one vertex."""
     coupling = WithEdges(np.array([[0, 2, 3]], np.int32), np.array([[12, 13, 14]], np.int64))
     pattern = BlockPattern({"mixed": coupling}, 1, 5)
-    values = RNG.normal(size=(pattern.n_blocks, 3, 3))
-    couplings, x, out = couplings_of(pattern), RNG.normal(size=(5, 3)), np.empty((1, 3))
-    assert couplings.n_vertices == 1
-    product = ProductWithEdges(couplings, pattern, values)
-    wide = product.copied(couplings.within(np.empty(couplings.n_values)))
-    couplings.take(values.reshape(-1, 9), 0.0, couplings.within(np.empty(couplings.n_values)), wide)
-    product(x, out)
+    values = RNG.normal(size=(pattern.n_stored, 3, 3))
+    x, out = RNG.normal(size=(5, 3)), np.empty((1, 3))
+    assert couplings_of(pattern).n_vertices == 1
+    ProductWithEdges(pattern, values)(x, out)
     expected = sum(values[k].T @ x[column] for k, column in enumerate(pattern.columns))
     np.testing.assert_allclose(out[0], expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_negligible_entries_are_none(kind: type) -> None:
-    pattern, values, _ = mixed_rows()
-    couplings = couplings_of(pattern)
-    copy = couplings.within(np.empty(couplings.n_values, dtype=kind))
-    couplings.take(values.reshape(-1, 9), 1e9, copy)
-    assert not any(part.any() for part in copy)
+def test_negligible_entries_are_none() -> None:
+    pattern, values, _ = mixed_rows(definite=True)
+    rows = BlockRows(pattern)
+    x = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)
+    found = []
+    for part in (0.0, 1e-14):
+        rows.set_diagonal(np.ones(N_OWNED), sums := rows.zeros())
+        sums += part * values
+        sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
+        sweeps.set(sums.reshape(-1, 9))
+        sweeps.begin(x)
+        sweeps.backward(y := np.zeros_like(x))
+        found.append(y)
+    np.testing.assert_array_equal(*found)

@@ -14,7 +14,7 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.linear import pattern as room
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
-from lyra_petsc.terms.term import Across
+from lyra_petsc.terms.term import Across, WithEdges
 
 N_OWNED, N_LOCAL = 9, 14
 
@@ -83,14 +83,14 @@ def test_prescribed_coordinates_are_decoupled_in_rows_and_columns() -> None:
     values, mask = rng.standard_normal((rows.pattern.n_blocks, 3, 3)), np.zeros((N_LOCAL, 3), dtype=bool)
     mask[[2, 5, N_OWNED + 1], [0, 1, 2]] = mask[7] = True
     before, free = values.copy(), ~mask
-    rows.constrain(values, mask, rows.beside(mask)[0])
+    rows.constrain(values, mask, beside := rows.beside(mask))
     x = rng.standard_normal((N_LOCAL, 3))
     found = rows.product(values, x)
     # the free part as it was without the others, each of which is its own
     alone = rows.product(before, np.where(free, x, 0.0))
     np.testing.assert_allclose(np.where(free[:N_OWNED], found - alone, 0.0), 0.0, atol=1e-14)
     assert (found * x[:N_OWNED])[mask[:N_OWNED]].min() > 0.0
-    rows.constrain(everywhere := before, mask, np.arange(N_OWNED))
+    rows.constrain(everywhere := before, mask, beside._replace(rows=np.arange(N_OWNED)))
     np.testing.assert_array_equal(values, everywhere)
 
 
@@ -164,12 +164,11 @@ def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
     rng = np.random.default_rng(8)
     vertices = np.array([[0, 1, 2], [5, 3, 1], [4, 2, 0]], dtype=np.int32)
     edges = np.array([[18, 19], [23, 20], [21, 19]], dtype=np.int64)  # two of one row, and of different ones
-    stencil = np.concatenate([vertices, edges // 3], axis=1).astype(np.int32)
-    pattern = BlockPattern({"mixed": stencil}, n_owned, 8)
+    pattern = BlockPattern({"mixed": WithEdges(vertices, edges)}, n_owned, 8)
     blocks = rng.random((3, 11, 11))
     blocks += blocks.transpose(0, 2, 1)
-    weight, values = rng.random(3), np.zeros((pattern.n_blocks, 3, 3))
-    add_mixed_elements(weight, blocks, vertices, edges, pattern.offsets["mixed"], values)
+    weight, values = rng.random(3), np.zeros((pattern.n_stored, 3, 3))
+    add_mixed_elements(weight, blocks, 3, pattern.offsets["mixed"], values)
     expected = np.zeros((24, 24))
     for e in range(3):
         places = np.concatenate([(3 * vertices[e][:, None] + np.arange(3)).ravel(), edges[e]])

@@ -152,6 +152,7 @@ def stiffness(trial: Trial) -> Stiffness:
         if isinstance(term, Elastic):
             frozen = term.freeze(UpcomingStep(0.0, 1.0, 1.0, system.x, system.reference.at))
             rows.add_stiffness(term, system.x, frozen, 0.0, 1.0, values)
+    values, pattern = pattern.in_blocks(values), pattern.whole
     numbers = mesh_numbers(trial)
     row, column = np.repeat(np.arange(points.n_owned), np.diff(pattern.indptr)), pattern.columns
     height = np.ascontiguousarray(values[:, 2, 2])

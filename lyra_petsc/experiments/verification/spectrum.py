@@ -90,8 +90,8 @@ def lowest_squares(trial: Trial, count: int, shift: float = 0.0) -> tuple[Array,
     held.ravel()[points.padding] = 1.0
     points.update_ghosts(held)
     mask = held > 0.5
-    values[problem.pattern.indptr[:-1]] += shift * system.mass[:, None, None] * np.eye(3)
-    rows.constrain(values, mask, rows.beside(mask)[0])
+    rows.add_diagonal(shift * system.mass, values)
+    rows.constrain(values, mask, rows.beside(mask))
     matrix = AssembledMatrix(points, problem.pattern, "aij")
     matrix.set(values)
     solver = direct_solver(points.comm, matrix.mat, "verify_modes_")
