@@ -545,10 +545,10 @@ class StageEquations:
         what obstacles take along.
         """
         here = self.velocity_of_staying()
-        lagged, refused = self.integrator.lagged_loads, None
-        ways = [here] if lagged else [here, self.v[: len(here)]]
+        rests, refused = self.integrator.starts_at_rest, None
+        ways = [here] if rests else [here, self.v[: len(here)]]
         tried = [(v, False) for v in ways]
-        if self.active.pushing and not lagged:
+        if self.active.pushing and not rests:
             tried += [(v, True) for v in ways]
         for v, carried in tried:
             there = here + self._carried(here, v - here) if carried else v.copy()
@@ -600,11 +600,11 @@ class StageEquations:
         """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
         collective.
         """
-        if self.stage.after == self.dt and not (self.integrator.lagged_loads and self.integrator.moves):
+        if self.stage.after == self.dt and self.integrator.iterates:
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
-        if self.integrator.lagged_loads:  # one linear solve has found it
+        if not self.integrator.iterates:  # one linear solve has found it
             v = self.velocity_of_staying()
         way = (end - self.evaluate_at(v)[0][:n]) / self.stage.reach
         return self._may_go(v, way, after=True)

@@ -143,6 +143,22 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) ->
     simulation.destroy()
 
 
+def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: MPI.Comm) -> None:
+    time = {"end": 0.015, "step": 0.005, "integrator": "semi-implicit"}
+    scene = ON_A_TABLE | {"time": time, "initial": {"velocity": [0, 0, -60.0]}}
+    simulation = SteppedScene(comm, scene_of(scene))
+    start, solver = simulation.budget.total, simulation.stepper.preset
+    while not simulation.finished:
+        simulation.step()
+        assert simulation.budget.total < 1.005 * start
+        assert simulation.ledger.columns()["smallest_gap"] > 0.0
+        # a checkpoint is of the usual steps
+        assert simulation.memory()["preset"] == solver
+    assert any("repeated by backward Euler" in note for note in simulation.notes)
+    assert simulation.totals["newton_iterations"] > 2 * simulation.step_number
+    simulation.destroy()
+
+
 def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
     """A blade turns by 120° a step, whose ends are on both sides of the sheet's edge."""
     blade = {"capsule": {"from": [-0.1, 0, 0], "to": [0.5, 0, 0], "radius": 0.01}, "motion": "turn"}
