@@ -82,6 +82,20 @@ BALL: dict[str, Any] = {
 }
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
+def test_accelerations_are_those_before_an_obstacle_comes(comm: MPI.Comm, integrator: str) -> None:
+    """At the stage of the first step the ball is where the sheet was."""
+    scene = BALL | {
+        "motions": {"up": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, 100.0]}]},
+        "time": {"end": 0.0025, "step": 0.0025, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    take_all_steps(simulation)
+    assert simulation.ledger.columns()["smallest_gap"] > 0.0
+    assert simulation.budget.kinetic > 0.1
+    simulation.destroy()
+
+
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) -> None:
     """A ball goes many gaps in a step, through where the sheet was; its work is that of its force."""
