@@ -202,13 +202,16 @@ class Discretisation:
         x, way = x[:n], way[:n]
         start, end = self._way
         from_start, from_end, _, back = self._from_way(x, x + way, reach)
-        flags = np.array([back, from_start or from_end], dtype=np.int64)
+        flags = np.array([from_start, back, from_start or from_end], dtype=np.int64)
         self.layout.comm.Allreduce(MPI.IN_PLACE, flags, MPI.MAX)
-        at_start, apart = flags
-        if at_start and not apart:
+        *left, apart = flags
+        if not apart:
             return 1.0
-        least = float(_free_part(x, way, start if at_start else end, reach))
-        return float(self.layout.comm.allreduce(least, MPI.MIN))
+        # near both ends of a short way there may be no room left at the one, and all at the other
+        places = zip(left, (start, end), strict=True)
+        parts = np.array([0.0 if gone else _free_part(x, way, place, reach) for gone, place in places])
+        self.layout.comm.Allreduce(MPI.IN_PLACE, parts, MPI.MIN)
+        return float(parts.max())
 
     def _search(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints]:
         """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 def first_guess(system: StageEquations, out: Array) -> None:
     """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
     n, integrator = system.points.n_owned, system.integrator
-    if integrator.lagged_loads:
+    if integrator.starts_at_rest:
         out[:] = 0.0
         if isinstance(integrator, Static) and not system.discretisation.guards:
             ahead = integrator.ahead

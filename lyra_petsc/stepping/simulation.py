@@ -28,7 +28,7 @@ from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
-from lyra_petsc.stepping.integrators.beuler import BackwardEuler
+from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.near_pairs import worst_pair
 from lyra_petsc.stepping.problem import Problem, build_problem, events, refuse_contact
@@ -266,6 +266,7 @@ class SteppedScene:
             past, past_error = system.integrator.memory(), self.estimated_error
             past_slope = self.local_error.memory() if self.local_error is not None else None
             with self.phases("solve"):
+                self.stepper.follow_integrator()
                 attempt = self._seek.attempt(self.time, end)
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
@@ -387,17 +388,17 @@ class SteppedScene:
             return stands
 
     def _take_impact(self, dt: float, why: str) -> bool:
-        """Let backward Euler repeat a short step of second order that failed where something touches, as no
-        formula for smooth motions holds over an impact; whether it does.
+        """Let backward Euler repeat a short step that failed where something touches, as neither a formula for
+        smooth motions nor one linear solve holds over an impact; whether it does.
         """
         system, usual = self.problem.system, self._usual
         long = self.scene.time.adaptive or dt > (FINEST if usual.by_stage else FINER) * self.control.step
-        if long or usual.order == 1 or not system.touches:
+        if long or usual.name == "beuler" or not usual.moves or not system.touches:
             return False
         if system.integrator is not usual:
             system.integrator = usual  # nor did that help
             return False
-        system.integrator = BackwardEuler()
+        system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
         if "impact" not in self._told:
             self._told.add("impact")
             self.notes.append(

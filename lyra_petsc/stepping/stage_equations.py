@@ -217,7 +217,7 @@ class StageEquations:
             for follower in self.followers:
                 follower.disturbed()
         asking = [follower for follower in self.followers if follower.needs_acceleration]
-        acceleration = self._accelerations() if asking else self.history
+        acceleration = self._accelerations(t0 + after) if asking else self.history
         for follower in asking:
             follower.start_from(acceleration)
         n = self.points.n_owned
@@ -236,11 +236,17 @@ class StageEquations:
         self.points.update_ghosts(ahead)
         return ahead
 
-    def _accelerations(self) -> Array:
+    def _accelerations(self, at: float) -> Array:
+        """Of the free unknowns (n_owned, 3) [m/s²] at the start of the step, whose stage is at time ``at`` [s]."""
         v = self.v.copy()
         self.prescribed.begin_with_rates(v[: self.points.n_owned])
         self.points.update_ghosts(v)
+        x, turns = self._frozen_positions(at), bool(self.active.pushing)
+        if turns:  # by the stage an obstacle may be where the sheet is yet
+            self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
         parts = self._parts(self.x, v, np.zeros_like(self.history))
+        if turns:
+            self.active.turn_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
         force, mass = np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
@@ -545,10 +551,10 @@ class StageEquations:
         what obstacles take along.
         """
         here = self.velocity_of_staying()
-        lagged, refused = self.integrator.lagged_loads, None
-        ways = [here] if lagged else [here, self.v[: len(here)]]
+        rests, refused = self.integrator.starts_at_rest, None
+        ways = [here] if rests else [here, self.v[: len(here)]]
         tried = [(v, False) for v in ways]
-        if self.active.pushing and not lagged:
+        if self.active.pushing and not rests:
             tried += [(v, True) for v in ways]
         for v, carried in tried:
             there = here + self._carried(here, v - here) if carried else v.copy()
@@ -600,11 +606,11 @@ class StageEquations:
         """Whether the sheet can go from the stage with velocities v (n_owned, 3) to the end of the step;
         collective.
         """
-        if self.stage.after == self.dt and not (self.integrator.lagged_loads and self.integrator.moves):
+        if self.stage.after == self.dt and self.integrator.iterates:
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
-        if self.integrator.lagged_loads:  # one linear solve has found it
+        if not self.integrator.iterates:  # one linear solve has found it
             v = self.velocity_of_staying()
         way = (end - self.evaluate_at(v)[0][:n]) / self.stage.reach
         return self._may_go(v, way, after=True)

@@ -95,20 +95,11 @@ class Stepper:
     ) -> None:
         self._scene, self._equations, self._surface = scene, equations, surface
         self._spacing, self._floor = spacing, floor
-        self._iterates = scene.time.scheme != "semi-implicit"
+        self._iterates = equations.integrator.iterates
+        self._left: tuple[list[str], dict[str, float]] | None = None  # while it solves otherwise than usual
         points = equations.points
-        step = 0.0 if scene.time.step == "auto" else scene.time.step
-        static = scene.time.scheme == "static"
-        expected = 0.0 if static else expected_iterations(equations, step)
-        self.presets = presets.candidates(
-            points.n_vertices_global if static else points.n_global,  # edges hardly add to the factors
-            points.comm.size,
-            static=static,
-            newton=self._iterates,
-            iterations=expected,
-            contact=equations.discretisation.guards,
-        )
-        self._blend = Blend("regularised" if not self._iterates else scene.solver.hessian)
+        self.presets = self._candidates()
+        self._blend = Blend(self._hessian)
         self.our_options: list[str] = []
         self._filled: list[str] = []
         self._linear_failed = False
@@ -117,6 +108,42 @@ class Stepper:
         self._create()
 
     # -- objects -------------------------------------------------------------------------------------
+
+    def _candidates(self) -> list[str]:
+        """Linear solvers to try in order; collective."""
+        equations, scene, points = self._equations, self._scene, self._equations.points
+        step = 0.0 if scene.time.step == "auto" else scene.time.step
+        static = scene.time.scheme == "static"
+        return presets.candidates(
+            points.n_vertices_global if static else points.n_global,  # edges hardly add to the factors
+            points.comm.size,
+            static=static,
+            newton=self._iterates,
+            iterations=0.0 if static else expected_iterations(equations, step),
+            contact=equations.discretisation.guards,
+        )
+
+    @property
+    def _hessian(self) -> str:
+        return self._scene.solver.hessian if self._iterates else "regularised"
+
+    def follow_integrator(self) -> None:
+        """Solve by Newton's method or by one linear solve, as the present integrator does; collective."""
+        if self._equations.integrator.iterates == self._iterates:
+            return
+        time, step = self.ts.getTime(), self.ts.getStepNumber()
+        left, memory = self._left, self._newton.memory()
+        self.destroy()
+        self._iterates = not self._iterates
+        self._blend = Blend(self._hessian)
+        if left is None:
+            self._left, self.presets = (self.presets, memory), self._candidates()
+        else:
+            self._left, (self.presets, memory) = None, left
+        self._create()
+        if left is not None:
+            self._newton.restore(memory)
+        self.start(time, step)
 
     def _create(self) -> None:
         equations, scene = self._equations, self._scene
@@ -355,8 +382,9 @@ class Stepper:
     def memory(self, time: float) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers with which the steps after ``time`` [s] go on alike; collective."""
         arrays: dict[str, Array] = {}
-        numbers: dict[str, Any] = {"preset": self.preset, **self._newton.memory()}
-        if not self._iterates:
+        names, newton = self._left or (self.presets, self._newton.memory())
+        numbers: dict[str, Any] = {"preset": names[0], **newton}
+        if not self._iterates or self._left is not None:
             self._extrapolation.learn(time, self._equations.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()
         return arrays, numbers

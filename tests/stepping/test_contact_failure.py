@@ -82,6 +82,20 @@ BALL: dict[str, Any] = {
 }
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "alpha2"])
+def test_accelerations_are_those_before_an_obstacle_comes(comm: MPI.Comm, integrator: str) -> None:
+    """At the stage of the first step the ball is where the sheet was."""
+    scene = BALL | {
+        "motions": {"up": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, 100.0]}]},
+        "time": {"end": 0.0025, "step": 0.0025, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    take_all_steps(simulation)
+    assert simulation.ledger.columns()["smallest_gap"] > 0.0
+    assert simulation.budget.kinetic > 0.1
+    simulation.destroy()
+
+
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) -> None:
     """A ball goes many gaps in a step, through where the sheet was; its work is that of its force."""
@@ -140,6 +154,22 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) ->
     assert most < 1.005 * start
     assert simulation.budget.total > 0.6 * start
     assert any("backward Euler" in note for note in simulation.notes) == (integrator == "alpha2")
+    simulation.destroy()
+
+
+def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: MPI.Comm) -> None:
+    time = {"end": 0.015, "step": 0.005, "integrator": "semi-implicit"}
+    scene = ON_A_TABLE | {"time": time, "initial": {"velocity": [0, 0, -60.0]}}
+    simulation = SteppedScene(comm, scene_of(scene))
+    start, solver = simulation.budget.total, simulation.stepper.preset
+    while not simulation.finished:
+        simulation.step()
+        assert simulation.budget.total < 1.005 * start
+        assert simulation.ledger.columns()["smallest_gap"] > 0.0
+        # a checkpoint is of the usual steps
+        assert simulation.memory()["preset"] == solver
+    assert any("repeated by backward Euler" in note for note in simulation.notes)
+    assert simulation.totals["newton_iterations"] > 2 * simulation.step_number
     simulation.destroy()
 
 

@@ -114,6 +114,22 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
 
 
+def test_there_is_room_near_the_start_of_a_way() -> None:
+    """Points as far from its end as they may be are still near its start."""
+    with Simulation(falling(0.02), MPI.COMM_SELF) as simulation:
+        contact = next(t for t in simulation.problem.terms.values() if isinstance(t, ContactBarrier))
+        known, x = simulation.problem.discretisation, simulation.problem.system.x + 1.0
+        reach = 0.5 * contact.unseen
+        x_way = np.zeros_like(x)
+        x_way[:, 0] = 1.0
+        known.follow(x, 0.3 * reach * x_way)
+        back = x - 0.69 * reach * x_way
+        assert known.largest_step(back, -0.1 * reach * x_way) == 1.0
+        assert known.largest_step(back, -reach * x_way) == pytest.approx(0.31)
+        assert known.largest_step(x, reach * x_way) == 1.0
+        assert known.largest_step(x, 2.0 * reach * x_way) == pytest.approx(0.65)
+
+
 def test_the_pairs_of_a_stack_are_shared(comm: MPI.Comm) -> None:
     one, gap = grid(1.0, 1.0, 12, 12), 0.02
     content = {

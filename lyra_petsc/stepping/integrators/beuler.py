@@ -31,3 +31,10 @@ class SemiImplicit(BackwardEuler):
 
     name = "semi-implicit"
     lagged_loads = True
+    iterates = False
+
+
+class LaggedBackwardEuler(BackwardEuler):
+    """All Newton iterations of a step whose first one the semi-implicit method takes."""
+
+    lagged_loads = True

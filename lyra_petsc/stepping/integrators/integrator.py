@@ -101,6 +101,8 @@ class Integrator(NoHistory, ABC):
         history in place of the last velocities.
     lagged_loads : bool
         Velocity-dependent loads are taken at the start of the step.
+    iterates : bool
+        Newton's method solves for the stage; else one linear solve does.
     moves : bool
         It is a motion in time, with damping.
     centred : bool
@@ -121,12 +123,18 @@ class Integrator(NoHistory, ABC):
     order: ClassVar[int] = 1
     ts_type: ClassVar[str] = "beuler"
     lagged_loads: ClassVar[bool] = False
+    iterates: ClassVar[bool] = True
     moves: ClassVar[bool] = True
     centred: ClassVar[bool] = False
     judged_over: ClassVar[int] = 1
     by_stage: ClassVar[bool] = False
     surplus: float = 0.0
     given: bool = False
+
+    @property
+    def starts_at_rest(self) -> bool:
+        """Whether a solve starts where the sheet is, at rest."""
+        return not (self.iterates and self.moves)
 
     @property
     @abstractmethod
