@@ -50,6 +50,8 @@ class Convergence:
         Whether the solve ended because only round-off was left.
     left : float
         Estimated remaining correction of any coordinate [m].
+    corrected : float
+        Part of the last Newton step that a second solve with its matrix added to it; 1 if it is not known.
     too_slow : bool
         Whether the solve was given up since its linear iterations passed the limit.
     usual : float
@@ -81,6 +83,7 @@ class Convergence:
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
         self._balanced = self._ended = False
+        self.corrected = 1.0
 
     @property
     def judged(self) -> bool:
@@ -152,8 +155,13 @@ class Convergence:
     def _moved_by(self, increment: float) -> None:
         """Expect increments to go on falling as they fell last, where the residual shows that they may.
 
-        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.)
+        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.) A correction that was
+        added tells how solves with the same matrix contract errors: the next would add as much of it again.
+        (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
         """
         fell = increment / self._increment if self.fell and self._increment > 0.0 else 1.0
         self._increment = increment
         self.left = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)
+        part, self.corrected = self.corrected, 1.0
+        if part < SLOWEST:
+            self.left = min(self.left, increment * part * part / (1.0 - part))

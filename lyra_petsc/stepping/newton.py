@@ -25,6 +25,10 @@ CORRECTED = 0.5
 """Fraction of the residual at the end of a step below which a correction of it is taken."""
 
 
+def _largest(vector: PETSc.Vec) -> float:
+    return float(vector.norm(PETSc.NormType.INFINITY))
+
+
 class Newton:
     """Callbacks of one SNES.
 
@@ -135,16 +139,17 @@ class Newton:
         if self._equations.limits_steps:
             changed |= self._limit(x, residual, y)
         if self._corrects and self.globalisation.trusts:
-            changed |= self._correct(x, y)
+            exact = self._linear.same and self._blend.value == 0.0
+            changed |= self._correct(x, y, exact=exact)
         if self._from is not None:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
         self.globalisation.search_along(residual.dot(y))
         return changed
 
-    def _correct(self, x: PETSc.Vec, y: PETSc.Vec) -> bool:
+    def _correct(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
         """Solve once more with the same matrix at the end of a step y that is taken in full; whether what
-        is left there becomes much less, and y is longer by that.
+        is left there becomes much less, and y is longer by that. ``exact``: y is the whole Newton step.
 
         It takes back the stretch of a step along tangents, for a residual and a solve with factors at hand
         (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order).
@@ -157,6 +162,7 @@ class Newton:
         self.more_linear += self._ksp.getIterationNumber()
         better = self._force(first - self._array(correction))[0] < CORRECTED * size
         if better:
+            self.convergence.corrected = _largest(correction) / _largest(y) if exact else 1.0
             y.axpy(1.0, correction)
             self._equations.linearise_to(first)
         left.destroy()

@@ -388,8 +388,9 @@ class SteppedScene:
             return stands
 
     def _take_impact(self, dt: float, why: str) -> bool:
-        """Let backward Euler repeat a short step that failed where something touches, as neither a formula for
-        smooth motions nor one linear solve holds over an impact; whether it does.
+        """Let backward Euler repeat a short step that failed where something touches; whether it does.
+
+        Neither a formula for smooth motions nor one linear solve holds over an impact.
         """
         system, usual = self.problem.system, self._usual
         long = self.scene.time.adaptive or dt > (FINEST if usual.by_stage else FINER) * self.control.step

@@ -237,7 +237,7 @@ class StageEquations:
         return ahead
 
     def _accelerations(self, at: float) -> Array:
-        """Of the free unknowns (n_owned, 3) [m/s²] at the start of the step, whose stage is at time ``at`` [s]."""
+        """Of the free unknowns (n_owned, 3) [m/s²] at the start of the step, with its stage at ``at`` [s]."""
         v = self.v.copy()
         self.prescribed.begin_with_rates(v[: self.points.n_owned])
         self.points.update_ghosts(v)

@@ -208,6 +208,29 @@ def test_a_shell_takes_few_iterations(comm: MPI.Comm, tmp_path: Path) -> None:
 
 
 @pytest.mark.parallel(1)
+def test_a_solve_ends_as_soon_as_it_is_near_enough(comm: MPI.Comm, tmp_path: Path) -> None:
+    """What second solves with the same matrix add tells how near."""
+    found, iterations = [], []
+    for tolerance in (1e-6, 1e-10):
+        content = {
+            "mesh": grid(1.0, 0.2, 20, 4, "alternating"),
+            "material": {"young": 1e7, "poisson": 0.3, "thickness": 0.01, "density": 1.0},
+            "gravity": [0.0, 0.0, 0.0],
+            "handles": [{"group": "left", "clamp": True}],
+            "loads": [{"nodes": [20, 104], "force": [0.0, 0.0, 0.5]}],
+            "solver": {"force_tolerance": 1e-6, "step_tolerance": tolerance},
+            "time": {"analysis": "static", "step": 0.1},
+            "petsc": {"ts_adapt_dt_max": 0.1},
+        }
+        with at_rest(comm, **content) as simulation:
+            found.append(simulation.problem.system.x[: simulation.problem.points.n_vertices].copy())
+            iterations.append(simulation.totals["newton_iterations"])
+            spacing = simulation.problem.outline.spacing
+    assert np.abs(found[0] - found[1]).max() <= 1e-6 * spacing
+    assert iterations[0] <= 32  # 30; 35 without
+
+
+@pytest.mark.parallel(1)
 def test_the_jacobian_of_directors_is_that_of_their_energy(comm: MPI.Comm) -> None:
     """What keeps edges without triangles from being loose stiffens no others."""
     with motion(comm, material=SHEET["material"] | {"bending_model": "midedge"}) as simulation:
