@@ -32,8 +32,6 @@ from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Swept = tuple[Ints, tuple[Array, Array]]
-"""Simplices (n, m), and the low and high corners (n, 3) [m] of what they pass."""
 
 KEPT = 0.2
 """Part of its distance that a pair keeps in a Newton iteration."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from launch import DIRECT, REDUNDANT, Left, done, finish, read_csv, read_json, start, write_scene
+from launch import DIRECT, REDUNDANT, Left, done, finish, read_csv, read_json, start, wait_until, write_scene
 from numpy.typing import NDArray
 
 from lyra_petsc.output.read_run import StoredRun
@@ -45,13 +44,8 @@ def state_times(folder: Path) -> list[float]:
 
 
 def wait_for_rows(folder: Path, rows: int) -> None:
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        path = folder / "history.csv"
-        if path.exists() and path.read_text(encoding="utf-8").count("\n") > rows:
-            return
-        time.sleep(0.005)
-    pytest.fail("the run does not get on")
+    path = folder / "history.csv"
+    wait_until(lambda: path.exists() and path.read_text(encoding="utf-8").count("\n") > rows)
 
 
 @pytest.fixture(scope="module")

@@ -21,10 +21,10 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 
-CPU_SECONDS = 20
-"""After which a case counts as hanging."""
+CPU_SECONDS = 60
+"""After which a case counts as hanging; the first ones in a fresh checkout compile kernels."""
 
-WALL_SECONDS = 120.0
+WALL_SECONDS = 300.0
 MEMORY = 4 * 2**30
 """Address space [B] of a case, beside what the process that it is forked from has."""
 

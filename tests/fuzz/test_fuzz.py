@@ -17,7 +17,7 @@ pytest.importorskip("hypothesis")
 
 from all_cases import KINDS, for_each
 from judge import Case, Outcome, complaint, judge, listing, warm
-from launch import finish, start
+from launch import lyra
 from mesh_cases import GEO, OBJ, SCENE, msh_2, msh_4
 from scene_cases import bomb, nested
 
@@ -73,7 +73,7 @@ def test_a_sample_in_the_program_itself(ranks: int, tmp_path: Path) -> None:
         folder.mkdir()
         case.write(folder)
         before = listing(folder)
-        left = finish(start([*case.arguments, "-ts_max_steps", 2], folder, ranks))
+        left = lyra([*case.arguments, "-ts_max_steps", 2], folder, ranks)
         err = left.err
         if ranks > 1 and left.code:  # the launcher adds its banner
             assert len(left.ours) == 1, err

@@ -107,12 +107,11 @@ def test_processes_that_begin_at_once_with_an_empty_cache(place: Path) -> None:
         "wind.normals(x, np.array([[0, 1, 2]], dtype=np.int{}), out); assert np.allclose(out, 3 ** -0.5), out"
     )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(place), "PYTHONPATH": str(REPOSITORY)}
-    for _ in range(2):
+    for each in ((32, 64, 32, 64), (32, 64)):
         begun = [
-            subprocess.Popen([sys.executable, "-c", code.format(bits)], env=environment)
-            for bits in (32, 64, 32, 64)
+            subprocess.Popen([sys.executable, "-c", code.format(bits)], env=environment) for bits in each
         ]
-        assert [process.wait(timeout=120) for process in begun] == [0, 0, 0, 0]
+        assert not any([process.wait(timeout=120) for process in begun])
     assert not files(place, "tmp.*")
 
 

@@ -62,9 +62,8 @@ def test_is_in_the_docs(name: str) -> None:
 
 
 def marks(name: str) -> list[pytest.MarkDecorator]:
-    """Whether a case is slow, and on how many ranks it also runs: contact on two and three, others on two."""
-    ranks = pytest.mark.parallel if CASES.modules[name] == "contacts" else pytest.mark.parallel(2)
-    return [ranks] * (name in TOGETHER) + [pytest.mark.slow] * (name not in SOME)
+    """Whether a case is slow, and whether it also runs on two ranks."""
+    return [pytest.mark.parallel(2)] * (name in TOGETHER) + [pytest.mark.slow] * (name not in SOME)
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in CASES.modules])

@@ -87,7 +87,7 @@ def browser() -> Iterator[Any]:
         pytest.skip("needs Debian's packages chromium and chromium-driver, and selenium from PyPI")
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
-    for word in ("headless=new", "disable-dev-shm-usage", "window-size=900,640", "no-proxy-server"):
+    for word in ("headless=new", "disable-dev-shm-usage", "window-size=1280,800", "no-proxy-server"):
         options.add_argument(f"--{word}")
     options.add_argument("--enable-unsafe-swiftshader")
     options.add_argument("--use-angle=swiftshader")

@@ -198,6 +198,17 @@ def test_the_page_loads_plays_and_obeys(serve, browser, tmp_path):
     seen.element("edges").click()
     seen.until_drawn(before)
 
+    # at any width nothing lies over another
+    seen.choose("quantity", "speed")
+    seen.until(lambda: seen.elements("#colours"))
+    try:
+        for width in (820, 420, 1280):
+            size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            seen.until(lambda width=width: seen.is_laid_out(width))
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
     assert seen.complaints() == []
     assert seen.asked_elsewhere(page.url) == []
 
@@ -337,17 +348,6 @@ def test_who_looks_on_is_told_that_the_run_has_ended_and_can_go_on_looking(brows
     seen.until(lambda: seen.time() == 0.0)
     assert "The run has ended" in seen.text("notice")
     assert seen.complaints() == []
-
-
-def test_nothing_lies_over_another_at_any_width(serve, browser, tmp_path):
-    seen = Seen(browser, serve(written(tmp_path / "run")).url)
-    try:
-        for width in (1280, 820, 420):
-            size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": False}
-            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            seen.until(lambda width=width: seen.is_laid_out(width))
-    finally:
-        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_a_browser_without_the_token_sees_nothing(serve, browser, tmp_path):
