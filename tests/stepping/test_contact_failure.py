@@ -173,6 +173,23 @@ def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: 
     simulation.destroy()
 
 
+@pytest.mark.parametrize("integrator", ["alpha2", "semi-implicit"])
+def test_automatic_steps_do_not_follow_an_impact_for_ever(comm: MPI.Comm, integrator: str) -> None:
+    scene = BALL | {
+        "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
+        "initial": {"velocity": [0, 0, -100.0]},
+        "time": {"end": 0.001, "step": "auto", "tolerance": 1e-4, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    start = simulation.budget.total
+    while not simulation.finished:
+        simulation.step()
+        assert simulation.budget.total < 1.01 * start
+    assert simulation.step_number < 1000
+    assert any("of those that follow impacts" in note for note in simulation.notes)
+    simulation.destroy()
+
+
 def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
     """A blade turns by 120° a step, whose ends are on both sides of the sheet's edge."""
     blade = {"capsule": {"from": [-0.1, 0, 0], "to": [0.5, 0, 0], "radius": 0.01}, "motion": "turn"}
