@@ -382,7 +382,7 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float
         return
     apart, remedy = "not apart", "move them apart"
     if near.gap > 0.0:
-        apart = f"{near.gap:.3g} m apart, beside contact.thickness" if near.kept else f"{near.gap:.3g} m apart"
+        apart = f"{near.gap:.3g} m apart" + (", beside contact.thickness" if near.kept else "")
         apart += ", less than a thousandth of contact.gap, which would throw them from each other"
         remedy += f", best by {least / TOO_NEAR:.3g} m"
     elif near.kept > 0.0:

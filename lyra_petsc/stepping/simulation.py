@@ -55,8 +55,8 @@ FINEST = 0.02
 """The same under the midpoint rule, whose steps keep angular momentum over an impact, if they find a way."""
 
 FOLLOWED, FOLLOWED_OF_RUN = 0.02, 1e-4
-"""Below this part of a search's skin that vertices go in a step, and of the run, automatic steps do not become
-shorter for the error of an impact: it may be followed into ever smaller parts of the gap.
+"""Parts of a search's skin that vertices go in a step, and of the run, below which automatic steps do not
+become shorter for the error of an impact: it may be followed into ever smaller parts of the gap.
 """
 
 MOST_STEPS, MOST_STATES = 1e8, 1e6
@@ -384,8 +384,8 @@ class SteppedScene:
         return stands
 
     def _shortest_over_impacts(self) -> float:
-        """Δt [s] below which automatic steps are not shortened for their error where something touches, unless
-        ``-ts_adapt_dt_min`` is given; 0 where nothing does; collective.
+        """Δt [s] below which automatic steps are not shortened for their error where something touches; 0
+        where nothing does, or ``-ts_adapt_dt_min`` is given; collective.
         """
         system = self.problem.system
         if not system.touches or is_set("ts_adapt_dt_min"):

@@ -57,17 +57,16 @@ def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
 def test_a_load_step_in_which_a_plate_comes_to_where_the_sheet_is(comm: MPI.Comm) -> None:
     """Forces there are no numbers; it is repeated with a smaller increment."""
     scene = SHEET | {
-        "obstacles": {"plate": PLATE},
+        "obstacles": {"plate": {"plane": {"point": [0, 0, 0.03], "normal": [0, 0, -1]}, "motion": "press"}},
         "gravity": [0, 0, 0],
         "handles": [{"nodes": [0, 1]}],
         "motions": {"press": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, -0.04]}]},
         "time": {"analysis": "static", "end": 1.0, "step": 1.0},
     }
     simulation = SteppedScene(comm, scene_of(scene))
-    with pytest.raises(SolverError, match="obstacles.plate.motion must leave it some"):
+    with pytest.raises(SolverError, match=r"obstacles\.plate\.motion must leave it some"):
         take_all_steps(simulation)
-    assert 0.2 < simulation.time < 1.0
-    assert simulation.ledger.columns()["smallest_gap"] > 0.0
+    assert 0.5 < simulation.time < 0.75  # when the plate is where the sheet is held
     simulation.destroy()
 
 
