@@ -413,8 +413,8 @@ class SteppedScene:
     def _take_impact(self, dt: float, why: str, *, last: bool = False) -> bool:
         """Let backward Euler repeat a short step that failed where something touches; whether it does.
 
-        Neither a formula for smooth motions nor one linear solve holds over an impact. Automatic steps are short
-        where they do not become shorter over impacts, or at the ``last`` halving.
+        Neither a formula for smooth motions nor one linear solve holds over an impact. Automatic steps are
+        short where they do not become shorter over impacts, or at the ``last`` halving.
         """
         system, usual = self.problem.system, self._usual
         if self.scene.time.adaptive:
