@@ -309,6 +309,8 @@ class Equilibrium:
         system.begin_step(before, factor)
         force, largest = system.out_of_balance()
         norm = self._norm(force)
+        if not np.isfinite(norm):  # an obstacle has come to where the sheet is
+            return norm
         self._scale = max(self._scale, largest)
         if first and norm > 0.0:
             n = system.points.n_vertices

@@ -49,6 +49,11 @@ Ints = NDArray[np.int64]
 FLAT = 1e-6
 """Distance over the sheet's size up to which a vertex lies in a symmetry plane."""
 
+TOO_NEAR = 1e-3
+"""Part of contact's gap that is at least between what a scene starts with: what is nearer has the energy
+k gap² / 1e-3 for each vertex, and is thrown apart.
+"""
+
 
 @dataclass
 class Outline:
@@ -346,7 +351,7 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     for term in system.active.elastic:
         term.begin(system.x)
     system.rest_at(0.0)
-    refuse_contact(system, scene, "at the start")
+    refuse_contact(system, scene, "at the start", TOO_NEAR * outline.barrier.gap if outline.barrier else 0.0)
     probes = {name: _own(part, f"probe {name}") for name in scene.probes}
     return Problem(
         scene,
@@ -363,8 +368,9 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
     )
 
 
-def refuse_contact(system: StageEquations, scene: Scene, when: str) -> None:
-    """Refuse a state, named by ``when``, in which contact has what is not apart; collective.
+def refuse_contact(system: StageEquations, scene: Scene, when: str, least: float = 0.0) -> None:
+    """Refuse a state, named by ``when``, in which contact has what is not apart, or not by ``least`` [m];
+    collective.
 
     Raises
     ------
@@ -372,16 +378,21 @@ def refuse_contact(system: StageEquations, scene: Scene, when: str) -> None:
         Where it is worst.
     """
     near = nearest_pair(system, system.x)
-    if near is not None and not near.gap > 0.0:
-        apart, remedy = "not apart", "move them apart"
-        if near.kept > 0.0:
-            apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
-            apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
-        raise InputError(
-            f"{when} {near.words} are {apart}; {remedy}",
-            file=scene.source,
-            key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
-        )
+    if near is None or near.gap > least:
+        return
+    apart, remedy = "not apart", "move them apart"
+    if near.gap > 0.0:
+        apart = f"{near.gap:.3g} m apart" + (", beside contact.thickness" if near.kept else "")
+        apart += ", less than a thousandth of contact.gap, which would throw them from each other"
+        remedy += f", best by {least / TOO_NEAR:.3g} m"
+    elif near.kept > 0.0:
+        apart = f"{max(0.0, near.gap + near.kept):.3g} m apart, not more than contact.thickness"
+        apart, remedy = f"{apart} = {near.kept:g} m", f"{remedy}, or give a smaller thickness"
+    raise InputError(
+        f"{when} {near.words} are {apart}; {remedy}",
+        file=scene.source,
+        key="contact" if not near.obstacle else f"obstacles.{near.obstacle}",
+    )
 
 
 def _clamped_edges(scene: Scene, part: Part, terms: Mapping[str, Term]) -> ClampedEdges | None:

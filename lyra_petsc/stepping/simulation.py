@@ -54,6 +54,11 @@ FINER = 0.2
 FINEST = 0.02
 """The same under the midpoint rule, whose steps keep angular momentum over an impact, if they find a way."""
 
+FOLLOWED, FOLLOWED_OF_RUN = 0.02, 1e-4
+"""Parts of a search's skin that vertices go in a step, and of the run, below which automatic steps do not
+become shorter for the error of an impact: it may be followed into ever smaller parts of the gap.
+"""
+
 MOST_STEPS, MOST_STATES = 1e8, 1e6
 """Beyond them a run would never end, or fill any disk."""
 
@@ -287,7 +292,10 @@ class SteppedScene:
                         self.local_error.restore(*past_slope)
                     assert self.guard is not None
                     # not under the midpoint rule, which keeps angular momentum
-                    impact = not self._usual.by_stage and self._take_impact(end - self.time, self.guard.words)
+                    last = halvings == HALVINGS - 1
+                    impact = not self._usual.by_stage and self._take_impact(
+                        end - self.time, self.guard.words, last=last
+                    )
                     if not impact:
                         self._lessen(end - self.time, halvings)
                         halvings += 1
@@ -295,6 +303,8 @@ class SteppedScene:
         if system.integrator is not self._usual:
             system.integrator = self._usual
             self._usual.disturbed()
+            if self.local_error is not None:
+                self.local_error.disturbed()
         if isinstance(self._seek, Equilibrium) and self.control.is_end(end):
             with self.phases("solve"):
                 settled = self._seek.settle(self.time, end)
@@ -359,17 +369,30 @@ class SteppedScene:
         size = self.problem.outline.size
         error = self.local_error.of(v_before, dt) / size
         share = (self.scene.time.tolerance or 0.0) * dt / control.end
-        stands = control.judge(dt, error / share, self.problem.system.integrator.order)
+        least = self._shortest_over_impacts()
+        stands = control.judge(dt, error / share, self.problem.system.integrator.order, least)
         if stands:
             self.local_error.accepted(v_before, dt)
             self.estimated_error += error
             if error > share and "error" not in self._told:
                 self._told.add("error")
+                where = "of those that follow impacts " if least > control.smallest else ""
                 self.notes.append(
                     f"step {self.step_number + 1} (t = {self.time:g} s): time.tolerance is not reached with "
-                    f"the smallest Δt = {dt:.3g} s (-ts_adapt_dt_min)"
+                    f"the smallest Δt = {dt:.3g} s {where}(-ts_adapt_dt_min)"
                 )
         return stands
+
+    def _shortest_over_impacts(self) -> float:
+        """Δt [s] below which automatic steps are not shortened for their error where something touches; 0
+        where nothing does, or ``-ts_adapt_dt_min`` is given; collective.
+        """
+        system = self.problem.system
+        if not system.touches or is_set("ts_adapt_dt_min"):
+            return 0.0
+        fastest = float(self.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
+        skin = min(term.skin for term in system.active.limiting)
+        return min(FOLLOWED * skin / max(fastest, 1e-300), FOLLOWED_OF_RUN * self.control.end)
 
     def _keeps_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
         """Whether the step just taken made no energy."""
@@ -387,13 +410,17 @@ class SteppedScene:
                 self.ledger.take_back(kept)
             return stands
 
-    def _take_impact(self, dt: float, why: str) -> bool:
+    def _take_impact(self, dt: float, why: str, *, last: bool = False) -> bool:
         """Let backward Euler repeat a short step that failed where something touches; whether it does.
 
-        Neither a formula for smooth motions nor one linear solve holds over an impact.
+        Neither a formula for smooth motions nor one linear solve holds over an impact. Automatic steps are
+        short where they do not become shorter over impacts, or at the ``last`` halving.
         """
         system, usual = self.problem.system, self._usual
-        long = self.scene.time.adaptive or dt > (FINEST if usual.by_stage else FINER) * self.control.step
+        if self.scene.time.adaptive:
+            long = not last and dt > 2.0 * self._shortest_over_impacts()
+        else:
+            long = dt > (FINEST if usual.by_stage else FINER) * self.control.step
         if long or usual.name == "beuler" or not usual.moves or not system.touches:
             return False
         if system.integrator is not usual:

@@ -153,17 +153,18 @@ class ToleranceControl(StepControl):
         # two equal steps rather than a full one and a crumb
         return 0.5 * left if left < 2.0 * dt else dt
 
-    def judge(self, dt: float, ratio: float, order: int) -> bool:
+    def judge(self, dt: float, ratio: float, order: int, least: float = 0.0) -> bool:
         """Whether a step of length dt [s] may stand, with its error over what it may be; plans the next.
 
-        A step that cannot be shortened stands whatever its error.
+        A step that cannot be shortened, or not below ``least`` [s], stands whatever its error.
         """
+        least = max(least, self.smallest)
         planned = self.factor * self.step
         allowed = math.inf if ratio == 0.0 else dt * SAFETY * ratio ** (-1.0 / order)
-        stands = ratio <= 1.0 or dt <= self.smallest * (1.0 + SLACK)
+        stands = ratio <= 1.0 or dt <= least * (1.0 + SLACK)
         # a step shortened to end at an output time is no reason against the longer one planned
         most = max(GROW * dt, planned) if stands else 0.9 * dt
-        self.factor = max(min(max(allowed, SHRINK * dt), most, self.step), self.smallest) / self.step
+        self.factor = max(min(max(allowed, SHRINK * dt), most, self.step), least) / self.step
         return stands
 
     def succeeded(self, iterations: int) -> None:

@@ -54,6 +54,23 @@ def test_what_is_in_the_way_is_named(comm: MPI.Comm) -> None:
     simulation.destroy()
 
 
+def test_a_load_step_in_which_a_plate_comes_to_where_the_sheet_is(comm: MPI.Comm) -> None:
+    """Forces there are no numbers; it is repeated with a smaller increment."""
+    scene = SHEET | {
+        "obstacles": {"plate": {"plane": {"point": [0, 0, 0.03], "normal": [0, 0, -1]}, "motion": "press"}},
+        "gravity": [0, 0, 0],
+        "handles": [{"nodes": [0, 1]}],
+        "motions": {"press": [{"time": 0.0}, {"time": 1.0, "translate": [0, 0, -0.04]}]},
+        "time": {"analysis": "static", "end": 1.0, "step": 1.0},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    for _ in range(2):
+        simulation.step()
+    assert simulation.totals["rejected"] > 1
+    assert 0.5 < simulation.time < 0.75  # before the plate is where the sheet is held
+    simulation.destroy()
+
+
 def test_what_moves_does_work(comm: MPI.Comm) -> None:
     floor = {"plane": {"point": [0, 0, -0.0199], "normal": [0, 0, 1]}, "motion": "lift"}
     scene = SHEET | {
@@ -170,6 +187,23 @@ def test_newton_takes_the_steps_of_an_impact_that_one_linear_solve_cannot(comm: 
         assert simulation.memory()["preset"] == solver
     assert any("repeated by backward Euler" in note for note in simulation.notes)
     assert simulation.totals["newton_iterations"] > 2 * simulation.step_number
+    simulation.destroy()
+
+
+@pytest.mark.parametrize("integrator", ["alpha2", "semi-implicit"])
+def test_automatic_steps_do_not_follow_an_impact_for_ever(comm: MPI.Comm, integrator: str) -> None:
+    scene = BALL | {
+        "obstacles": {"it": {"sphere": {"center": [0, 0, 0], "radius": 0.3}}},
+        "initial": {"velocity": [0, 0, -100.0]},
+        "time": {"end": 0.001, "step": "auto", "tolerance": 1e-4, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    start = simulation.budget.total
+    while not simulation.finished:
+        simulation.step()
+        assert simulation.budget.total < 1.01 * start
+    assert simulation.step_number < 1000
+    assert any("of those that follow impacts" in note for note in simulation.notes)
     simulation.destroy()
 
 

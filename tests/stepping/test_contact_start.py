@@ -120,6 +120,16 @@ def test_touching_is_not_apart(comm: MPI.Comm) -> None:
     )
 
 
+def test_next_to_nothing_is_no_distance(comm: MPI.Comm) -> None:
+    above = SHEET["mesh"] | {"transform": {"translate": [0, 0, 1e-9]}}
+    text = refusal(comm, sheet(mesh=[SHEET["mesh"], above], contact={"gap": 0.02}))
+    assert re.match(r"contact: at the start (vertex \d+|edge \d+-\d+|the triangle .*) and ", text)
+    assert text.endswith(
+        " are 1e-09 m apart, less than a thousandth of contact.gap, which would throw them from each other; "
+        "move them apart, best by 0.02 m"
+    )
+
+
 def test_sheets_nearer_than_thickness(comm: MPI.Comm) -> None:
     above = SHEET["mesh"] | {"transform": {"translate": [0.1, 0.03, 0.003]}}
     scene = sheet(mesh=[SHEET["mesh"], above])
