@@ -51,8 +51,8 @@ SEARCHES = 40
 FEW = 0.3
 """Part of a way that must be known for the rest to be searched bit by bit; else all of it is at once."""
 
-PUSHES = 8
-"""By which what has come too near is set aside, at most."""
+PUSHES = 40
+"""By which what has come too near is set aside, or what leaves taken back, at most."""
 
 LEAST = 1e-10
 """Stiffness of an edge's unknown over that at rest, below which Jacobians do not go."""

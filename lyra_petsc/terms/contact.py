@@ -444,14 +444,14 @@ class ContactBarrier(Elastic):
         pairs = self.kind[at], self.points[at], self.offset[at]
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
 
-    def aims(self, x: Array, way: Array, frozen: Places) -> tuple[Array, Array]:
+    def aims(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:
         aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
-        pairs = self.kind, self.points, self.offset, self.gap
-        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, aim, before)
-        return aim, before
+        pairs, presses = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements, np.bool_)
+        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, aim, before, presses)
+        return aim, before, presses
 
     def push_apart(
-        self, x: Array, way: Array, frozen: Places, aims: tuple[Array, Array], out: Array, count: Array
+        self, x: Array, way: Array, frozen: Places, aims: tuple[NDArray[Any], ...], out: Array, count: Array
     ) -> bool:
         pairs = self.kind, self.points, self.offset, self.gap
         return bool(contact_pairs.push_apart(x, frozen.now, way, *pairs, *aims, SHORT, out, count))

@@ -894,18 +894,18 @@ def _where(force, gap):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def aims(x, others, way, kind, points, offset, gap, most, aim, before):  # type: ignore[no-untyped-def]
+def aims(x, others, way, kind, points, offset, gap, most, aim, before, presses):  # type: ignore[no-untyped-def]
     """Least distances less the offsets (E,) [m] that pairs should have after a ``way`` (n_local, 3) [m] of
     Newton's.
 
     Where the barrier's force is what it is in the linear model, and what does not touch yet at the part
     ``most`` of the gap, which no aim is beyond; −∞ of pairs that stay apart. On which side (E, 3) parts are
-    that would pass each other; 0 where distances tell.
+    that would pass each other; 0 where distances tell. Whether a pair presses (E,) in the linear model.
     """
     p, n, beta, none = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3)
     nearer = 2.0 * _farthest(way)
     for e in range(len(kind)):
-        aim[e] = -math.inf
+        aim[e], presses[e] = -math.inf, False
         _load(x, others, points, e, p)
         if at_least(p, kind[e]) - offset[e] - nearer >= gap[e]:
             continue
@@ -926,15 +926,17 @@ def aims(x, others, way, kind, points, offset, gap, most, aim, before):  # type:
             _, slope, second = barrier(delta, gap[e])
             force = -slope - second * along
             if force > 0.0:
-                aim[e] = min(aim[e], _where(force, gap[e]))
+                aim[e], presses[e] = min(aim[e], _where(force, gap[e])), True
 
 
 @kernel()
-def push_apart(x, others, way, kind, points, offset, gap, aim, before, least, out, count):  # type: ignore[no-untyped-def]  # fmt: skip
+def push_apart(x, others, way, kind, points, offset, gap, aim, before, presses, least, out, count):  # type: ignore[no-untyped-def]  # fmt: skip
     """How pairs that are nearer than they should be after a way are to be pushed apart; how many there are.
 
+    And those that press in the linear model, but leave the gap, as tangents of what is round do, pulled back.
+
     Added to ``out`` (n_local, 3) [m], each push times what is added to ``count`` (n_local,), its weight.
-    ``aim`` and ``before`` as of `aims`; what is short by less than ``least`` times the gap stays.
+    ``aim``, ``before``, ``presses`` as of `aims`; what is short by less than ``least`` times the gap stays.
     """
     p, n, beta, found = np.empty((4, 3)), np.empty(3), np.empty(4), 0
     for e in range(len(kind)):
@@ -950,7 +952,8 @@ def push_apart(x, others, way, kind, points, offset, gap, aim, before, least, ou
         for i in range(4):
             if points[e, i] >= 0:
                 square += beta[i] * beta[i]
-        if not short > least * gap[e] or not square > 0.0:
+        leaves = presses[e] and aim[e] - short >= gap[e]
+        if not (short > least * gap[e] or leaves) or not square > 0.0:
             continue
         found += 1
         for i in range(4):

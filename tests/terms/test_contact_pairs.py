@@ -346,8 +346,8 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
     n, gap, most = len(pairs), np.full(len(pairs), GAP), 0.7
     way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
-    aim, before = np.empty(n), np.zeros((n, 3))
-    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, aim, before)
+    aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
+    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, aim, before, presses)
 
     def slopes(delta: Array) -> Array:
         return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])
@@ -362,12 +362,15 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
     alike = np.isclose(slopes(aim[touch][pressed]), linear[pressed], rtol=1e-4)
     assert alike.mean() > 0.99  # nearest points of a few jump within the difference
     assert (aim[touch][~pressed] == most * GAP).all()
-    # each pair alone, by as much as it lacks
+    assert (presses[touch] == (linear < 0.0)).mean() > 0.99
+    assert not presses[~touch].any()
+    assert presses.any()
+    # each pair alone, by as much as it lacks, and back what presses and would leave
     x, others = pairs.x, pairs.others
     room = pairs.kind != VERTEX_INSIDE
     for e in np.flatnonzero(room | (aim + pairs.offset < 0.0))[::7]:
         one, at = slice(e, e + 1), np.unique(pairs.points[e][pairs.points[e] >= 0])
-        of = tuple(part[one] for part in (*numbers, aim, before))
+        of = tuple(part[one] for part in (*numbers, aim, before, presses))
         moved = way.copy()
         for _ in range(50):
             out, count = np.zeros_like(x), np.zeros((len(x), 1))
@@ -376,6 +379,7 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
             moved[at] += out[at] / np.maximum(count[at], 1e-9)
         else:
             raise AssertionError("is not apart")
+        assert not presses[e] or pairs.distances(x + moved)[e] - pairs.offset[e] < GAP
 
 
 def test_a_common_motion_of_both_is_free() -> None:
