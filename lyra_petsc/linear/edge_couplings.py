@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
-from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, index_type, union
+from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, block_of, index_type, union
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -221,15 +221,18 @@ class EdgeCouplings:
     def whole(self, pattern: BlockPattern) -> BlockPattern:
         """A pattern of blocks alone, in which owned edges are in rows of three."""
         row, column, edge, other = (place // 3 for place in self._coupled())
-        keys = union(_keys_of(pattern), row * pattern.n_local + column, edge * pattern.n_local + other)
+        keys = union(
+            pattern.keys(pattern.n_local), row * pattern.n_local + column, edge * pattern.n_local + other
+        )
         return BlockPattern.of_keys(keys, pattern.n_owned, pattern.n_local)
 
     def in_blocks(self, pattern: BlockPattern, values: Array) -> Array:
         """Values (n_stored, 3, 3) as that pattern has them, (n_blocks, 3, 3)."""
         blocks, groups, numbers = self.parts(values, pattern.n_blocks)
-        keys, n_local = _keys_of(pattern.whole), pattern.n_local
+        n_local = pattern.n_local
+        keys = pattern.whole.keys(n_local)
         out = np.zeros((len(keys), 9))
-        out[np.searchsorted(keys, _keys_of(pattern))] = blocks
+        out[np.searchsorted(keys, pattern.keys(n_local))] = blocks
         flat = out.reshape(-1)
 
         def place(row: Ints, column: Ints) -> Ints:
@@ -245,24 +248,6 @@ class EdgeCouplings:
         together = edge // 3 == other // 3
         flat[place(other[together], edge[together])] = numbers[together, 0]
         return out.reshape(-1, 3, 3)
-
-
-def _keys_of(pattern: BlockPattern) -> Ints:
-    rows = np.repeat(np.arange(pattern.n_owned, dtype=np.int64), np.diff(pattern.indptr))
-    return rows * pattern.n_local + pattern.columns
-
-
-@cached(inline="always")
-def _block(indptr, columns, row, column):  # type: ignore[no-untyped-def]
-    """The number of a block, or `MISSING`."""
-    lo, hi = indptr[row], indptr[row + 1]
-    while hi - lo > 1:
-        middle = (lo + hi) // 2
-        if columns[middle] <= column:
-            lo = middle
-        else:
-            hi = middle
-    return lo if lo < hi and columns[lo] == column else MISSING
 
 
 @cached()
@@ -281,7 +266,7 @@ def _look_up(  # type: ignore[no-untyped-def]
                 row, column = min(one, other), max(one, other)
                 if row < n_owned:
                     if b < n or column >= n_owned:
-                        found = _block(indptr, columns, row, column)
+                        found = block_of(indptr, columns, row, column)
                     if b < n:
                         if found >= 0:
                             found = 2 * found + (1 if one < other else 0)

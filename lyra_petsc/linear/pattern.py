@@ -32,6 +32,19 @@ MISSING = -2
 """Offset of a coupling that has no block."""
 
 
+@cached(inline="always")
+def block_of(indptr, columns, row, column):  # type: ignore[no-untyped-def]
+    """The number of a block, or `MISSING`."""
+    lo, hi = indptr[row], indptr[row + 1]
+    while hi - lo > 1:
+        middle = (lo + hi) // 2
+        if columns[middle] <= column:
+            lo = middle
+        else:
+            hi = middle
+    return lo if lo < hi and columns[lo] == column else MISSING
+
+
 @cached()
 def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
     """Offsets (E, n (n + 1) / 2) of all couplings of elements (E, n)."""
@@ -42,15 +55,9 @@ def _look_up(indptr, columns, stencil, out):  # type: ignore[no-untyped-def]
                 row, column = min(stencil[e, a], stencil[e, b]), max(stencil[e, a], stencil[e, b])
                 found = -1
                 if row < len(indptr) - 1:
-                    lo, hi = indptr[row], indptr[row + 1]
-                    while hi - lo > 1:
-                        middle = (lo + hi) // 2
-                        if columns[middle] <= column:
-                            lo = middle
-                        else:
-                            hi = middle
-                    same = columns[lo] == column
-                    found = 2 * lo + (1 if stencil[e, a] < stencil[e, b] else 0) if same else MISSING
+                    found = block_of(indptr, columns, row, column)
+                    if found >= 0:
+                        found = 2 * found + (1 if stencil[e, a] < stencil[e, b] else 0)
                 out[e, pair] = found
                 pair += 1
 
@@ -155,8 +162,7 @@ class BlockPattern:
         place : (n_blocks,) int64
             Which of its blocks each block of this pattern is.
         """
-        rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
-        own = rows * n_local + self.columns
+        own = self.keys(n_local)
         place: Ints = np.arange(len(own)) + np.searchsorted(more, own)
         keys = np.empty(len(own) + len(more), dtype=np.int64)
         keys[place], keys[np.arange(len(more)) + np.searchsorted(own, more)] = own, more
@@ -184,6 +190,11 @@ class BlockPattern:
         rows, columns = np.divmod(keys, max(n_local, 1))
         self.columns: NDArray[np.int32] = columns.astype(np.int32)
         self.indptr: Ints = begins(np.bincount(rows, minlength=n_owned))
+
+    def keys(self, n_local: int) -> Ints:
+        """Of all blocks, ascending: row · n_local + column."""
+        rows = np.repeat(np.arange(self.n_owned, dtype=np.int64), np.diff(self.indptr))
+        return rows * n_local + self.columns
 
     @property
     def n_blocks(self) -> int:

@@ -71,6 +71,11 @@ def _no_pairs() -> Pairs:
     return Pairs(np.empty((0, 10), dtype=np.int64), np.empty((0, COLUMNS)))
 
 
+def _order(key: Ints) -> Ints:
+    """Numbers (E,) of keys (E, 10) in ascending order."""
+    return ascending(np.arange(len(key)), key, key, 0)
+
+
 class CoulombFriction(Elastic):
     """Friction in a step.
 
@@ -124,7 +129,7 @@ class CoulombFriction(Elastic):
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
-        order = ascending(np.arange(len(at)), key, key[:, 4:], key.shape[1] - 4)
+        order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
         touching = at[order], beta[order], normal[order], force[order]
@@ -149,7 +154,7 @@ class CoulombFriction(Elastic):
         swapped = edges & sheets & (vertices[:, 0] > vertices[:, 2])
         vertices[swapped], slip[swapped] = vertices[swapped][:, [2, 3, 0, 1]], -slip[swapped]
         key = np.column_stack([vertices, what])
-        order = ascending(np.arange(len(key)), key, key[:, 4:], key.shape[1] - 4)
+        order = _order(key)
         # `take_pairs` finds the rest
         rest = np.zeros((len(key), COLUMNS - values.shape[1]))
         self._pairs = Pairs(key[order], np.column_stack([what, slip, values[:, 9], rest])[order])
