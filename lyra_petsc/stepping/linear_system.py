@@ -18,6 +18,7 @@ from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import shows_negative_curvature
 from lyra_petsc.phases import JACOBIAN_AGAIN, logged
 from lyra_petsc.stepping.diagonal_shift import DiagonalShift
+from lyra_petsc.stepping.reuse import Reuse
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
@@ -46,6 +47,8 @@ class LinearSystem:
         The latter is a cycle of multigrid.
     factors : bool
         It is exact factors of a matrix.
+    reuse : Reuse
+        For how many steps the preconditioner serves.
     """
 
     def __init__(
@@ -61,6 +64,10 @@ class LinearSystem:
         self._shifts = not direct
         self.factors = PETSc.Options().getString("pc_type", "") in ("cholesky", "lu")
         self.cycles = multigrid.is_asked_for()
+        # cycles on a mesh that has moved on take many more iterations
+        asked = is_set("snes_lag_preconditioner")
+        new = iterates or self.factors or direct or self._one_matrix or self.cycles or asked
+        self.reuse = Reuse(acts=not new)
         self._interpolations: list[InterpolationRows] | None = None
         self._multigrid: Multigrid | None = None
         self._ksp: PETSc.KSP | None = None
@@ -128,6 +135,7 @@ class LinearSystem:
             self._multigrid.attach(self._ksp)
         self._ksp.setOperators(self.operator.mat, self.preconditioner.mat)
         self.begin()
+        self.reuse.renew()
         return True
 
     # -- values --------------------------------------------------------------------------------------
@@ -149,7 +157,7 @@ class LinearSystem:
             The Hessian was positive definite when it was last seen.
         """
         self.set_operator(v, blend)
-        if self.preconditioner is not self.operator:
+        if self.preconditioner is not self.operator and not self.reuse.begin(self._equations):
             self._set_preconditioner(v, keep=keep, convex=convex)
         self._equations.forget_directors()
 

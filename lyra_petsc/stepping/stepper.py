@@ -322,7 +322,10 @@ class Stepper:
         self.ts.setTime(t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_()):
+        numbers = self.ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
+        outworn = self.linear.reuse.reused and self._linear_failed and numbers
+        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_() or outworn):
+            self.linear.reuse.renew()
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)
 
@@ -365,6 +368,8 @@ class Stepper:
                 collective=together,
             ) from None
         self._linear_failed = False
+        if not self._iterates:
+            self.linear.reuse.solved(self.ksp.getIterationNumber())
         if self._iterates and self.snes.getConvergedReason() > 0 and not self._newton.convergence.judged:
             self.snes.setConvergedReason(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
         if self.ts.getConvergedReason() < 0 or self.snes.getConvergedReason() <= 0:
@@ -384,6 +389,7 @@ class Stepper:
         arrays: dict[str, Array] = {}
         names, newton = self._left or (self.presets, self._newton.memory())
         numbers: dict[str, Any] = {"preset": names[0], **newton}
+        self.linear.reuse.renew()  # who goes on from here has none
         if not self._iterates or self._left is not None:
             self._extrapolation.learn(time, self._equations.v[: self._shape[0]])
             arrays, numbers["extrapolation"] = self._extrapolation.memory()

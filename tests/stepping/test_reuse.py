@@ -1,0 +1,72 @@
+"""Preconditioners that serve several steps of one linear solve."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from physics import CLOTH, gathered, grid, scene_of
+
+from lyra_petsc.stepping.reuse import SET_UP, Reuse
+from lyra_petsc.stepping.simulation import SteppedScene
+
+MASK = np.zeros((1, 3), dtype=bool)
+
+
+def equations(reach: float = 0.01, mask: object = MASK) -> Any:
+    return SimpleNamespace(stage=SimpleNamespace(reach=reach), prescribed=SimpleNamespace(mask=mask))
+
+
+def test_it_is_kept_until_the_average_would_grow() -> None:
+    reuse, kept = Reuse(acts=True), []
+    for iterations in (10, 11, 12, 13, 14, 15, 16, 17):
+        kept.append(reuse.begin(equations()))
+        reuse.solved(iterations)
+    # (8 + 10 + 11 + 12 + 13) / 4 = 13.5 > 13, (54 + 14) / 5 = 13.6 < 14
+    assert SET_UP == 8.0
+    assert kept == [False, True, True, True, True, False, True, True]
+
+
+def test_another_step_or_other_prescribed_unknowns_need_their_own() -> None:
+    reuse = Reuse(acts=True)
+    for other in (equations(), equations(reach=0.02), equations(0.02, MASK.copy()), equations(mask=MASK)):
+        assert not reuse.begin(other)
+        reuse.solved(10)
+        assert reuse.begin(other)
+        reuse.solved(10)
+    never = Reuse(acts=False)
+    never.solved(10)
+    assert not never.begin(equations())
+
+
+@pytest.mark.parallel(2)
+@pytest.mark.parametrize("kind", ["", "pbjacobi", "gamg"])
+def test_steps_are_those_of_a_preconditioner_each(comm: MPI.Comm, kind: str) -> None:
+    scene = {
+        "mesh": grid(0.6, 0.4, 6, 5, "alternating"),
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.01},
+        "gravity": [0, 0, -9.81],
+        "handles": [{"nodes": [0]}, {"nodes": [6], "from": 0.05, "until": 0.15}],
+        "time": {"end": 0.3, "step": 0.01, "integrator": "semi-implicit"},
+    }
+    options, ends = PETSc.Options(), []
+    for lag in (None, 1):
+        given = ({"pc_type": kind} if kind else {}) | ({"snes_lag_preconditioner": lag} if lag else {})
+        for name, value in given.items():
+            options.setValue(name, value)
+        simulation = SteppedScene(comm, scene_of(scene))
+        reused = 0
+        while not simulation.finished:
+            simulation.step()
+            reused += simulation.stepper.linear.reuse.reused
+        assert (reused > 10) == (lag is None)
+        ends.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        for name in [*simulation.stepper.our_options, *given]:
+            options.delValue(name)
+        simulation.destroy()
+    # the linear tolerance of a step is 1e-6 of its change of velocities
+    np.testing.assert_allclose(*ends, atol=1e-6)
