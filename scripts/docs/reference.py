@@ -68,6 +68,8 @@ OPTIONS = {
     "By default the operator is block rows of the program's (`python`), the other as the preconditioner "
     "needs.",
     "mg_coarse_mat_type": "Type of the matrix of multigrid's coarsest level (`aij`).",
+    "snes_lag_preconditioner": "How many linear systems a preconditioner serves, where a step of "
+    "`semi-implicit` would decide by its iterations.",
     "contact_monitor": "Print contacts, smallest gap, stiffest contact, step limit and friction at each "
     "Newton iterate.",
     "mat_partitioning_type": "Partitioner of the mesh: `ptscotch`, `parmetis`, … as PETSc has them; "
