@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import measures
-from cases import BENDING_MESHES
+from cases import BENDING_MESHES, PLAIN_MESHES
 from peers import parse
-from processes import Failed, Limits
+from processes import WORKER, Failed, Limits
 from tables import document
 
 from lyra_petsc.api.mpirun import find_launcher
@@ -62,6 +62,12 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
     add("--weak", type=int, metavar="N", help="vertices per rank of the weak scaling (25000); 0: none")
     add("--growth", type=numbers, nargs="*", metavar="N", help=f"further sizes to fit growth ({GROWTH})")
     add("--presets", nargs="*", metavar="NAME", help="CG iterations against size of these presets, or of all")
+    add(
+        "--against",
+        type=Path,
+        metavar="DIR",
+        help="this program over that of another checkout, in pairs of runs",
+    )
     add("--contact", action="store_true", help="also sheets in contact, for a second and more")
     add("--bending", nargs="*", metavar="MESH", help=f"also directors on edges beside hinges, on {meshes}")
     add(
@@ -95,6 +101,12 @@ def read_arguments(words: Sequence[str]) -> argparse.Namespace:
             if kind not in BENDING_MESHES:
                 raise InputError(f"unknown mesh {kind!r}, {nearest(kind, BENDING_MESHES)}", key="--bending")
         asked.bending = asked.bending or list(BENDING_MESHES)
+    if asked.against is not None:
+        asked.against = asked.against.resolve()
+        if not (asked.against / WORKER).is_file():
+            raise InputError(
+                f"has no {WORKER}; give a checkout of lyra_petsc", file=asked.against, key="--against"
+            )
     if asked.presets is not None:
         asked.presets = measures.preset_names(asked.presets)
     return asked
@@ -175,6 +187,8 @@ class Bench:
             self._presets()
         if asked.bending is not None:
             self._bending()
+        if asked.against is not None:
+            self._against()
         if asked.contact:
             self._contact()
         if not asked.only_rows:
@@ -237,6 +251,15 @@ class Bench:
             what = f"{vertices} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
             row = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits
             self._add("bending", self._attempt(what, lambda row=row: measures.bending(*row)))
+
+    def _against(self) -> None:
+        asked = self._asked
+        for ranks, vertices, kind, method in itertools.product(
+            asked.ranks, asked.vertices, PLAIN_MESHES, measures.METHODS
+        ):
+            what = f"{vertices} vertices, {kind}, {method}, {ranks} rank(s), here and in {asked.against}"
+            row = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits, asked.against
+            self._add("against", self._attempt(what, lambda row=row: measures.against(*row)))
 
     def _contact(self) -> None:
         asked = self._asked

@@ -60,6 +60,7 @@ GRADED_MESH = "gmsh 1:20"
 MESHES = ("diagonal", "alternating", "criss-cross", "gmsh", GRADED_MESH, "diagonal, midedge", "gmsh, midedge")
 """Kinds of triangles that the square is cut into, the first that of all other measurements; bending model."""
 
+PLAIN_MESHES = ("diagonal", "alternating", "criss-cross", "gmsh")
 BENDING_MESHES = ("diagonal", "alternating", "gmsh")
 BENDING_MODELS = ("hinge", "midedge")
 

@@ -25,7 +25,7 @@ from cases import (
     square_number,
 )
 from peers import measure_peer
-from processes import Limits, measure, run
+from processes import HERE, Limits, measure, run
 from tables import growth
 
 from lyra_petsc.api.mpirun import find_launcher
@@ -38,6 +38,9 @@ WARM_UP = 3
 """Steps of a row before the first one that is measured."""
 
 REPEATS = 3
+PAIRS = 7
+"""Runs of this program and of another checkout's, by turns."""
+
 STATES = 10
 """States that are written to measure output."""
 
@@ -115,6 +118,33 @@ def bending(
             alone = measure("steps", ranks, petsc, limits.process, scene=scene, **few)
             found["meshes"][model]["peak_bytes"] = sum(alone["peak_bytes"])
     return found | {"mesh": kind, "who": method, "ranks": ranks}
+
+
+def against(
+    kind: str,
+    vertices: int,
+    method: str,
+    ranks: int,
+    petsc: Sequence[str],
+    folder: Path,
+    limits: Limits,
+    other: Path,
+) -> Result:
+    """Steps of the square on a kind of mesh with this program and that of another checkout, in pairs of runs
+    that take turns in being first.
+    """
+    few = {"warm_up": WARM_UP, "steps": limits.steps, "seconds": limits.seconds}
+    runs: dict[str, list[Result]] = {"here": [], "other": []}
+    with _scratch(folder) as scratch:
+        scene = on_mesh(kind, vertices, scratch)
+        scene["time"]["integrator"] = method
+        for number in range(PAIRS):
+            both = [("here", HERE), ("other", other)]
+            for name, program in both if number % 2 == 0 else reversed(both):
+                found = measure("steps", ranks, petsc, limits.process, program=program, scene=scene, **few)
+                kept = {"peak_bytes": sum(found["peak_bytes"]), "set_up_seconds": found["set_up_seconds"]}
+                runs[name].append({"steps": found["steps"], "vertices": found["vertices"], **kept})
+    return {"mesh": kind, "who": method, "ranks": ranks, **runs}
 
 
 def contact(

@@ -21,7 +21,8 @@ from lyra_petsc.api.mpirun import environment, find_launcher
 GRACE = 10.0
 """Seconds [s] that a process gets to leave before it is killed."""
 
-WORKER = Path(__file__).with_name("worker.py")
+HERE = Path(__file__).parents[2]
+WORKER = Path("scripts", "benchmarks", "worker.py")
 
 
 class Failed(Exception):
@@ -54,8 +55,11 @@ class Spent(NamedTuple):
     cpu: float
 
 
-def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> Spent:
-    """Run a command, a list of words or one line for the shell; what it took.
+def run(
+    command: Sequence[str] | str, limit: float, cwd: Path | None = None, *, program: Path = HERE
+) -> Spent:
+    """Run a command, a list of words or one line for the shell, that imports the program of a checkout; what
+    it took.
 
     Raises
     ------
@@ -64,12 +68,15 @@ def run(command: Sequence[str] | str, limit: float, cwd: Path | None = None) -> 
     """
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as heard:
         began, cpu = time.perf_counter(), _cpu_of_children()
+        inherited = environment()
+        if program != HERE:
+            inherited["PYTHONPATH"] = os.pathsep.join([str(program), inherited.get("PYTHONPATH", "")])
         try:
             process = subprocess.Popen(
                 command,
                 shell=isinstance(command, str),
                 cwd=cwd,
-                env=environment(),
+                env=inherited,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=heard,
@@ -119,8 +126,10 @@ def _last_words(heard: str, code: int) -> str:
     return f"{reason}: {said[0][:200]}" if said else reason
 
 
-def measure(kind: str, ranks: int, petsc: Sequence[str], limit: float, **job: Any) -> dict[str, Any]:
-    """One measurement of ``worker.py`` on so many ranks; its result.
+def measure(
+    kind: str, ranks: int, petsc: Sequence[str], limit: float, *, program: Path = HERE, **job: Any
+) -> dict[str, Any]:
+    """One measurement of a checkout's ``worker.py`` on so many ranks; its result.
 
     Raises
     ------
@@ -129,6 +138,7 @@ def measure(kind: str, ranks: int, petsc: Sequence[str], limit: float, **job: An
     with tempfile.TemporaryDirectory(prefix="lyra-bench-") as folder:
         told, result = Path(folder, "job.json"), Path(folder, "result.json")
         told.write_text(json.dumps({"kind": kind, **job}), encoding="utf-8")
-        run([*find_launcher(ranks), sys.executable, str(WORKER), str(told), str(result), *petsc], limit)
+        words = [sys.executable, str(program / WORKER), str(told), str(result), *petsc]
+        run([*find_launcher(ranks), *words], limit, program=program)
         found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
     return found

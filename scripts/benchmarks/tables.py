@@ -265,6 +265,44 @@ def bending_table(results: Sequence[Result]) -> list[str]:
     return table(head, rows)
 
 
+def against_table(results: Sequence[Result]) -> list[str]:
+    """This program over that of another checkout, pair by pair; the median of all rows and the largest."""
+    rows, medians = [], []
+    for result in results:
+        pairs = list(zip(result["here"], result["other"], strict=True))
+        cpu = [median_of(here, "cpu") / median_of(other, "cpu") for here, other in pairs]
+        medians.append(statistics.median(cpu))
+        ratios = [
+            [here[key] / other[key] for here, other in pairs] for key in ("peak_bytes", "set_up_seconds")
+        ]
+        cg = [
+            statistics.mean(s["cg"] for run in result[who] for s in run["steps"]) for who in ("here", "other")
+        ]
+        rows.append(
+            [
+                str(result["here"][0]["vertices"]),
+                result["mesh"],
+                result["who"],
+                str(result["ranks"]),
+                spread(cpu),
+                ", ".join(number(each) for each in cg),
+                *(number(statistics.median(each)) for each in ratios),
+            ]
+        )
+    head = (
+        "vertices",
+        "mesh",
+        "who",
+        "ranks",
+        "CPU of a step, times the other's",
+        "CG iterations of both",
+        "memory",
+        "set-up",
+    )
+    most = f"Median of the rows {number(statistics.median(medians))}, largest {number(max(medians))}."
+    return [*table(head, rows), "", most]
+
+
 def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
     """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
     x = np.log([row["vertices"] for row in rows])
@@ -395,6 +433,8 @@ def document(results: Result) -> str:
         lines += ["## Other meshes, and directors on edges", "", *meshes_table(results["meshes"]), ""]
     if results.get("bending"):
         lines += ["## Directors on edges beside hinges", "", *bending_table(results["bending"]), ""]
+    if results.get("against"):
+        lines += ["## Beside another checkout", "", *against_table(results["against"]), ""]
     if results.get("contact"):
         lines += ["## Contact", "", *contact_table(results["contact"]), ""]
     if "growth" in results:

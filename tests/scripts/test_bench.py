@@ -7,12 +7,23 @@ import sys
 import time
 from pathlib import Path
 
+import measures
 import numpy as np
 import pytest
 from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet, square_number
 from peers import write_files, write_scene
-from processes import Failed, run
-from tables import COLUMNS, bending_table, document, exponent, growth, meshes_table, number, spread
+from processes import Failed, Limits, run
+from tables import (
+    COLUMNS,
+    against_table,
+    bending_table,
+    document,
+    exponent,
+    growth,
+    meshes_table,
+    number,
+    spread,
+)
 
 from lyra_petsc.api.mpirun import environment
 from lyra_petsc.mesh.build import build_mesh
@@ -170,6 +181,7 @@ def test_peers_stand_beside_and_one_that_fails_is_one_line(measured):
         (["--presets", "magic"], "unknown preset 'magic'"),
         (["--steps", "0"], "--steps must be at least 1"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
+        (["--against", "taken"], "--against: has no scripts/benchmarks/worker.py"),
         (["--out", "taken/below"], "taken/below: --out: cannot be made"),
     ],
 )
@@ -255,6 +267,31 @@ def test_directors_are_shown_beside_hinges():
     assert (found_cells["growth"], found_cells["memory, times hinge"]) == ("1.20", "1.50")
     assert found_cells["CG iterations of both"] == "7.00, 6.00"
     assert "1.00" in first
+
+
+def test_two_checkouts_are_compared_pair_by_pair():
+    def runs(*cpu: float) -> list[dict]:
+        return [
+            {"vertices": 36, "peak_bytes": 50, "set_up_seconds": 1.0, "steps": [{"cpu": c, "cg": 7}] * 3}
+            for c in cpu
+        ]
+
+    results = [
+        {"mesh": mesh, "who": "beuler", "ranks": 2, "here": runs(*here), "other": runs(1.0, 2.0, 4.0)}
+        for mesh, here in (("diagonal", (1.1, 2.0, 3.6)), ("gmsh", (2.0, 6.0, 4.4)))
+    ]
+    _, _, first, last, _, most = against_table(results)
+    assert [cell.strip() for cell in first.strip("|").split("|")][4] == "1.00 (0.900-1.10)"
+    assert [cell.strip() for cell in last.strip("|").split("|")][4] == "2.00 (1.10-3.00)"
+    assert most == "Median of the rows 1.50, largest 2.00."
+
+
+def test_a_checkout_beside_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(measures, "PAIRS", 2)
+    limits = Limits(steps=2, seconds=0.1, process=120.0)
+    found = measures.against("gmsh", 36, "beuler", 1, [], tmp_path, limits, SCRIPTS.parent)
+    assert [len(found[name]) for name in ("here", "other")] == [2, 2]
+    assert len(against_table([found])) == 5
 
 
 def row(vertices: int, seconds: float) -> dict:
