@@ -605,11 +605,11 @@ def write_page(folder: Path, out: Path | None) -> Path:
     OutputError
         If the page cannot be written.
     """
+    run = StoredRun(folder)
     path = folder / PAGE if out is None else out
     if path.is_dir() or not path.absolute().parent.is_dir():
         what = "is a folder; name a file" if path.is_dir() else "cannot be written: there is no such folder"
         raise InputError(what, file=path, key="--out")
-    run = StoredRun(folder)
     pictures = _rendered(run) or plain_pictures(run)
     replace_text(path, run_page(run, pictures).html())
     return path

@@ -145,7 +145,7 @@ def test_the_page_can_go_elsewhere_and_mistakes_are_one_line(finished: Path, tmp
     assert (tmp_path / "page.html").is_file()
     for arguments, words in (
         (["report"], "Missing argument"),
-        (["report", "nothing"], "no such folder"),
+        (["report", "nothing"], "nothing: no such folder; give the folder of a run"),
         (["report", tmp_path], "is not the folder of a run"),
         (["report", finished, "--out", tmp_path], "is a folder; name a file"),
         (["report", finished, "--out", "no/where.html"], "there is no such folder"),
