@@ -39,8 +39,10 @@ class RigidMotion(Protocol):
 class MakesMotion(Protocol):
     """The constructor of `terms.motion.Motion`, which this package does not know."""
 
-    def __call__(self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str) -> RigidMotion:
-        """The motion through keyframes; ``key`` is for messages."""
+    def __call__(
+        self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str, file: object | None
+    ) -> RigidMotion:
+        """The motion through keyframes; ``key`` and ``file`` are for messages."""
         ...
 
 
@@ -189,7 +191,7 @@ def _made(
         named = (
             f"motions.{obstacle.motion}" if isinstance(obstacle.motion, str) else f"obstacles.{name}.motion"
         )
-        carried = motion(keyframes, obstacle.interpolation, key=named)
+        carried = motion(keyframes, obstacle.interpolation, key=named, file=scene.source)
     if obstacle.plane is not None:
         normal = np.array(obstacle.plane.normal)
         normal /= np.abs(normal).max()  # squares of what is very large or small are no numbers

@@ -69,7 +69,7 @@ def _axis(keyframe: Keyframe) -> Array | None:
     return unit
 
 
-def _turns(keyframes: Sequence[Keyframe], key: str) -> list[float | None]:
+def _turns(keyframes: Sequence[Keyframe], key: str, file: object) -> list[float | None]:
     """By how many degrees the sheet turns between keyframes; None where their axes differ.
 
     Raises
@@ -89,6 +89,7 @@ def _turns(keyframes: Sequence[Keyframe], key: str) -> list[float | None]:
             raise InputError(
                 f"keyframes {i} and {i + 1} turn about different axes, and one by more than 180°; give the "
                 "angle that leads there within 180°, or a keyframe with the same axis between them",
+                file=file,
                 key=key,
             )
         else:
@@ -113,10 +114,17 @@ class Motion:
         it goes faster than `FASTEST`.
     """
 
-    def __init__(self, keyframes: Sequence[Keyframe], interpolation: str, *, key: str = "motions") -> None:
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        interpolation: str,
+        *,
+        key: str = "motions",
+        file: object | None = None,
+    ) -> None:
         self._times = np.array([k.time for k in keyframes], dtype=np.float64)
         n = len(keyframes)
-        turns = _turns(keyframes, key)
+        turns = _turns(keyframes, key, file)
         rows: list[Array] = []
         side = 1.0  # a quaternion and its negative are the same rotation
         for i, k in enumerate(keyframes):
@@ -130,6 +138,7 @@ class Motion:
             if np.any(self._values[i, 3:6] * self._values[i + 1, 3:6] < 0.0):
                 raise InputError(
                     f"scale changes its sign between keyframes {i} and {i + 1}; it would vanish between them",
+                    file=file,
                     key=key,
                 )
         speeds = np.abs(np.diff(self._values[:, :3], axis=0)) / np.diff(self._times)[:, None]
@@ -137,6 +146,7 @@ class Motion:
             i = int(np.argmax(~(speeds <= FASTEST).all(axis=1)))
             raise InputError(
                 f"goes at {speeds[i].max():.3g} m/s from keyframe {i} to {i + 1}; at most {FASTEST:g} m/s",
+                file=file,
                 key=key,
             )
         self._tangents = np.zeros_like(self._values)
@@ -300,4 +310,5 @@ def motion_of(scene: Scene, index: int) -> Motion:
     handle = scene.handles[index]
     if handle.motion is None:
         return STILL
-    return Motion(scene.motions[handle.motion], handle.interpolation, key=f"motions.{handle.motion}")
+    keyframes, key = scene.motions[handle.motion], f"motions.{handle.motion}"
+    return Motion(keyframes, handle.interpolation, key=key, file=scene.source)

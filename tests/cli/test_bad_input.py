@@ -60,7 +60,14 @@ WORDS: list[tuple[list[str], str]] = [
     (["check", "scene.yaml", "--set", f"{LONG}=1"], "unknown key"),
     (["check", "scene.yaml", "--set", f"handles=[{{group: {LONG}}}]"], "handles[0].group"),
     (["check", "scene.yaml", "--set", f"mesh.file=/{LONG}/x.obj"], "file name too long"),
-    (["report", LONG], "file name too long"),
+    (
+        [
+            *("check", "scene.yaml", "--set", "handles[0].motion=fast"),
+            *("--set", "motions={fast: [{time: 0}, {time: 1e-9, translate: [1, 0, 0]}]}"),
+        ],
+        "scene.yaml: motions.fast: goes at 1e+09 m/s",
+    ),
+    (["report", LONG], "File name too long"),
     (["check", "scene.yaml", f"--{LONG}"], "no such option"),
 ]
 
