@@ -550,7 +550,9 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n
 def _longer(alike, following, n):  # type: ignore[no-untyped-def]
     """Copies with room for a row n and as many more."""
     more, after = np.empty((2 * n + 64, 3), dtype=np.int64), np.full(2 * n + 64, -1)
-    more[: len(alike)], after[: len(following)] = alike, following
+    for row in range(len(following)):  # arrays as a whole would take seconds to compile
+        more[row, 0], more[row, 1], more[row, 2] = alike[row, 0], alike[row, 1], alike[row, 2]
+        after[row] = following[row]
     return more, after
 
 
