@@ -306,7 +306,7 @@ def _smoothed(along_start, along_ends, start, neighbours, border, parents, weigh
     seen, at = np.full(n, -1, np.int64), np.zeros(n, np.int64)
     out = np.empty(4 * n + 16, np.int64)
     share = np.empty(len(out))
-    q = 0
+    q = np.int64(0)  # 0 has a type of its own, for which what takes it is compiled once more
     for v in range(n):
         around, begin = neighbours, start
         if border[v] > 0:
