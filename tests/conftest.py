@@ -155,6 +155,7 @@ def collect_garbage() -> None:
 
         if hasattr(PETSc, "garbage_cleanup"):
             PETSc.garbage_cleanup()
+    gc.freeze()  # what outlives its test, above all kernels: each collection would look through all of them
     WORLD.Barrier()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,11 @@ RANK[""] = len(LEVELS)  # the package itself, which names what it offers
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def module_name(path: Path) -> str:
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -61,11 +67,11 @@ def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
                     yield node.lineno, f"{node.module}.{alias.name}" if is_module else node.module
 
 
-def upward(source: str, name: str) -> list[str]:
+def upward(tree: ast.AST, name: str) -> list[str]:
     """The imports of a module that point up the house."""
     wrong = []
     mine = room(name)
-    for line, other in imported(ast.parse(source)):
+    for line, other in imported(tree):
         theirs = room(other)
         if theirs in ("", mine):
             continue
@@ -78,25 +84,30 @@ def test_imports_point_one_way() -> None:
     for path in MODULES:
         name = module_name(path)
         assert room(name) in RANK or name == PACKAGE.name, f"give the package of {name} its place in LEVELS"
-        assert upward(path.read_text(encoding="utf-8"), name) == [], name
+        assert upward(parsed(path), name) == [], name
 
 
-def test_an_upward_import_is_found() -> None:
-    assert upward("def f():\n    from lyra_petsc.stepping.system import X\n", "lyra_petsc.terms.wind") == [
-        "line 2: lyra_petsc.stepping.system"
-    ]
-    assert upward("from lyra_petsc import stepping", "lyra_petsc.mesh.points") == [
-        "line 1: lyra_petsc.stepping"
-    ]
-    assert upward("from lyra_petsc.terms.rest import R", "lyra_petsc.linear.block_rows") == []
+@pytest.mark.parametrize(
+    ("source", "name", "found"),
+    [
+        (
+            "def f():\n    from lyra_petsc.stepping.system import X\n",
+            "terms.wind",
+            ["line 2: lyra_petsc.stepping.system"],
+        ),
+        ("from lyra_petsc import stepping", "mesh.points", ["line 1: lyra_petsc.stepping"]),
+        ("from lyra_petsc.terms.rest import R", "linear.block_rows", []),
+    ],
+)
+def test_an_upward_import_is_found(source: str, name: str, found: list[str]) -> None:
+    assert upward(ast.parse(source), f"lyra_petsc.{name}") == found
 
 
 def test_only_the_command_line_prints() -> None:
     for path in MODULES:
         if room(module_name(path)) in ("cli", "__main__"):
             continue
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        calls = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
         lines = [c.lineno for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
         assert lines == [], path
 
@@ -104,12 +115,15 @@ def test_only_the_command_line_prints() -> None:
 def test_terms_have_never_heard_of_petsc_mpi_or_files() -> None:
     for path in (PACKAGE / "terms").glob("*.py"):
         names = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
                 names.add(node.module.split(".")[0])
         assert not names & {"petsc4py", "mpi4py", "h5py", "os", "io", "pathlib"}, path.name
+
+
+COMPILERS = ("cached", "kernel", "leaf", "njit")
 
 
 def kernels(tree: ast.AST) -> list[ast.FunctionDef]:
@@ -118,7 +132,10 @@ def kernels(tree: ast.AST) -> list[ast.FunctionDef]:
         node
         for node in ast.walk(tree)
         if isinstance(node, ast.FunctionDef)
-        and any(ast.unparse(one).partition("(")[0] in ("cached", "njit") for one in node.decorator_list)
+        and any(
+            ast.unparse(one).partition("(")[0] in ("cached", "kernel", "leaf", "njit")
+            for one in node.decorator_list
+        )
     ]
 
 
@@ -136,7 +153,7 @@ def test_kernels_need_no_scipy() -> None:
     """It is in an extra; a kernel that was compiled with it ends a process without it."""
     count = 0
     for path in MODULES:
-        for kernel in kernels(ast.parse(path.read_text(encoding="utf-8"))):
+        for kernel in kernels(parsed(path)):
             count += 1
             assert linear_algebra(kernel) == [], f"{path}: {kernel.name}"
     assert count > 30

@@ -101,7 +101,7 @@ class BlockRows:
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
-        weights = np.ascontiguousarray(weights)  # as kernels are compiled for
+        weights = np.require(weights, requirements=("C", "W"))  # as kernels are compiled for
         term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, predicted)
 
     def set_diagonal(self, diagonal: Array, values: Array) -> None:

@@ -306,7 +306,7 @@ def _smoothed(along_start, along_ends, start, neighbours, border, parents, weigh
     seen, at = np.full(n, -1, np.int64), np.zeros(n, np.int64)
     out = np.empty(4 * n + 16, np.int64)
     share = np.empty(len(out))
-    q = 0
+    q = np.int64(0)  # 0 has a type of its own, for which what takes it is compiled once more
     for v in range(n):
         around, begin = neighbours, start
         if border[v] > 0:
@@ -315,7 +315,8 @@ def _smoothed(along_start, along_ends, start, neighbours, border, parents, weigh
         most = 3 * (degree + 1)
         if q + most > len(out):
             bigger, more = np.empty(2 * len(out) + most, np.int64), np.empty(2 * len(out) + most)
-            bigger[:q], more[:q] = out[:q], share[:q]
+            for i in range(q):  # arrays as a whole would take seconds to compile
+                bigger[i], more[i] = out[i], share[i]
             out, share = bigger, more
         for k in range(-1, degree):
             w = v if k < 0 else around[begin[v] + k]

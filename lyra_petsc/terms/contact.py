@@ -26,7 +26,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs, surface_shares
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.contact_search import SheetSearch, Simplices
-from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
 
@@ -124,7 +124,9 @@ class Meeting(NamedTuple):
 
 
 _NONE = np.empty(0)
-NOTHING = Meeting(_NONE, np.empty(0, dtype=np.int64), _NONE, _NONE, np.empty((0, 4)), _NONE, np.empty((0, 5)))
+NOTHING = Meeting(
+    *unwritable(_NONE, np.empty(0, dtype=np.int64), _NONE, _NONE, np.empty((0, 4)), _NONE, np.empty((0, 5)))
+)
 """Where there are no pairs."""
 
 
@@ -494,7 +496,7 @@ class ContactBarrier(Elastic):
         for obstacle in np.unique(number[number >= 0]):
             of = np.flatnonzero((number == obstacle) & (met.counted != 0.0))
             gradient, pull = np.zeros_like(x), np.zeros_like(places)
-            given = met.at[of], met.counted[of], met.beta[of], met.felt[of]
+            given = unwritable(met.at[of], met.counted[of], met.beta[of], met.felt[of])
             contact_pairs.add_gradient(x, places, *self._of_pairs, given, gradient, pull)
             yield int(obstacle), gradient
 

@@ -33,6 +33,7 @@ triangle has a share in each of its sides and corners (`surface_shares`).
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -356,7 +357,7 @@ def _around(p, points, e, offset, gap, shares, number, ends, at, count, apart, b
         return delta, number
     # without a corner it is on the side before that, and there nearest of the side, too
     if b1 != 0.0 and b2 != 0.0 and b3 != 0.0:
-        number = _note(number, ends, at, count, apart, beta, e, -1 - e, 0, 1.0, delta, b1, b2, b3)
+        number = _note(number, ends, at, count, apart, beta, e, -1 - e, np.int64(0), 1.0, delta, b1, b2, b3)
     else:
         one = i if b1 != 0.0 else (j if b2 != 0.0 else k)
         other = k if b3 != 0.0 else (j if b2 != 0.0 else i)
@@ -470,11 +471,12 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n
         How many there are: the first rows of ``found``, as many as have room.
     """
     numbers, often, for_us, share, energies, felt = found
-    p, q, slope, n = np.empty((4, 3)), np.empty((4, 3)), np.zeros(12), 0
+    p, q, slope = np.empty((4, 3)), np.empty((4, 3)), np.zeros(12)
+    n: Any = np.int64(0)  # 0 has a type of its own, for which all that takes it is compiled once more
     first, following = np.full(len(x), -1), np.full(0, -1)  # lists, by a vertex
     alike = np.empty((0, 3), dtype=np.int64)  # nearest vertex and edge, or a second vertex twice
     ends, at, count = np.empty(TOGETHER, np.int64), np.empty(TOGETHER, np.int64), np.empty(TOGETHER)
-    apart, beta, number, vertex = np.empty(TOGETHER), np.empty((TOGETHER, 3)), 0, -1
+    apart, beta, number, vertex = np.empty(TOGETHER), np.empty((TOGETHER, 3)), n, -1
     for e in range(len(kind)):
         _load(x, others, points, e, p)
         if kind[e] == VERTEX_TRIANGLE and points[e, 0] >= 0:
@@ -550,7 +552,9 @@ def meeting(x, others, kind, points, offset, gap, stiffness, parallel, shares, n
 def _longer(alike, following, n):  # type: ignore[no-untyped-def]
     """Copies with room for a row n and as many more."""
     more, after = np.empty((2 * n + 64, 3), dtype=np.int64), np.full(2 * n + 64, -1)
-    more[: len(alike)], after[: len(following)] = alike, following
+    for row in range(len(following)):  # arrays as a whole would take seconds to compile
+        more[row, 0], more[row, 1], more[row, 2] = alike[row, 0], alike[row, 1], alike[row, 2]
+        after[row] = following[row]
     return more, after
 
 

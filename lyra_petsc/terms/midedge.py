@@ -44,7 +44,7 @@ from lyra_petsc.terms.midedge_shape import (
     tangents_at,
     unit,
 )
-from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, Term, UpcomingStep
 
@@ -57,7 +57,7 @@ STEEPEST = np.radians(89.95)
 """Angle of a director at rest or at the start from which on a scene is refused: rounding would tell which way
 it is folded."""
 
-NO_FRICTION = np.empty((0, 2))
+(NO_FRICTION,) = unwritable(np.empty((0, 2)))
 
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result", bound="Array | tuple[Array, ...]")
+
+
+def unwritable(*arrays: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """These arrays, which cannot be written to from here on.
+
+    Kernels are compiled for arrays of either kind: what stands for remembered results is to be as they are.
+    """
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
 
 
 class Remembered(Generic[Result]):
@@ -29,7 +39,6 @@ class Remembered(Generic[Result]):
     def __call__(self, at: Array) -> Result:
         if self._last is None or not np.array_equal(at, self._last[0]):
             result = self._function(at)
-            for array in (result,) if isinstance(result, np.ndarray) else result:
-                array.flags.writeable = False
+            unwritable(*((result,) if isinstance(result, np.ndarray) else result))
             self._last = at.copy(), result
         return self._last[1]

@@ -39,12 +39,13 @@ DRAWING = (
     "jinja2",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_svg",
+    "pyvista",
     "scipy.spatial",
     "scipy.special",
 )
 """What verbs that write a report take longest to load."""
 
-REPORTING = ("report", "stress", "study", "verify")
+REPORTING = ("render", "report", "stress", "study", "verify")
 
 
 def load(*modules: str) -> None:

@@ -11,8 +11,6 @@ import pytest
 from lyra_petsc.mesh.crossings import have_common_vertex, mutual_crossings, self_crossings
 from lyra_petsc.mesh.orient3d import UNDECIDED, rational_side, side
 
-pytestmark = pytest.mark.quick
-
 TWO = np.array([[0, 1, 2], [3, 4, 5]])
 FLOOR = [[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]
 
@@ -164,6 +162,7 @@ def test_sides_that_only_expansions_or_rational_numbers_tell() -> None:
 # -- by hand -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.quick
 def test_a_triangle_through_another_crosses() -> None:
     assert crosses(*FLOOR, [1, 1, -1], [1, 1, 1], [9, 9, 1])
     # edges through the floor's edge only, and corners of both within the other
@@ -193,6 +192,7 @@ def test_what_touches_does_not_cross(other: list[list[float]]) -> None:
     assert not crosses(*(np.array([*FLOOR, *other]) @ [[0, 2, 0], [0, 0, 2], [2, 0, 0]]).tolist())
 
 
+@pytest.mark.quick
 def test_interiors_that_meet_at_the_corner_or_the_edge_of_a_plane_cross() -> None:
     # a corner lies in the floor's interior, and the triangle goes through there on both sides
     assert crosses(*FLOOR, [1, 1, 0], [2, 1, -1], [2, 1, 1])
@@ -201,6 +201,7 @@ def test_interiors_that_meet_at_the_corner_or_the_edge_of_a_plane_cross() -> Non
     assert not crosses([0, 0, 0], [2, 1, 0], [2, -1, 0], [0, 0, 0], [-2, 0, 1], [-2, 0, -1])
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("offset", [0.0, 1.0, 1e6])
 def test_one_ulp_decides(offset: float) -> None:
     floor = (np.array(FLOOR) + offset).tolist()
@@ -217,6 +218,7 @@ def test_one_ulp_decides(offset: float) -> None:
     assert crosses(*floor, *beside)
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize("width", [1e-3, 1e-9, 2.0**-52])
 def test_needles(width: float) -> None:
     needle = [[1, 1, -1], [1, 1, 1], [1, 1 + width, 1]]
@@ -243,6 +245,7 @@ def turned(points: np.ndarray, seed: int) -> np.ndarray:
     return np.asarray(points @ axes.T)
 
 
+@pytest.mark.quick
 def test_sheets_that_are_flat_curved_folded_or_stacked_do_not_cross() -> None:
     flat, triangles = grid(12)
     x, y, z = flat.T
@@ -272,6 +275,7 @@ def test_a_sheet_through_itself_is_counted_the_same_in_any_order_and_place() -> 
     assert sorted(found.tolist()) == pairs.tolist()
 
 
+@pytest.mark.quick
 def test_pairs_with_a_common_vertex_are_told_apart() -> None:
     points = np.array(
         [[0, 0, 0], [2, 1, 0], [2, -1, 0], [2, 0, 1], [2, 0, -1], [1, 0, 5], [1, 0.1, -5], [1, -0.1, -5.0]]
@@ -282,6 +286,7 @@ def test_pairs_with_a_common_vertex_are_told_apart() -> None:
     assert have_common_vertex(triangles, pairs).tolist() == [True, False, False]
 
 
+@pytest.mark.quick
 def test_two_surfaces() -> None:
     flat, triangles = grid(6)
     wall = np.array([[0.31, -1, -1], [0.31, 3, -1], [0.31, 1, 2.0]])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.terms import contact_pairs, surface_shares
 from lyra_petsc.terms.contact_pairs import CLOSE, EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
+from lyra_petsc.terms.remembered import unwritable
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -98,25 +99,26 @@ MET = ["at", "weight", "beta", "felt"]
 def blocks_of(x: Array, others: Array, of: tuple[Any, ...], met: tuple[Any, ...], blend: float) -> Array:
     """Hessians (n, 4, 4, 3, 3) of pairs, as the kernel adds them to blocks; every other one turned."""
     n, (one, other) = len(of[0]), np.triu_indices(4)
-    turned = np.arange(10 * n).reshape(n, 10) % 2
+    number = np.arange(10 * n, dtype=np.int32).reshape(n, 10)
+    turned = number % 2
     values, out = np.zeros((10 * n, 3, 3)), np.empty((n, 4, 4, 3, 3))
-    contact_pairs.add_hessians(
-        x, others, *of, met, blend, 2 * np.arange(10 * n).reshape(n, 10) + turned, values
-    )
+    (at, weight, *rest), places = met, 2 * number + turned
+    contact_pairs.add_hessians(x, others, *of, (at, 1.0 * weight, *rest), blend, places, values)
     values = values.reshape(n, 10, 3, 3)
     values = np.where(turned[:, :, None, None] == 1, values.transpose(0, 1, 3, 2), values)
     out[:, one, other], out[:, other, one] = values, values.transpose(0, 1, 3, 2)
     return out
 
 
-def met_of(*given: Any, counted: int) -> dict[str, NDArray[Any]]:
-    """What `contact_pairs.meeting` finds, by name."""
+def met_of(*given: Any, counted: int, room: int | None = None) -> dict[str, NDArray[Any]]:
+    """What `contact_pairs.meeting` finds, by name, as remembered: it cannot be written to."""
     n = len(given[2])
-    least, found = np.empty(n), {"at": np.empty(n, dtype=np.int64), "weight": np.empty(n)}
-    found |= {"counted": np.empty(n), "beta": np.empty((n, 4)), "energy": np.empty(n)}
-    found["felt"] = np.empty((n, 5))
+    room = n if room is None else room
+    least, found = np.empty(n), {"at": np.empty(room, dtype=np.int64), "weight": np.empty(room)}
+    found |= {"counted": np.empty(room), "beta": np.empty((room, 4)), "energy": np.empty(room)}
+    found["felt"] = np.empty((room, 5))
     met = contact_pairs.meeting(*given, counted, least, tuple(found.values()))
-    return {name: part[:met] for name, part in found.items()}
+    return dict(zip(found, unwritable(*(part[:met] for part in found.values())), strict=True))
 
 
 def units(rng: np.random.Generator, n: int) -> Array:
@@ -483,21 +485,12 @@ def felt_before(x: Array, pairs: Ints, shares: Array) -> tuple[dict[str, NDArray
     """What is met, its gradient, and its Hessian."""
     n, none = len(pairs), np.empty((0, 3))
     of = np.full(n, VERTEX_TRIANGLE), pairs, np.zeros(n), np.full(n, 0.5), STIFFNESS, NOWHERE
-    sized = {"least": np.empty(n)} | {name: np.empty(shape) for name, shape in ROOM.items()}
-    found = {name: array for name, array in sized.items() if name != "least"} | {
-        "at": np.empty(999, np.int64)
-    }
-    given = tuple(found[name] for name in ("at", "weight", "counted", "beta", "energy", "felt"))
-    met = contact_pairs.meeting(x, none, *of, shares, n, sized["least"], given)
-    found = {name: part[:met] for name, part in found.items()}
+    found = met_of(x, none, *of, shares, counted=n, room=999)
     out, hessian = np.zeros_like(x), np.zeros((len(x), len(x), 3, 3))
     taken = tuple(found[name] for name in MET)
     contact_pairs.add_gradient(x, none, *of, taken, out, none)
     np.add.at(hessian, (pairs[:, :, None], pairs[:, None, :]), blocks_of(x, none, of, taken, 0.0))
     return found, out, hessian
-
-
-ROOM = {"weight": (999,), "counted": (999,), "beta": (999, 4), "energy": (999,), "felt": (999, 5)}
 
 
 def test_a_vertex_feels_a_flat_surface_once() -> None:

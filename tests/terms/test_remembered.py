@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
+from numba import typeof
 from physics import CLOTH, Simulation, grid
 
-from lyra_petsc.terms.remembered import Remembered
+from lyra_petsc.linear.block_rows import BlockRows
+from lyra_petsc.terms.contact import NOTHING, ContactBarrier
+from lyra_petsc.terms.midedge import NO_FRICTION
+from lyra_petsc.terms.remembered import Remembered, unwritable
 
 
 def test_a_function_is_called_where_it_was_not_called_last() -> None:
@@ -30,6 +36,38 @@ def test_a_function_is_called_where_it_was_not_called_last() -> None:
     remembered.forget()
     remembered(at)
     assert len(calls) == 3
+
+
+def test_kernels_are_compiled_for_what_is_remembered_alone() -> None:
+    """Nothing that meets, and a sheet without friction, are arrays of the same types."""
+    floor = {"floor": {"plane": {"point": [0, 0, -0.01], "normal": [0, 0, 1]}}}
+    scene = {"mesh": grid(1, 1, 1, 1), "contact": {"gap": 0.02}, "obstacles": floor}
+    with Simulation(scene, MPI.COMM_SELF) as simulation:
+        simulation.step(1e-4)
+        contact, system = simulation.problem.terms["contact"], simulation.system
+        assert isinstance(contact, ContactBarrier)
+        met = contact.meeting(system.x, system.active.frozen[contact].now)
+        assert len(met.at)
+    assert typeof(NOTHING) == typeof(met)
+    assert typeof(NO_FRICTION) == typeof(unwritable(np.zeros((1, 2)))[0])
+
+
+def test_one_weight_is_as_many() -> None:
+    """Of one number for all elements kernels are given what they are given of several."""
+    given = []
+
+    class Term:
+        name, n_elements = "term", 1
+
+        def add_hessian(
+            self, x: object, frozen: object, blend: float, weight: np.ndarray, *_: object
+        ) -> None:
+            given.append(typeof(weight))
+
+    rows = BlockRows(SimpleNamespace(offsets={}))
+    for weight in (2.0, np.broadcast_to(np.ones(1), 1), np.broadcast_to(np.ones(1), 3)):
+        rows.add_stiffness(Term(), None, None, 0.0, weight, None)
+    assert given == 3 * [typeof(np.ones(1))]
 
 
 def test_forces_of_moving_clamps_are_always_computed() -> None:

@@ -16,8 +16,9 @@ import base64
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -82,15 +83,20 @@ class Drawing:
     name : str
         Its file name without ending.
     caption : str
-    png : bytes
+    as_png : callable
+        Makes ``png``, which a page with ``svg`` in it does without.
     svg : bytes
         Empty for a picture that is no line drawing.
     """
 
     name: str
     caption: str
-    png: bytes
+    as_png: Callable[[], bytes]
     svg: bytes
+
+    @cached_property
+    def png(self) -> bytes:
+        return self.as_png()
 
 
 @dataclass

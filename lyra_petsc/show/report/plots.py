@@ -236,15 +236,19 @@ def _finish(axes: Any) -> None:
 
 
 def drawn(figure: Any, name: str, caption: str) -> Drawing:
-    """A matplotlib figure as PNG and SVG."""
+    """A matplotlib figure as SVG, and as PNG where that is asked for."""
     from matplotlib import rc_context
 
-    png, svg = io.BytesIO(), io.BytesIO()
-    figure.savefig(png, format="png", dpi=150, metadata={"Software": None})
+    def png() -> bytes:
+        content = io.BytesIO()
+        figure.savefig(content, format="png", dpi=150, metadata={"Software": None})
+        return content.getvalue()
+
+    svg = io.BytesIO()
     # without date and with a fixed salt the same data give the same file
     with rc_context({"svg.hashsalt": name}):
         figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-    return Drawing(name, caption, png.getvalue(), svg.getvalue())
+    return Drawing(name, caption, png, svg.getvalue())
 
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -633,4 +633,4 @@ def _rendered(run: StoredRun) -> list[Drawing]:
             drawn = {state: path.read_bytes() for path, state in plan.pictures}
         except LyraError:  # no OpenGL: the page has plain pictures
             return []
-    return [Drawing(f"state-{i}", state_caption(run, i), drawn[i], b"") for i in states]
+    return [Drawing(f"state-{i}", state_caption(run, i), partial(drawn.__getitem__, i), b"") for i in states]

@@ -60,6 +60,12 @@ def test_the_html_is_whole_and_fetches_nothing(tmp_path: Path) -> None:
     assert "my scene.yaml" in page
 
 
+def test_a_page_with_line_drawings_draws_no_pixels() -> None:
+    report = small_report()
+    report.html()
+    assert not any("png" in vars(drawing) for drawing in report.drawings)
+
+
 def test_the_markdown_says_the_same(tmp_path: Path) -> None:
     small_report().write(tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
