@@ -58,6 +58,8 @@ STEEPEST = np.radians(89.95)
 it is folded."""
 
 NO_FRICTION = np.empty((0, 2))
+FLAT = np.empty((0, 3))
+"""In place of tangents without energy that are all 0."""
 
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
@@ -100,7 +102,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length"))
+        super().__init__(elements.without("tangent", "director", "length", "rest"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -110,7 +112,8 @@ class MidEdge(Elastic):
         index = index.reshape(-1, 3).astype(np.int32)
         self.of_edges = Edges(places.astype(np.int64), ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
-        self._constants = data["stiffness"], data["rest"], data["limit"], NO_FRICTION
+        rest = data["rest"] if data["rest"].any() else FLAT
+        self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
         self._membrane: Membrane | None = None  # of the same triangles
@@ -244,19 +247,18 @@ class MidEdge(Elastic):
     # -- energy ------------------------------------------------------------------------------------
 
     def shape(self, x: Array, frames: Frames) -> Array:
-        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 9)."""
+        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 6)."""
         if self._shapes is None or self._shapes_of is not frames:
             self._shapes_of = frames
             self._shapes = Remembered(lambda at: self._computed(at, frames))
         return self._shapes(x)
 
     def forget(self) -> None:
-        if self._shapes is not None:
-            self._shapes.forget()
+        self._shapes = self._shapes_of = None
 
     def _computed(self, x: Array, frames: Frames) -> Array:
         angle = x.ravel()[self.of_edges.places] / self.of_edges.length
-        out = np.empty((len(angle), 9))
+        out = np.empty((len(angle), 6))
         # all at once: NumPy's are several at a time where the processor can
         directors(x, self.of_edges.ends, *frames, np.cos(angle), np.sin(angle), out)
         return out

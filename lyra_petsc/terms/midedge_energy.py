@@ -20,8 +20,9 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
 
-With friction, ``friction`` (E, 2) has for each triangle a factor c and an energy [J]: by the latter the
-energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact Hessian; without, it is empty.
+Where ``rest``, T̄, is empty all of it is 0. With friction, ``friction`` (E, 2) has for each triangle a factor
+c and an energy [J]: by the latter the energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact
+Hessian; without, it is empty.
 """
 
 from __future__ import annotations
@@ -42,20 +43,26 @@ AHEAD = 4
 
 
 @kernel(inline="always")
+def _at_rest(rest, e):  # type: ignore[no-untyped-def]
+    """T̄ of triangle e."""
+    if rest.shape[0] == 0:
+        return 0.0, 0.0, 0.0
+    return rest[e, 0], rest[e, 1], rest[e, 2]
+
+
+@kernel(inline="always")
 def _own(stiffness, rest, e, t0, t1, t2):  # type: ignore[no-untyped-def]
     """K_ii (T_i − T̄_i) of triangle e, and the differences."""
-    f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+    u0, u1, u2 = _at_rest(rest, e)
+    f0, f1, f2 = t0 - u0, t1 - u1, t2 - u2
     return stiffness[e, 0] * f0, stiffness[e, 3] * f1, stiffness[e, 5] * f2, f0, f1, f2
 
 
 @kernel(inline="always")
 def _others(stiffness, rest, e, s0, s1, s2):  # type: ignore[no-untyped-def]
     """Σ_j≠i K_ij (S_j − S̄_j) of triangle e, and the differences."""
-    h0, h1, h2 = (
-        s0 - fading_tangent(rest[e, 0]),
-        s1 - fading_tangent(rest[e, 1]),
-        s2 - fading_tangent(rest[e, 2]),
-    )
+    u0, u1, u2 = _at_rest(rest, e)
+    h0, h1, h2 = s0 - fading_tangent(u0), s1 - fading_tangent(u1), s2 - fading_tangent(u2)
     k01, k02, k12 = stiffness[e, 1], stiffness[e, 2], stiffness[e, 4]
     return k01 * h1 + k02 * h2, k01 * h0 + k12 * h2, k02 * h0 + k12 * h1, h0, h1, h2
 
@@ -204,9 +211,10 @@ def _times(f, u):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _bend(spin, about, e, n, scale, pull, sign):  # type: ignore[no-untyped-def]
-    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge."""
-    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * pull * sign, spin), about)
+def _bend(spin, e, square, n, scale, pull):  # type: ignore[no-untyped-def]
+    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge, of length² ``square``; s ρ = 2 e / |e|² + γ × t."""
+    about = _along(2.0 / square, e, cross(spin, scaled(1.0 / math.sqrt(square), e)))
+    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * pull, spin), about)
 
 
 @kernel()
@@ -360,9 +368,9 @@ def add_hessian(  # type: ignore[no-untyped-def]
             m0, m1, m2 = exact * p0, exact * p1, exact * p2
             f0, f1, f2 = m0 * r0, m1 * r1, m2 * r2
             half = 0.5 * math.sqrt(square)
-            bend0 = _bend(spin0, row(shape, edges[e, 0], 6), e0, n, half * f0 / s00, m0, sign[e, 0])
-            bend1 = _bend(spin1, row(shape, edges[e, 1], 6), e1, n, half * f1 / s11, m1, sign[e, 1])
-            bend2 = _bend(spin2, row(shape, edges[e, 2], 6), e2, n, half * f2 / s22, m2, sign[e, 2])
+            bend0 = _bend(spin0, e0, s00, n, half * f0 / s00, m0)
+            bend1 = _bend(spin1, e1, s11, n, half * f1 / s11, m1)
+            bend2 = _bend(spin2, e2, s22, n, half * f2 / s22, m2)
             u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
             v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
             nothing = (0.0, 0.0, 0.0)

@@ -125,7 +125,7 @@ def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sweeps_of(pattern: BlockPattern, values: np.ndarray) -> SweepsWithEdges:
-    """Of block rows that are, as in a run, where the copy will be, in memory that served for something else."""
+    """Of block rows that are, as in a run, where the copy will be, in memory that something else had."""
     memory = np.full(max(sum(room(pattern)), values.size), np.nan)
     rows = memory[: values.size].reshape(-1, 9)
     rows[:] = values.reshape(-1, 9)
