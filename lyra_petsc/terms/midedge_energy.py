@@ -279,9 +279,9 @@ def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
 def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-untyped-def]
     """Add factor times the couplings of the corners 1 and 2 with an edge, and minus their sum of 0."""
     both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
-    _add_column(flat, offsets[e, 3 + edge], both, -factor)
-    _add_column(flat, offsets[e, 8 + edge], one, factor)
-    _add_column(flat, offsets[e, 12 + edge], two, factor)
+    _add_column(flat, offsets[e, edge], both, -factor)
+    _add_column(flat, offsets[e, 3 + edge], one, factor)
+    _add_column(flat, offsets[e, 6 + edge], two, factor)
 
 
 @kernel(inline="always")
@@ -292,28 +292,43 @@ def _add_number(flat, at, value):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _fetch_ahead(e, offsets, values):  # type: ignore[no-untyped-def]
+def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
     """Let what a later triangle is added to come into the caches, as if it were blocks (3 × 3)."""
     later = min(e + AHEAD, offsets.shape[0] - 1)
-    for pair in (0, 1, 2, 6, 7, 11):
-        fetch(values, offsets[later, pair] >> 1)
-    for pair in (3, 4, 5, 8, 9, 10, 12, 13, 14):
+    for pair in range(6):
+        fetch(values, corners[later, pair] >> 1)
+    for pair in range(9):
         fetch(values, (offsets[later, pair] >> 2) // 9)
-    for pair in (15, 18, 20):
+    for pair in (9, 12, 14):
         fetch(values, offsets[later, pair] // 9)
 
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
-    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, friction, length, weight, offsets, values
+    x,
+    stencil,
+    blend,
+    edges,
+    sign,
+    shape,
+    stiffness,
+    rest,
+    limit,
+    friction,
+    length,
+    weight,
+    corners,
+    offsets,
+    values,
 ):
-    """Add weight (E,) times the Hessians to block rows, where offsets (E, 21) say.
+    """Add weight (E,) times the Hessians to block rows, where offsets of the couplings of corners (E, 6) and
+    of those with edges (E, 15) say.
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
     flat, exact = values.reshape(-1), 1.0 - blend
     for e in range(stencil.shape[0]):
-        _fetch_ahead(e, offsets, values)
+        _fetch_ahead(e, corners, offsets, values)
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
@@ -389,14 +404,14 @@ def add_hessian(  # type: ignore[no-untyped-def]
             )
         (b11, b12, b22), one, two, numbers = hessian
         factor = weight[e]
-        add_corners(values, offsets, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
+        add_corners(values, corners, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
         _add_columns(flat, offsets, e, 0, one[0], two[0], factor)
         _add_columns(flat, offsets, e, 1, one[1], two[1], factor)
         _add_columns(flat, offsets, e, 2, one[2], two[2], factor)
         h00, h01, h02, h11, h12, h22 = numbers
-        _add_number(flat, offsets[e, 15], factor * h00)
-        _add_number(flat, offsets[e, 16], factor * h01)
-        _add_number(flat, offsets[e, 17], factor * h02)
-        _add_number(flat, offsets[e, 18], factor * h11)
-        _add_number(flat, offsets[e, 19], factor * h12)
-        _add_number(flat, offsets[e, 20], factor * h22)
+        _add_number(flat, offsets[e, 9], factor * h00)
+        _add_number(flat, offsets[e, 10], factor * h01)
+        _add_number(flat, offsets[e, 11], factor * h02)
+        _add_number(flat, offsets[e, 12], factor * h11)
+        _add_number(flat, offsets[e, 13], factor * h12)
+        _add_number(flat, offsets[e, 14], factor * h22)

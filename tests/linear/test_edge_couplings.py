@@ -29,11 +29,11 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     edges = np.array([RNG.choice(places, 3, replace=False) for _ in range(40)], dtype=np.int64)
     pair = RNG.choice(vertex_rows, (8, 2)).astype(np.int32)
     coupling = WithEdges(vertices, edges)
-    pattern = BlockPattern({"mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
+    pattern = BlockPattern({"corners": vertices, "mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
     half = RNG.normal(size=(40, 12, 12))
     blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
     values = np.zeros((pattern.n_stored, 3, 3))
-    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["mixed"], values)
+    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
     BlockRows(pattern).add_diagonal(np.full(N_OWNED, 2.0), values)
     dense = expanded(pattern, values, N_LOCAL).reshape(3 * N_OWNED, 3 * N_LOCAL)
     return pattern, values, dense
