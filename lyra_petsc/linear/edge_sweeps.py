@@ -41,15 +41,13 @@ Ints = NDArray[np.int64]
 EDGES_EVERY = 2
 """Sweeps over the vertices for one over the edges."""
 
-STIFF_UNTIL = 0.03
-"""Inertia over what all resists a vertex in its softest direction, up to which bending is stiff beside it."""
-
 ALIGNED = 8
 """Vectors begin at a multiple of so many numbers of double precision."""
 
-SWEEPS = {False: (1, 1), True: (3, 2)}
-"""Of the mesh and of coarser levels, where bending is stiff or not: of those that take equally long, the ones
-with which iterations grow least with the mesh."""
+SWEEPS = ((0.03, 3), (0.3, 2))
+"""Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices on
+all levels; beyond, one. Of numbers that take equally long those with which iterations grow least with the
+mesh."""
 
 
 def room(pattern: BlockPattern) -> tuple[int, int]:

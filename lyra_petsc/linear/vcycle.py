@@ -103,11 +103,12 @@ class Smoother:
 
     def _choose_sweeps(self, own: Array) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import STIFF_UNTIL, SWEEPS  # of use for nothing else
+        from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
 
         inertia, resistance = self.points.comm.allreduce(own)
-        worth, self.n_coarse_sweeps = SWEEPS[bool(inertia < STIFF_UNTIL * resistance)]
-        self.n_sweeps = self._asked_sweeps or worth
+        found = (number for until, number in SWEEPS if inertia < until * resistance)
+        self.n_coarse_sweeps = next(found, 1)
+        self.n_sweeps = self._asked_sweeps or self.n_coarse_sweeps
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.

@@ -21,6 +21,7 @@ Schöberl, Computers & Structures 225 (2019) 106109.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +103,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest"))
+        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -121,7 +122,9 @@ class MidEdge(Elastic):
     def connect(self, terms: Iterable[Term]) -> None:
         membrane = next((term for term in terms if isinstance(term, Membrane)), None)
         if membrane is not None and np.array_equal(membrane.stencil, self.stencil):
-            self._membrane, self.elements = membrane, self.elements.without("material")
+            self._membrane, self.stencil = membrane, membrane.stencil
+            own = self.elements.without("material")
+            self.elements = replace(own, stencil=membrane.elements.stencil)
 
     @property
     def _material(self) -> Array:
@@ -301,9 +304,9 @@ class MidEdge(Elastic):
         return float(np.abs(way.ravel()[places[own]] / length[own]).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        data = self.elements.data
-        trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
-        scale: Array = trace * size / data["height"] ** 2
+        trace = self._constants[0][:, [0, 3, 5]].sum(axis=1)
+        height = 2.0 * self.areas / _outward(self._material)[1].max(axis=1)
+        scale: Array = trace * size / height**2
         return scale
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
