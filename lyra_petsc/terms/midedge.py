@@ -103,7 +103,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
+        super().__init__(elements.without("tangent", "director", "length", "rest"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -304,9 +304,9 @@ class MidEdge(Elastic):
         return float(np.abs(way.ravel()[places[own]] / length[own]).max(initial=0.0))
 
     def force_scale(self, size: float) -> Array:
-        trace = self._constants[0][:, [0, 3, 5]].sum(axis=1)
-        height = 2.0 * self.areas / _outward(self._material)[1].max(axis=1)
-        scale: Array = trace * size / height**2
+        data = self.elements.data
+        trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
+        scale: Array = trace * size / data["height"] ** 2
         return scale
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
