@@ -413,6 +413,7 @@ def elements(rest: RestShape) -> Elements:
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
+        _check_curved(at_rest, rest, chosen, size)
     director = mean_directors(mesh.positions, triangles, number, n_edges)
     _mirror(director, rest, triangles, number, mesh.positions)
     director = director[number]
@@ -499,6 +500,22 @@ def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape, what: str) 
             "or take bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
+        )
+
+
+def _check_curved(at_rest: Array, rest: RestShape, chosen: Ints, size: Array) -> None:
+    """Refuse triangles ``chosen`` with edges ``size`` (n, 3) [m] that have no energy where directors, with
+    tangents at_rest (n, 3), lie beyond 180°.
+    """
+    most, least = np.abs(at_rest).max(axis=1), float(tangents_at(np.array(np.pi)))
+    worst = int(most.argmax())
+    if most[worst] > least:
+        raise InputError(
+            f"turns triangle {chosen[worst]} by more than 180° against its edges, of up to "
+            f"{size[worst].max():.3g} m, which no edge can; take a mesh finer by "
+            f"{most[worst] / least:.2g}, or less curvature",
+            file=rest.scene.source,
+            key=f"material[{rest.shell_of[chosen[worst]]}].rest_curvature",
         )
 
 
