@@ -71,7 +71,7 @@ class Edges(NamedTuple):
 
     Attributes
     ----------
-    places : (n,)
+    places : (n,) int32
         Of their unknowns in the flat form of arrays over local rows.
     ends : (n, 2) int32
         Local rows of their vertices; directors turn about the way from the first to the second.
@@ -81,7 +81,7 @@ class Edges(NamedTuple):
         The edge opposite each corner.
     """
 
-    places: Ints
+    places: NDArray[np.int32]
     ends: NDArray[np.int32]
     length: Array
     of_triangles: NDArray[np.int32]
@@ -111,7 +111,7 @@ class MidEdge(Elastic):
         against = data["sign"].ravel()[first] < 0
         ends[against] = ends[against, ::-1]
         index = index.reshape(-1, 3).astype(np.int32)
-        self.of_edges = Edges(places.astype(np.int64), ends, data["length"].ravel()[first], index)
+        self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
         rest = data["rest"] if data["rest"].any() else FLAT
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
@@ -234,7 +234,7 @@ class MidEdge(Elastic):
 
     @property
     def edge_places(self) -> Ints:
-        return self.of_edges.places
+        return self.of_edges.places.astype(np.int64)
 
     def moment(self, force: Array, edges: Ints, x: Array, frozen: Frames) -> Array:
         """Moment (3,) [N·m] of forces (n,) [N] on the unknowns of these edges, beside that at their ends.
