@@ -169,6 +169,7 @@ def midedge_blocks(
         stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
         edges, shape = term._edges, term._sheet.shape(x, frames)
         length = term._sheet.of_edges.length
+    rest = rest if len(rest) else np.zeros((term.n_elements, 3))
     for e, points in enumerate(term.stencil):
         corners, k = x[points], np.empty((3, 3))
         k[np.triu_indices(3)] = k.T[np.triu_indices(3)] = stiffness[e]
@@ -176,7 +177,10 @@ def midedge_blocks(
         area = np.cross(sides[1], sides[2])  # 2A n
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
-        director, spin, about = shape[edges[e]].reshape(3, 3, 3).transpose(1, 0, 2)
+        director, spin = shape[edges[e]].reshape(3, 2, 3).transpose(1, 0, 2)
+        tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
+        beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
+        about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)
         angles = [tangent_of(*rows, tuple(area)) for rows in zip(director, sides, strict=True)]
         t, t1, t2, s, s1, s2 = np.array(angles).T
         omega, inward = -(sides @ sides.T) / along[:, None] / double, np.cross(n, sides) / double

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import reduce
 from typing import Any
 
@@ -167,10 +166,10 @@ class Code:
         last = self.builder.gep(block, [INDEX(8)])
         self.builder.store(self.plus(self.builder.load(last), ninth), last)
 
-    def six_offsets(self, pairs: Iterable[int] = range(6), width: int = 6) -> list[Value]:
-        """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, width)."""
-        row = self.at(self.begin("offsets"), self.integer("e"), width)
-        return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in pairs]
+    def six_offsets(self) -> list[Value]:
+        """Those of the couplings (0, 0), (0, 1), …, (2, 2) of element ``e``, in ``offsets`` (E, 6)."""
+        row = self.at(self.begin("offsets"), self.integer("e"), 6)
+        return [self.builder.load(self.builder.gep(row, [INDEX(pair)])) for pair in range(6)]
 
     def is_odd(self, offset: Value, width: int) -> Value:
         """In all lanes, as processors choose between vectors without a jump."""

@@ -46,18 +46,22 @@ def add_elements(weight, blocks, offsets, values):  # type: ignore[no-untyped-de
 
 
 @cached(fastmath={"contract", "nsz"})
-def add_mixed_elements(weight, blocks, n, offsets, values):  # type: ignore[no-untyped-def]
+def add_mixed_elements(weight, blocks, n, corners, offsets, values):  # type: ignore[no-untyped-def]
     """Add weight (E,) times the Hessians (E, 3 n + m, 3 n + m) of elements of n vertices and m edge unknowns.
 
-    Offsets are those of the pairs of n + m rows.
+    ``corners`` are offsets of the pairs of vertices, ``offsets`` of all others.
     """
     flat, m = values.reshape(-1), blocks.shape[1] - 3 * n
     for e in range(offsets.shape[0]):
-        pair = 0
+        corner = pair = 0
         for a in range(n + m):
             for b in range(a, n + m):
-                at = offsets[e, pair]
-                pair += 1
+                if b < n:
+                    at = corners[e, corner]
+                    corner += 1
+                else:
+                    at = offsets[e, pair]
+                    pair += 1
                 if at < 0:
                     continue
                 if a >= n:

@@ -203,15 +203,15 @@ def _add_balanced(code: Code, offsets: list[Any], three: list[Any]) -> None:
 
 
 def _add_corners(typing: Any, blocks: Any, offsets: Any, e: Any, three: Any) -> Any:
-    """Add the blocks of the corners of an element e of three vertices and three edges, offsets (E, 21).
+    """Add the blocks of the couplings of an element e whose rows and columns of blocks sum to zero.
 
-    Their rows and columns sum to zero; given are those of (1, 1), (1, 2), (2, 2), nine numbers each.
+    Given are those of (1, 1), (1, 2), (2, 2), nine numbers each. Offsets (E, 6) are those of a pattern.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = Code(context, builder, signature, arguments, "blocks offsets e three")
         made = [(code.filled(nine[:8], code.eight), nine[8]) for nine in code.tuples("three")]
-        _add_balanced(code, code.six_offsets((0, 1, 2, 6, 7, 11), 21), made)
+        _add_balanced(code, code.six_offsets(), made)
         return context.get_dummy_value()
 
     return types.void(blocks, offsets, e, three), generate

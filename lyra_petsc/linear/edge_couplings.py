@@ -173,17 +173,17 @@ class EdgeCouplings:
         return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
 
     def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> Offsets:
-        """Where the couplings (a, b), b ≥ a, of elements go, the vertices being the first of their points.
+        """Where the couplings (a, b), b ≥ a, of elements go in which b is an edge; edges come after vertices.
 
-        Of two vertices as in the pattern; of a vertex and an edge four times the place of the first of three
-        numbers in the flat form of values, plus how far apart they are, less one; of two edges the place of
-        their number. −1 where other ranks have both.
+        Of a vertex and an edge four times the place of the first of three numbers in the flat form of values,
+        plus how far apart they are, less one; of two edges the place of their number. −1 where other ranks
+        have both.
         """
-        stencil = elements.stencil
-        n = stencil.shape[1]
+        stencil, m = elements.stencil, elements.edges.shape[1]
+        n = stencil.shape[1] - m
         first = self.first_group(pattern.n_blocks)
         kind = index_type(4 * (first + self.n_values))
-        out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=kind)
+        out: Offsets = np.empty((len(stencil), n * m + m * (m + 1) // 2), dtype=kind)
         rows = pattern.indptr, pattern.columns, *self.groups, *self.numbers
         _look_up(*rows, first, self.first_number(pattern.n_blocks), stencil, elements.edges, out)
         return out
@@ -254,23 +254,19 @@ class EdgeCouplings:
 def _look_up(  # type: ignore[no-untyped-def]
     indptr, columns, group_ptr, places, number_ptr, others, first_group, first_number, stencil, edges, out
 ):
-    """Offsets (E, n (n + 1) / 2) of elements whose stencil (E, n) ends with the rows of edges (E, m)."""
+    """Offsets of elements whose stencil (E, n + m) ends with the rows of edges (E, m)."""
     n_owned, n_vertices = len(indptr) - 1, len(group_ptr) - 1
     n = stencil.shape[1] - edges.shape[1]
     for e in range(len(stencil)):
         pair = 0
         for a in range(stencil.shape[1]):
-            for b in range(a, stencil.shape[1]):
+            for b in range(max(a, n), stencil.shape[1]):
                 found = -1
                 one, other = stencil[e, a], stencil[e, b]
                 row, column = min(one, other), max(one, other)
                 if row < n_owned:
-                    if b < n or column >= n_owned:
+                    if column >= n_owned:
                         found = block_of(indptr, columns, row, column)
-                    if b < n:
-                        if found >= 0:
-                            found = 2 * found + (1 if one < other else 0)
-                    elif column >= n_owned:
                         if found >= 0:
                             place = edges[e, b - n] % 3
                             if a < n:

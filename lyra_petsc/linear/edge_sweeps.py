@@ -41,12 +41,18 @@ Ints = NDArray[np.int64]
 EDGES_EVERY = 2
 """Sweeps over the vertices for one over the edges."""
 
-STIFF_UNTIL = 0.03
-"""Inertia over what all resists a vertex in its softest direction, up to which bending is stiff beside it."""
+ALIGNED = 8
+"""Vectors begin at a multiple of so many numbers of double precision."""
 
-SWEEPS = {False: (1, 1), True: (3, 2)}
-"""Of the mesh and of coarser levels, where bending is stiff or not: of those that take equally long, the ones
-with which iterations grow least with the mesh."""
+SWEEPS = ((0.03, 3), (0.3, 2))
+"""Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices on
+all levels; beyond, one. Of numbers that take equally long those with which iterations grow least with the
+mesh."""
+
+
+def room(pattern: BlockPattern) -> tuple[int, int]:
+    """How much memory `SweepsWithEdges` takes, in numbers of double precision: its rows, and its vectors."""
+    return ALIGNED * -(-9 * pattern.n_stored // (2 * ALIGNED)), 8 * pattern.n_local
 
 
 @cached()
@@ -208,10 +214,13 @@ class SweepsWithEdges:
     pattern : BlockPattern
     couplings : EdgeCouplings
     memory : (n,) float64, optional
-        Where the copy of rows is, in single precision.
+        First the copy of rows, in single precision, then the vectors (`room`). Between two calls of ``store``
+        and from that to the next ``begin`` the vectors' part may serve for something else.
 
     Attributes
     ----------
+    b, x : (n_local, 3)
+        Right-hand side and solution.
     r : (n_local, 4)
         Residual of vertices, and numbers without a meaning.
     of_edges : (n_local, 3)
@@ -234,15 +243,17 @@ class SweepsWithEdges:
         beside = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._beside, self._edges_beside = beside[beside < n], beside[beside >= n]
         self._weight = self._of_all_alike(pattern, n)
-        room = 9 * pattern.n_stored
-        memory = np.empty(-(-room // 2)) if memory is None else memory
-        self._copy = memory.view(np.float32)[:room].reshape(-1, 9)
+        of_rows, of_vectors = room(pattern)
+        memory = np.empty(of_rows + of_vectors) if memory is None else memory
+        self._copy = memory[:of_rows].view(np.float32)[: 9 * pattern.n_stored].reshape(-1, 9)
         self._values = couplings.parts(self._copy, pattern.n_blocks)
         self._inverse = np.empty((n, 9), dtype=np.float32)
-        self._moved = np.zeros((n_local, 3), dtype=np.float32)
         self._inverse_of_edges = np.empty((pattern.n_owned - n, 3), dtype=np.float32)
-        self.r = np.zeros((n_local, 4), dtype=np.float32)
-        self.of_edges = np.zeros((n_local, 3), dtype=np.float32)
+        vectors = memory[of_rows : of_rows + of_vectors].view(np.float32)
+        self._changing = vectors[: 13 * n_local]  # what a cycle begins with is in the rest
+        self._clean = False
+        self.r = vectors[: 4 * n_local].reshape(-1, 4)
+        self.x, self.of_edges, self._moved, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
         self.flops = 18.0 * pattern.n_couplings
 
     def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
@@ -264,24 +275,30 @@ class SweepsWithEdges:
         found[np.flatnonzero(edges)[:, None], [0, 4, 8]] = values.reshape(-1)[own]
         return found
 
-    def inertia(self) -> Array:
+    def inertia(self, values: Array) -> Array:
         """Sums (2,) over owned vertices: inertia, and what all resists them in their softest direction.
 
-        Moving all vertices alike meets nothing else than inertia.
+        Moving all vertices alike meets nothing else than inertia. ``values`` (n_stored, 9) as ``invert`` got.
         """
-        blocks = self._values.blocks[: len(self._weight)]
-        together = sum(np.dot(self._weight, blocks[:, i].astype(np.float64)) for i in (0, 4, 8))
+        blocks = values[: len(self._weight)]
+        together = sum(np.dot(self._weight, blocks[:, i]) for i in (0, 4, 8))
         softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
         return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
-    def set(self, values: Array) -> None:
-        """Take block rows (n_stored, 9)."""
+    def invert(self, values: Array) -> None:
+        """Take the inverses of the diagonal of block rows (n_stored, 9)."""
+        begin = self._rows[0][: len(self._inverse) + 1]
+        invert_diagonal(begin, values, self._inverse)
+        numbers = self._couplings.parts(values, self._n_blocks).numbers
+        invert_numbers(self._numbers.indptr, numbers, self._inverse_of_edges)
+
+    def store(self, values: Array) -> None:
+        """Take block rows (n_stored, 9), which may be where the copy will be."""
         begin = self._rows[0][: len(self._inverse) + 1]
         own = values.reshape(-1)[self._couplings.diagonal(self._n_blocks)]
         least = NEGLIGIBLE * float(own.min(initial=np.inf, where=own > 0.0))
         store(values, min(least, negligible(begin, values)), self._copy)
-        invert_diagonal(begin, values, self._inverse)
-        invert_numbers(self._numbers.indptr, self._values.numbers, self._inverse_of_edges)
+        self._clean = False
 
     def shrink(self, rows: Ints, factor: Array) -> None:
         """Divide the inverses of the diagonal of rows (n,) by ``factor`` (n, 1)."""
@@ -292,6 +309,9 @@ class SweepsWithEdges:
     def begin(self, b: Floats) -> None:
         """Let the residual be b (n_local, 3): x is zero."""
         n, n_owned = len(self._inverse), len(self._rows[1])
+        if not self._clean:
+            self._changing[:] = 0.0
+            self._clean = True
         self.r[:n, :3] = b[:n]
         self.r[n_owned:] = 0.0  # to which turns of edges are added
         self.of_edges[n:n_owned] = b[n:n_owned]

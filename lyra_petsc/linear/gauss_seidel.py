@@ -231,6 +231,8 @@ class BlockSweeps:
 
     Attributes
     ----------
+    b, x : (n_local, 3)
+        Right-hand side and solution.
     r : (n_owned, 4)
         Residual, and numbers without a meaning.
     flops : float
@@ -244,6 +246,7 @@ class BlockSweeps:
         self._blocks = np.empty((pattern.n_blocks, 9), dtype=np.float32)
         self._inverse = np.empty((n, 9), dtype=np.float32)
         self._moved: Floats | None = None  # of use for more than one sweep
+        self.x, self.b = (np.zeros((pattern.n_local, 3), dtype=np.float32) for _ in range(2))
         self.r = np.zeros((n, 4), dtype=np.float32)
         self.flops = 18.0 * pattern.n_couplings
 
@@ -252,10 +255,13 @@ class BlockSweeps:
         found: Array = values[self._rows[0][rows]]
         return found
 
-    def set(self, values: Array) -> None:
+    def invert(self, values: Array) -> None:
+        """Take the inverses of the diagonal blocks of block rows (n_blocks, 9)."""
+        invert_diagonal(self._rows[0], values, self._inverse)
+
+    def store(self, values: Array) -> None:
         """Take block rows (n_blocks, 9)."""
         store(values, negligible(self._rows[0], values), self._blocks)
-        invert_diagonal(self._rows[0], values, self._inverse)
 
     def shrink(self, rows: Ints, factor: Array) -> None:
         """Divide the inverses of the diagonal blocks of rows (n,) by ``factor`` (n, 1)."""
@@ -273,7 +279,7 @@ class BlockSweeps:
         """Sweep; see the function."""
         backward(*self._rows, self._blocks, self._inverse, x, self.r)
 
-    def inertia(self) -> Array | None:
+    def inertia(self, values: Array) -> Array | None:
         """None: more sweeps are not worth their time here."""
         return None
 

@@ -98,7 +98,7 @@ class Level:
     turns : EdgeTurns or None
         How unknowns of edges, that nothing is interpolated to, follow the vertices.
     memory : (n,) float64 or None
-        For what the sweeps copy, where edges carry unknowns.
+        Where edges carry unknowns, what the sweeps work in; before that, the block rows below are in it.
     """
 
     def __init__(self, points: Points, pattern: BlockPattern, turns: EdgeTurns | None = None) -> None:
@@ -119,11 +119,13 @@ class Hierarchy:
     below : WithoutEdges, optional
         Where edges carry unknowns.
     spare : bool
-        The finest level's block rows are of no use once it has taken them: ``below`` may have their room.
+        The finest level's block rows are of no use once it has taken them.
 
     Attributes
     ----------
     levels : list of Level
+    rows : (n_stored, 3, 3) or None
+        Where ``below`` is given and rows are spare: where the finest level's should be, in its memory.
     """
 
     def __init__(
@@ -137,10 +139,20 @@ class Hierarchy:
     ) -> None:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
-        self._spare = spare and below is not None and below.pattern.n_blocks <= pattern.n_stored
-        if below is not None and not self._spare:
-            # what is below is there before the copies, in single precision, are
-            level.memory = np.empty(9 * max(-(-pattern.n_stored // 2), below.pattern.n_blocks))
+        self.rows: Array | None = None
+        self._spare = spare
+        if below is not None:
+            from lyra_petsc.linear.edge_sweeps import room  # of use for nothing else
+
+            # copies of rows take the place of these, if they are spare, and then what is below that of the
+            # vectors; else what is below comes first of all
+            of_rows, of_vectors = room(pattern)
+            begin = of_rows if spare else 0
+            least = max(of_rows + of_vectors, begin + 9 * below.pattern.n_blocks)
+            level.memory = np.zeros(max(least, 9 * pattern.n_stored) if spare else least)
+            self._room_below = level.memory[begin:]
+            if spare:
+                self.rows = level.memory[: 9 * pattern.n_stored].reshape(-1, 3, 3)
         self.levels = [level]
         for interpolation in interpolations:
             rows = interpolation.start, interpolation.parents, interpolation.weights, interpolation.bounds
@@ -152,8 +164,8 @@ class Hierarchy:
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
         """Of each level, finest first, the block rows that those of the finest make; collective.
 
-        Each is made when it is asked for, and the one before should be freed by then; the finest ones are
-        overwritten where they are spare.
+        Each is made when it is asked for, and the one before should be freed by then; in ``rows`` the finest
+        ones are overwritten.
 
         Parameters
         ----------
@@ -171,12 +183,12 @@ class Hierarchy:
         finest = self.levels[0]
         free = np.where(held[: finest.points.n_owned], 0.0, 1.0)
         below: tuple[Array, Array] | None = None
-        if self._below is not None and finest.memory is not None and finest.galerkin is not None:
-            below = finest.galerkin.project(self._below.values(held, finest.memory), free)
+        if self._below is not None and not self._spare and finest.galerkin is not None:
+            below = finest.galerkin.project(self._below.values(held, self._room_below), free)
         for level in self.levels:
             yield values, free
             if self._below is not None and self._spare and level is finest:
-                values = self._below.values(held, values.reshape(-1))
+                values = self._below.values(held, self._room_below)
             if below is not None:
                 (values, free), below = below, None
             elif level.galerkin is not None:

@@ -91,6 +91,8 @@ class BlockMatrix:
     pattern : BlockPattern
     summary : method or None
         Further lines of ``-ksp_view``; collective. Its object is not kept alive.
+    rows : (n_stored, 3, 3) float64, optional
+        Where its block rows shall be.
 
     Attributes
     ----------
@@ -105,15 +107,19 @@ class BlockMatrix:
     kind = "python"
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, summary: Callable[[], list[str]] | None = None
+        self,
+        points: Points,
+        pattern: BlockPattern,
+        summary: Callable[[], list[str]] | None = None,
+        rows: Array | None = None,
     ) -> None:
-        rows = 3 * points.n_owned
+        n = 3 * points.n_owned
         self.mat = PETSc.Mat().create(points.comm)
-        self.mat.setSizes(((rows, 3 * points.n_global), (rows, 3 * points.n_global)), bsize=3)
+        self.mat.setSizes(((n, 3 * points.n_global), (n, 3 * points.n_global)), bsize=3)
         self.mat.setType(PETSc.Mat.Type.PYTHON)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._blocks = BlockRows(pattern)
-        self.rows = self._blocks.zeros()
+        self.rows = self._blocks.zeros() if rows is None else rows
         self.followers: list[Callable[[Array], None]] = []
         self.mat.setPythonContext(_Product(points, pattern, self.rows, summary))
         _set_vec_type(self.mat)

@@ -173,6 +173,10 @@ class BlockPattern:
             if name in self.edges:
                 made.offsets[name] = made.offsets_of(self.edges[name])
                 continue
+            alike = [other for other in made.offsets if self.offsets[other] is offsets]
+            if alike:
+                made.offsets[name] = made.offsets[alike[0]]
+                continue
             moved = 2 * place[offsets >> 1] + (offsets & 1)
             made.offsets[name] = np.where(offsets < 0, -1, moved).astype(kind)
         return made, place

@@ -76,9 +76,8 @@ class Smoother:
         self.points, self.n_couplings = points, pattern.n_couplings
         self._rows = pattern.indptr, pattern.ends, pattern.columns
         self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
-        self.x = np.zeros((points.n_local, 3), dtype=np.float32)
-        self.b = np.zeros_like(self.x)
         self._turns, self._sweeps = level.turns, _sweeps_of(level)
+        self.x, self.b = self._sweeps.x, self._sweeps.b
         self._asked_sweeps, self.n_sweeps, self.n_coarse_sweeps = vertex_sweeps, 1, 1
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
@@ -86,7 +85,7 @@ class Smoother:
         self._parents = start[: len(self._sweeps.r) + 1], parents, weights.astype(np.float32)
         self._all_parents = start, *self._parents[1:]
         self._transfer_flops = 6.0 * len(parents)  # of three coordinates of each parent
-        self._free = np.ones_like(self.x)
+        self._free = np.ones((points.n_local, 3), dtype=np.float32)
         self._lagged = np.empty(0, dtype=np.int64)
         self._increase = np.empty((0, 3, 3), dtype=np.float32)
         self._seen = np.empty((0, 3), dtype=np.float32)
@@ -94,20 +93,22 @@ class Smoother:
     def set(self, values: Array, free: Array) -> None:
         """Take block rows (n_blocks, 3, 3), and which coordinates (n_owned, 3) take part; collective."""
         values = values.reshape(-1, 9)
-        self._sweeps.set(values)
-        if (inertia := self._sweeps.inertia()) is not None:
+        self._sweeps.invert(values)
+        if (inertia := self._sweeps.inertia(values)) is not None:
             self._choose_sweeps(inertia)
         self._increase_diagonal(values)
+        self._sweeps.store(values)  # after which the values of the mesh are perhaps no more
         self._free[: len(free)] = free
         self.points.update_ghosts(self._free)
 
     def _choose_sweeps(self, own: Array) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import STIFF_UNTIL, SWEEPS  # of use for nothing else
+        from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
 
         inertia, resistance = self.points.comm.allreduce(own)
-        worth, self.n_coarse_sweeps = SWEEPS[bool(inertia < STIFF_UNTIL * resistance)]
-        self.n_sweeps = self._asked_sweeps or worth
+        found = (number for until, number in SWEEPS if inertia < until * resistance)
+        self.n_coarse_sweeps = next(found, 1)
+        self.n_sweeps = self._asked_sweeps or self.n_coarse_sweeps
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.

@@ -182,13 +182,11 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
         rows = Rows.build(Numbering.build(owner, locality_order(graph), comm.size), whole)
         del graph
         pieces = _pieces(whole, rows, comm.size)
-        own = None
-        for rank, piece in enumerate(pieces):
-            if rank == 0:
-                own = piece
-            else:
-                post.send(piece, dest=rank)
-        piece = own
+        for rank in range(1, comm.size):
+            piece = next(pieces)
+            post.send(piece, dest=rank)
+            del piece  # there is no room for the next one beside it
+        piece = next(pieces)
     else:
         piece = post.recv(source=0)
     bounds, ghosts, unknowns, elements, vertex_data = piece
@@ -196,16 +194,16 @@ def distribute(comm: MPI.Comm, whole: Whole | None) -> Part:
 
 
 def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-def]
-    """One picklable piece after the other, so that rank 0 holds one at a time."""
+    """One picklable piece after the other, so that rank 0 holds one at a time; its own comes last."""
     split = {name: split_elements(rows.owners(each), n_ranks) for name, each in whole.elements.items()}
-    for rank in range(n_ranks):
+    for rank in (*range(1, n_ranks), 0):
         lo, hi = rows.bounds[rank], rows.bounds[rank + 1]
+        elements = {}
         touched = {
             name: rows.of_elements(whole.elements[name], mine[rank][0]) for name, mine in split.items()
         }
-        every = np.unique(np.concatenate([t.ravel() for t in touched.values()] or [np.empty(0, np.int64)]))
+        every = np.unique(np.concatenate([*map(np.unique, touched.values()), np.empty(0, np.int64)]))
         ghosts = every[(every < lo) | (every >= hi)]
-        elements = {}
         for name, (index, n_owned) in ((n, s[rank]) for n, s in split.items()):
             each = whole.elements[name]
             n = each.stencil.shape[1]

@@ -99,7 +99,7 @@ class Ledger:
         self._pull: Array | None = None
         self._targets: list[tuple[Array, Array]] = []
         if not system.integrator.moves:
-            self._pull, self._targets = self._external(system.forces_now()), self._turning()
+            self._pull, self._targets = self._external(dict(system.forces_now())), self._turning()
         self.measure()
 
     @property
@@ -178,18 +178,22 @@ class Ledger:
         active, x = self._system.active, self._system.x
         return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
 
-    def _external(self, parts: Mapping[str, Array]) -> Array:
-        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F."""
+    def _external(self, parts: dict[str, Array]) -> Array:
+        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F, which
+        lose those of inertia and loads.
+        """
         system = self._system
         self._at = system.prescribed.at
         self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
-        external = -parts["loads"]
+        del parts["inertia"]  # what follows needs the room
+        external = np.negative(parts["loads"], out=parts.pop("loads"))
         system.prescribed.put(external, external.take(self._at) + self._reactions)
         for load in system.active.loads:
             if load.registration.energy:  # it has a potential, and does no work from outside
                 weight = np.zeros((system.points.n_local, 3))
                 load.add_force(system.x, 0.0, 0.0, weight)
-                external -= system.applied.factor * weight[: len(external)]
+                weight *= system.applied.factor
+                external -= weight[: len(external)]
         for name in ("wind", "springs"):
             if name in parts:
                 external -= parts[name]

@@ -88,9 +88,15 @@ class LinearSystem:
             self.operator = BlockMatrix(layout, pattern, self._equations.block_summary)
         self.preconditioner = self.operator
         if self.cycles:
-            if self._regularised or isinstance(self.operator, AssembledMatrix):
-                self.preconditioner = BlockMatrix(layout, pattern, self._equations.block_summary)
-            self._multigrid = self._levels()
+            spare = self._regularised or isinstance(self.operator, AssembledMatrix)
+            hierarchy = self._levels(spare=spare)
+            if spare:
+                summary = self._equations.block_summary
+                self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows)
+            assert isinstance(self.preconditioner, BlockMatrix)
+            self._multigrid = Multigrid(
+                self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask
+            )
         elif (
             self._regularised or isinstance(self.operator, BlockMatrix) or self._preset in presets.INCOMPLETE
         ):
@@ -99,8 +105,7 @@ class LinearSystem:
                 layout, pattern, "baij" if diagonal else kind, diagonal=diagonal
             )
 
-    def _levels(self) -> Multigrid:
-        assert isinstance(self.preconditioner, BlockMatrix)
+    def _levels(self, *, spare: bool) -> Hierarchy:
         discretisation = self._equations.discretisation
         found = self._interpolations
         if found is None:
@@ -112,9 +117,7 @@ class LinearSystem:
             from lyra_petsc.stepping.vertex_equations import VertexEquations  # of use for nothing else
 
             below = VertexEquations(self._equations)
-        spare = self.preconditioner is not self.operator
-        hierarchy = Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
-        return Multigrid(self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask)
+        return Hierarchy(discretisation.layout, discretisation.rows.pattern, found, below, spare=spare)
 
     def attach(self, ksp: PETSc.KSP) -> None:
         """Serve a KSP whose options are read."""

@@ -176,13 +176,13 @@ class StageEquations:
         return self.state.v
 
     def _least_stiffness(self) -> Array:
-        """What Jacobians add to the diagonal of block rows (n_owned,) [N/m]: where edges' triangles have lost
-        their area nothing else is left.
+        """What Jacobians add to the diagonal of block rows of edges (n,) [N/m]: where their triangles have
+        lost their area nothing else is left.
         """
         least = np.zeros((self.points.n_local, 3))
         for term in self.active.edged:
             least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
-        found: Array = least[: self.points.n_owned].max(axis=1)
+        found: Array = least[self.points.n_vertices : self.points.n_owned].max(axis=1)
         return found
 
     def begin(self, time: float) -> None:
@@ -761,7 +761,7 @@ class StageEquations:
         reach = self.stage.reach
         inertia = self.stage.sigma * self.mass
         if self.active.edged:
-            inertia += reach * self._least
+            inertia[self.points.n_vertices :] += reach * self._least
         beside = self.prescribed.beside
         changing = beside.changing
         if blend < 1.0 or not self.damping.with_stiffness_into(x, reach, inertia, values, changing):

@@ -21,6 +21,7 @@ Schöberl, Computers & Structures 225 (2019) 106109.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,8 @@ STEEPEST = np.radians(89.95)
 it is folded."""
 
 (NO_FRICTION,) = unwritable(np.empty((0, 2)))
+FLAT = np.empty((0, 3))
+"""In place of tangents without energy that are all 0."""
 
 CREASED = np.tan(np.radians(30.0))
 """tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
@@ -68,7 +71,7 @@ class Edges(NamedTuple):
 
     Attributes
     ----------
-    places : (n,)
+    places : (n,) int32
         Of their unknowns in the flat form of arrays over local rows.
     ends : (n, 2) int32
         Local rows of their vertices; directors turn about the way from the first to the second.
@@ -78,7 +81,7 @@ class Edges(NamedTuple):
         The edge opposite each corner.
     """
 
-    places: Ints
+    places: NDArray[np.int32]
     ends: NDArray[np.int32]
     length: Array
     of_triangles: NDArray[np.int32]
@@ -100,7 +103,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length"))
+        super().__init__(elements.without("tangent", "director", "length", "rest"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -108,9 +111,10 @@ class MidEdge(Elastic):
         against = data["sign"].ravel()[first] < 0
         ends[against] = ends[against, ::-1]
         index = index.reshape(-1, 3).astype(np.int32)
-        self.of_edges = Edges(places.astype(np.int64), ends, data["length"].ravel()[first], index)
+        self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
-        self._constants = data["stiffness"], data["rest"], data["limit"], NO_FRICTION
+        rest = data["rest"] if data["rest"].any() else FLAT
+        self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
         self._membrane: Membrane | None = None  # of the same triangles
@@ -118,7 +122,9 @@ class MidEdge(Elastic):
     def connect(self, terms: Iterable[Term]) -> None:
         membrane = next((term for term in terms if isinstance(term, Membrane)), None)
         if membrane is not None and np.array_equal(membrane.stencil, self.stencil):
-            self._membrane, self.elements = membrane, self.elements.without("material")
+            self._membrane, self.stencil = membrane, membrane.stencil
+            own = self.elements.without("material")
+            self.elements = replace(own, stencil=membrane.elements.stencil)
 
     @property
     def _material(self) -> Array:
@@ -228,7 +234,7 @@ class MidEdge(Elastic):
 
     @property
     def edge_places(self) -> Ints:
-        return self.of_edges.places
+        return self.of_edges.places.astype(np.int64)
 
     def moment(self, force: Array, edges: Ints, x: Array, frozen: Frames) -> Array:
         """Moment (3,) [N·m] of forces (n,) [N] on the unknowns of these edges, beside that at their ends.
@@ -244,19 +250,18 @@ class MidEdge(Elastic):
     # -- energy ------------------------------------------------------------------------------------
 
     def shape(self, x: Array, frames: Frames) -> Array:
-        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 9)."""
+        """Directors and what goes with them, as by ``midedge_shape.directors``, (n, 6)."""
         if self._shapes is None or self._shapes_of is not frames:
             self._shapes_of = frames
             self._shapes = Remembered(lambda at: self._computed(at, frames))
         return self._shapes(x)
 
     def forget(self) -> None:
-        if self._shapes is not None:
-            self._shapes.forget()
+        self._shapes = self._shapes_of = None
 
     def _computed(self, x: Array, frames: Frames) -> Array:
         angle = x.ravel()[self.of_edges.places] / self.of_edges.length
-        out = np.empty((len(angle), 9))
+        out = np.empty((len(angle), 6))
         # all at once: NumPy's are several at a time where the processor can
         directors(x, self.of_edges.ends, *frames, np.cos(angle), np.sin(angle), out)
         return out
@@ -290,9 +295,8 @@ class MidEdge(Elastic):
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
         constants = *self._constants, self.of_edges.length
-        midedge_energy.add_hessian(
-            x, self.stencil, blend, *numbers, *constants, weight, offsets[self.name], values
-        )
+        at = offsets[f"{self.name} vertices"], offsets[self.name]
+        midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
     def largest_turn(self, way: Array) -> float:
         places, length = self.of_edges.places, self.of_edges.length
@@ -409,6 +413,7 @@ def elements(rest: RestShape) -> Elements:
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
         at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
+        _check_curved(at_rest, rest, chosen, size)
     director = mean_directors(mesh.positions, triangles, number, n_edges)
     _mirror(director, rest, triangles, number, mesh.positions)
     director = director[number]
@@ -495,6 +500,22 @@ def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape, what: str) 
             "or take bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
+        )
+
+
+def _check_curved(at_rest: Array, rest: RestShape, chosen: Ints, size: Array) -> None:
+    """Refuse triangles ``chosen`` with edges ``size`` (n, 3) [m] that have no energy where directors, with
+    tangents at_rest (n, 3), lie beyond 180°.
+    """
+    most, least = np.abs(at_rest).max(axis=1), float(tangents_at(np.array(np.pi)))
+    worst = int(most.argmax())
+    if most[worst] > least:
+        raise InputError(
+            f"turns triangle {chosen[worst]} by more than 180° against its edges, of up to "
+            f"{size[worst].max():.3g} m, which no edge can; take a mesh finer by "
+            f"{most[worst] / least:.2g}, or less curvature",
+            file=rest.scene.source,
+            key=f"material[{rest.shell_of[chosen[worst]]}].rest_curvature",
         )
 
 

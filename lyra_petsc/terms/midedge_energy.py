@@ -20,8 +20,9 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
 
-With friction, ``friction`` (E, 2) has for each triangle a factor c and an energy [J]: by the latter the
-energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact Hessian; without, it is empty.
+Where ``rest``, T̄, is empty all of it is 0. With friction, ``friction`` (E, 2) has for each triangle a factor
+c and an energy [J]: by the latter the energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact
+Hessian; without, it is empty.
 """
 
 from __future__ import annotations
@@ -42,20 +43,26 @@ AHEAD = 4
 
 
 @kernel(inline="always")
+def _at_rest(rest, e):  # type: ignore[no-untyped-def]
+    """T̄ of triangle e."""
+    if rest.shape[0] == 0:
+        return 0.0, 0.0, 0.0
+    return rest[e, 0], rest[e, 1], rest[e, 2]
+
+
+@kernel(inline="always")
 def _own(stiffness, rest, e, t0, t1, t2):  # type: ignore[no-untyped-def]
     """K_ii (T_i − T̄_i) of triangle e, and the differences."""
-    f0, f1, f2 = t0 - rest[e, 0], t1 - rest[e, 1], t2 - rest[e, 2]
+    u0, u1, u2 = _at_rest(rest, e)
+    f0, f1, f2 = t0 - u0, t1 - u1, t2 - u2
     return stiffness[e, 0] * f0, stiffness[e, 3] * f1, stiffness[e, 5] * f2, f0, f1, f2
 
 
 @kernel(inline="always")
 def _others(stiffness, rest, e, s0, s1, s2):  # type: ignore[no-untyped-def]
     """Σ_j≠i K_ij (S_j − S̄_j) of triangle e, and the differences."""
-    h0, h1, h2 = (
-        s0 - fading_tangent(rest[e, 0]),
-        s1 - fading_tangent(rest[e, 1]),
-        s2 - fading_tangent(rest[e, 2]),
-    )
+    u0, u1, u2 = _at_rest(rest, e)
+    h0, h1, h2 = s0 - fading_tangent(u0), s1 - fading_tangent(u1), s2 - fading_tangent(u2)
     k01, k02, k12 = stiffness[e, 1], stiffness[e, 2], stiffness[e, 4]
     return k01 * h1 + k02 * h2, k01 * h0 + k12 * h2, k02 * h0 + k12 * h1, h0, h1, h2
 
@@ -204,9 +211,10 @@ def _times(f, u):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _bend(spin, about, e, n, scale, pull, sign):  # type: ignore[no-untyped-def]
-    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge."""
-    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * pull * sign, spin), about)
+def _bend(spin, e, square, n, scale, pull):  # type: ignore[no-untyped-def]
+    """pull (n τᵀ + τ nᵀ − ½ s (γ ρᵀ + ρ γᵀ)) of an edge, of length² ``square``; s ρ = 2 e / |e|² + γ × t."""
+    about = _along(2.0 / square, e, cross(spin, scaled(1.0 / math.sqrt(square), e)))
+    return _symmetric(n, scaled(scale, cross(e, n)), scaled(-0.5 * pull, spin), about)
 
 
 @kernel()
@@ -271,9 +279,9 @@ def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
 def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-untyped-def]
     """Add factor times the couplings of the corners 1 and 2 with an edge, and minus their sum of 0."""
     both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
-    _add_column(flat, offsets[e, 3 + edge], both, -factor)
-    _add_column(flat, offsets[e, 8 + edge], one, factor)
-    _add_column(flat, offsets[e, 12 + edge], two, factor)
+    _add_column(flat, offsets[e, edge], both, -factor)
+    _add_column(flat, offsets[e, 3 + edge], one, factor)
+    _add_column(flat, offsets[e, 6 + edge], two, factor)
 
 
 @kernel(inline="always")
@@ -284,28 +292,43 @@ def _add_number(flat, at, value):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _fetch_ahead(e, offsets, values):  # type: ignore[no-untyped-def]
+def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
     """Let what a later triangle is added to come into the caches, as if it were blocks (3 × 3)."""
     later = min(e + AHEAD, offsets.shape[0] - 1)
-    for pair in (0, 1, 2, 6, 7, 11):
-        fetch(values, offsets[later, pair] >> 1)
-    for pair in (3, 4, 5, 8, 9, 10, 12, 13, 14):
+    for pair in range(6):
+        fetch(values, corners[later, pair] >> 1)
+    for pair in range(9):
         fetch(values, (offsets[later, pair] >> 2) // 9)
-    for pair in (15, 18, 20):
+    for pair in (9, 12, 14):
         fetch(values, offsets[later, pair] // 9)
 
 
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
-    x, stencil, blend, edges, sign, shape, stiffness, rest, limit, friction, length, weight, offsets, values
+    x,
+    stencil,
+    blend,
+    edges,
+    sign,
+    shape,
+    stiffness,
+    rest,
+    limit,
+    friction,
+    length,
+    weight,
+    corners,
+    offsets,
+    values,
 ):
-    """Add weight (E,) times the Hessians to block rows, where offsets (E, 21) say.
+    """Add weight (E,) times the Hessians to block rows, where offsets of the couplings of corners (E, 6) and
+    of those with edges (E, 15) say.
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
     flat, exact = values.reshape(-1), 1.0 - blend
     for e in range(stencil.shape[0]):
-        _fetch_ahead(e, offsets, values)
+        _fetch_ahead(e, corners, offsets, values)
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
@@ -360,9 +383,9 @@ def add_hessian(  # type: ignore[no-untyped-def]
             m0, m1, m2 = exact * p0, exact * p1, exact * p2
             f0, f1, f2 = m0 * r0, m1 * r1, m2 * r2
             half = 0.5 * math.sqrt(square)
-            bend0 = _bend(spin0, row(shape, edges[e, 0], 6), e0, n, half * f0 / s00, m0, sign[e, 0])
-            bend1 = _bend(spin1, row(shape, edges[e, 1], 6), e1, n, half * f1 / s11, m1, sign[e, 1])
-            bend2 = _bend(spin2, row(shape, edges[e, 2], 6), e2, n, half * f2 / s22, m2, sign[e, 2])
+            bend0 = _bend(spin0, e0, s00, n, half * f0 / s00, m0)
+            bend1 = _bend(spin1, e1, s11, n, half * f1 / s11, m1)
+            bend2 = _bend(spin2, e2, s22, n, half * f2 / s22, m2)
             u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
             v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
             nothing = (0.0, 0.0, 0.0)
@@ -381,14 +404,14 @@ def add_hessian(  # type: ignore[no-untyped-def]
             )
         (b11, b12, b22), one, two, numbers = hessian
         factor = weight[e]
-        add_corners(values, offsets, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
+        add_corners(values, corners, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
         _add_columns(flat, offsets, e, 0, one[0], two[0], factor)
         _add_columns(flat, offsets, e, 1, one[1], two[1], factor)
         _add_columns(flat, offsets, e, 2, one[2], two[2], factor)
         h00, h01, h02, h11, h12, h22 = numbers
-        _add_number(flat, offsets[e, 15], factor * h00)
-        _add_number(flat, offsets[e, 16], factor * h01)
-        _add_number(flat, offsets[e, 17], factor * h02)
-        _add_number(flat, offsets[e, 18], factor * h11)
-        _add_number(flat, offsets[e, 19], factor * h12)
-        _add_number(flat, offsets[e, 20], factor * h22)
+        _add_number(flat, offsets[e, 9], factor * h00)
+        _add_number(flat, offsets[e, 10], factor * h01)
+        _add_number(flat, offsets[e, 11], factor * h02)
+        _add_number(flat, offsets[e, 12], factor * h11)
+        _add_number(flat, offsets[e, 13], factor * h12)
+        _add_number(flat, offsets[e, 14], factor * h22)

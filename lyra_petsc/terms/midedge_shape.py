@@ -121,10 +121,10 @@ def _turned(t0, a0, t):  # type: ignore[no-untyped-def]
 
 @kernel()
 def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-untyped-def]
-    """Of edges (n, 2): director d, γ [1/m] and ρ [1/m], into out (n, 9).
+    """Of edges (n, 2): director d and γ [1/m], into out (n, 6).
 
-    γ changes with the edge by −γ ρᵀ and an antisymmetric part. d is 0 where an edge is too far from its
-    frame.
+    γ changes with the edge by −γ ρᵀ, ρ = 2 t / |e| + γ × t, and an antisymmetric part. d is 0 where an edge
+    is too far from its frame.
     """
     for k in range(ends.shape[0]):
         e = minus(point(x, ends[k, 1]), point(x, ends[k, 0]))
@@ -142,7 +142,6 @@ def directors(x, ends, tangent, across, cosine, sine, out):  # type: ignore[no-u
         for i in range(3):
             out[k, i] = cosine[k] * a[i] + sine[k] * w[i]
             out[k, 3 + i] = -inverse * b[i]
-            out[k, 6 + i] = inverse * ((2.0 + c) * t[i] + t0[i])
 
 
 @kernel(inline="always")

@@ -43,7 +43,10 @@ class Across(NamedTuple):
 
 
 class WithEdges(NamedTuple):
-    """Elements that couple rows of ``vertices`` (E, n) and ``edges`` (E, m), places of their unknowns."""
+    """Elements that couple rows of ``vertices`` (E, n) and ``edges`` (E, m), places of their unknowns.
+
+    What couples the vertices with each other has offsets of its own.
+    """
 
     vertices: NDArray[np.int32]
     edges: NDArray[np.int32]
@@ -147,7 +150,7 @@ class Term(ABC):
         """What the Hessians couple."""
         if self.edges is None:
             return {self.name: self.stencil}
-        return {self.name: WithEdges(self.stencil, self.edges)}
+        return {f"{self.name} vertices": self.stencil, self.name: WithEdges(self.stencil, self.edges)}
 
     @property
     def reference_rows(self) -> Ints:
@@ -182,7 +185,8 @@ class Term(ABC):
             if self.edges is None:
                 add_elements(weight[lo:hi], blocks, at[lo:hi], values)
             else:
-                add_mixed_elements(weight[lo:hi], blocks, n, at[lo:hi], values)
+                corners = offsets[f"{self.name} vertices"][rows][lo:hi]
+                add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], values)
 
 
 class Elastic(Term):

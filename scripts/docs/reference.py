@@ -60,8 +60,8 @@ OPTIONS = {
     "pc_mg_w_from": "Level of multigrid (`-pc_type python`) from which on three are visited twice in a cycle "
     "(1: the next coarser than the mesh; without it none).",
     "pc_mg_vertex_sweeps": "Sweeps of multigrid (`-pc_type python`, `mg`) over the mesh's vertices before "
-    "and after the coarser levels, where edges carry unknowns (3 where bending is stiff beside inertia, "
-    "else 1).",
+    "and after the coarser levels, where edges carry unknowns (1 to 3, the stiffer bending is beside "
+    "inertia).",
     "pc_mg_levels": "Most levels of multigrid (`-pc_type python`, `mg`), on coarse meshes of the program's.",
     "sub_pc_type": "Preconditioner of each rank's block with `-pc_type bjacobi` (`ilu`).",
     "mat_type": "Type of the operator and of what the preconditioner is built from: `aij`, `baij`, `sbaij`. "

@@ -8,7 +8,8 @@ from oracle import expanded
 from lyra_petsc.kernels.scatter import add_mixed_elements
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
-from lyra_petsc.linear.edge_sweeps import SweepsWithEdges
+from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, room
+from lyra_petsc.linear.gauss_seidel import store
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import WithEdges
 
@@ -28,11 +29,11 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     edges = np.array([RNG.choice(places, 3, replace=False) for _ in range(40)], dtype=np.int64)
     pair = RNG.choice(vertex_rows, (8, 2)).astype(np.int32)
     coupling = WithEdges(vertices, edges)
-    pattern = BlockPattern({"mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
+    pattern = BlockPattern({"corners": vertices, "mixed": coupling, "pair": pair}, N_OWNED, N_LOCAL)
     half = RNG.normal(size=(40, 12, 12))
     blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
     values = np.zeros((pattern.n_stored, 3, 3))
-    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["mixed"], values)
+    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
     BlockRows(pattern).add_diagonal(np.full(N_OWNED, 2.0), values)
     dense = expanded(pattern, values, N_LOCAL).reshape(3 * N_OWNED, 3 * N_LOCAL)
     return pattern, values, dense
@@ -123,11 +124,29 @@ def parts(dense: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return owned, upper
 
 
+def sweeps_of(pattern: BlockPattern, values: np.ndarray) -> SweepsWithEdges:
+    """Of block rows that are, as in a run, where the copy will be, in memory that something else had."""
+    memory = np.full(max(sum(room(pattern)), values.size), np.nan)
+    rows = memory[: values.size].reshape(-1, 9)
+    rows[:] = values.reshape(-1, 9)
+    sweeps = SweepsWithEdges(pattern, couplings_of(pattern), memory)
+    sweeps.invert(rows)
+    sweeps.store(rows)
+    return sweeps
+
+
+def test_rows_are_copied_into_their_own_place() -> None:
+    _, values, _ = mixed_rows()
+    memory = values.reshape(-1, 9).copy()
+    copy = memory.reshape(-1).view(np.float32)[: values.size].reshape(-1, 9)
+    store(memory, 0.0, copy)
+    np.testing.assert_array_equal(copy, values.reshape(-1, 9).astype(np.float32))
+
+
 def test_a_sweep_before_and_one_after() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     owned, upper = parts(dense)
-    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
-    sweeps.set(values.reshape(-1, 9))
+    sweeps = sweeps_of(pattern, values)
 
     def residual() -> np.ndarray:
         return np.concatenate([sweeps.r[:N_VERTICES, :3], sweeps.of_edges[N_VERTICES:N_OWNED]]).ravel()
@@ -172,8 +191,7 @@ def test_more_sweeps_over_the_vertices() -> None:
     pattern, values, dense = mixed_rows(definite=True)
     owned, upper = parts(dense)
     n = 3 * N_VERTICES
-    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
-    sweeps.set(values.reshape(-1, 9))
+    sweeps = sweeps_of(pattern, values)
     b = RNG.normal(size=(N_LOCAL, 3)).astype(np.float32)
     right, x = b[:N_OWNED].astype(float).ravel(), np.zeros((N_LOCAL, 3), dtype=np.float32)
     sweeps.begin(b)
@@ -211,8 +229,7 @@ def test_what_is_inverted_of_edges_is_their_diagonal() -> None:
 
 def test_increased_diagonals_and_what_is_added_reach_their_rows() -> None:
     pattern, values, _ = mixed_rows(definite=True)
-    sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
-    sweeps.set(values.reshape(-1, 9))
+    sweeps = sweeps_of(pattern, values)
     b = np.zeros((N_LOCAL, 3), dtype=np.float32)
     last = N_OWNED - 1  # nothing but ghosts comes after it
     b[last] = 1.0
@@ -250,8 +267,7 @@ def test_negligible_entries_are_none() -> None:
     for part in (0.0, 1e-14):
         rows.set_diagonal(np.ones(N_OWNED), sums := rows.zeros())
         sums += part * values
-        sweeps = SweepsWithEdges(pattern, couplings_of(pattern))
-        sweeps.set(sums.reshape(-1, 9))
+        sweeps = sweeps_of(pattern, sums)
         sweeps.begin(x)
         sweeps.backward(y := np.zeros_like(x))
         found.append(y)

@@ -168,6 +168,18 @@ def test_sweeps_over_the_vertices_where_edges_carry_unknowns(
         assert "  3 of each" in capfd.readouterr().out
 
 
+@pytest.mark.parametrize(("bending", "sweeps"), [(1.0, 1), (5e3, 2)])
+def test_the_stiffer_bending_the_more_sweeps(
+    comm: MPI.Comm, capfd: pytest.CaptureFixture[str], bending: float, sweeps: int
+) -> None:
+    content = hanging(12)
+    content["material"] |= {"bending_model": "midedge", "bending_scale": bending}
+    stepped(comm, content, 1, "python", ksp_view="")
+    if comm.rank == 0:
+        said = capfd.readouterr().out
+        assert [number for number in (2, 3) if f"  {number} of each" in said] == [sweeps] * (sweeps > 1)
+
+
 def test_another_python_preconditioner_is_left_alone(comm: MPI.Comm) -> None:
     own = {"pc_python_type": f"{__name__}.Scaling"}
     x, counts = stepped(comm, hanging(8), 2, "python", **own)

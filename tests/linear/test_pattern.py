@@ -164,11 +164,11 @@ def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
     rng = np.random.default_rng(8)
     vertices = np.array([[0, 1, 2], [5, 3, 1], [4, 2, 0]], dtype=np.int32)
     edges = np.array([[18, 19], [23, 20], [21, 19]], dtype=np.int64)  # two of one row, and of different ones
-    pattern = BlockPattern({"mixed": WithEdges(vertices, edges)}, n_owned, 8)
+    pattern = BlockPattern({"corners": vertices, "mixed": WithEdges(vertices, edges)}, n_owned, 8)
     blocks = rng.random((3, 11, 11))
     blocks += blocks.transpose(0, 2, 1)
     weight, values = rng.random(3), np.zeros((pattern.n_stored, 3, 3))
-    add_mixed_elements(weight, blocks, 3, pattern.offsets["mixed"], values)
+    add_mixed_elements(weight, blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
     expected = np.zeros((24, 24))
     for e in range(3):
         places = np.concatenate([(3 * vertices[e][:, None] + np.arange(3)).ravel(), edges[e]])

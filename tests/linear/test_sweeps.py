@@ -140,7 +140,8 @@ def test_more_sweeps_before() -> None:
     couplings = [(row, k) for row in range(N) for k in range(indptr[row], indptr[row + 1])]
     keys = np.array([row * (N + GHOSTS) + columns[k] for row, k in couplings])
     sweep = sweeps.BlockSweeps(BlockPattern.of_keys(keys, N, N + GHOSTS))
-    sweep.set(blocks.reshape(-1, 9))
+    sweep.invert(blocks.reshape(-1, 9))
+    sweep.store(blocks.reshape(-1, 9))
     b = np.random.default_rng(6).standard_normal((N, 3)).astype(np.float32)
     x = np.zeros((N + GHOSTS, 3), dtype=np.float32)
     sweep.begin(b)

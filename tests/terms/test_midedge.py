@@ -417,6 +417,18 @@ def test_a_fold_of_nearly_180_degrees_is_refused(tmp_path: Path) -> None:
         Run(MPI.COMM_SELF, content)
 
 
+def test_curvature_that_no_edge_can_turn_is_refused() -> None:
+    """Of cells of 0.1 m a triangle has the tangent κ / 20 m, which is 1 + 3π/2 at 180°."""
+    sheet = {"mesh": {"grid": {"width": 0.5, "height": 0.2, "nx": 5, "ny": 2}}}
+    material = STIFF | {"bending_model": "midedge"}
+    with Simulation(sheet | {"material": material | {"rest_curvature": [114.0, 0.0, 0.0]}}, MPI.COMM_SELF):
+        pass
+    content = scene_of(sheet | {"material": material | {"rest_curvature": [115.0, 0.0, 0.0]}})
+    with pytest.raises(InputError, match=r"by more than 180° .* finer by 1, or less") as caught:
+        Run(MPI.COMM_SELF, content)
+    assert caught.value.key == "material[0].rest_curvature"
+
+
 @pytest.mark.parametrize("n", [8, 24])
 def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
     """A quarter of a cylinder of radius 1 and thickness 0.01, √(t R) = 0.1."""
