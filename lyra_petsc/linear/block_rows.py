@@ -100,6 +100,8 @@ class BlockRows:
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
         """Add weight × Hessians of an elastic term at positions x (n_local, 3)."""
+        if not term.n_elements:
+            return
         weights = np.full(term.n_elements, weight) if isinstance(weight, float) else weight
         weights = np.require(weights, requirements=("C", "W"))  # as kernels are compiled for
         term.add_hessian(x, frozen, blend, weights, self.pattern.offsets, values, predicted)

@@ -14,7 +14,6 @@ import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.kernels.cache import Index, cached
@@ -52,6 +51,20 @@ def _leaves(x, start, end, reach):  # type: ignore[no-untyped-def]
         s |= _far(x, start, i, square)
         e |= _far(x, end, i, square)
     return s != 0, e != 0
+
+
+@cached()
+def _leaves_on(x, way, start, end, reach):  # type: ignore[no-untyped-def]
+    """Whether some of x are farther than ``reach`` from start, and from end; and x + way from end."""
+    square, s, e, then = reach * reach, 0, 0, 0
+    for row in range(len(x)):
+        i = Index(row)
+        s |= _far(x, start, i, square)
+        e |= _far(x, end, i, square)
+        a, b, c = x[i, 0] + way[i, 0], x[i, 1] + way[i, 1], x[i, 2] + way[i, 2]
+        a, b, c = a - end[i, 0], b - end[i, 1], c - end[i, 2]
+        then |= 0 if a * a + b * b + c * c <= square else 1
+    return s != 0, e != 0, then != 0
 
 
 @cached()
@@ -113,6 +126,8 @@ class Discretisation:
         self._located: set[str] = set()  # terms of whose present stencils the pattern has the offsets
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
+        self._reach = 0.0  # how far from it points may be [m]
+        self._triangles: dict[Elastic, Ints] = {}  # where a rank has them all
         self._found: dict[Elastic, tuple[Ints, Ints | Array]] = {}
         self._extra = np.empty(0, dtype=np.int64)  # keys of the blocks that ``fixed`` has not
 
@@ -133,22 +148,28 @@ class Discretisation:
         asked = self._renewed(here, to)
         if not asked:
             return False
-        comm, layout = self.layout.comm, self.layout
+        layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
             self._way = here.copy(), to.copy()
+            self._reach = 0.5 * min(term.skin for term in self._searching)
         way = np.zeros_like(x) if ahead is None else ahead
         for term in asked:
             searches = term.search_distance > 0.0
             self._found[term] = self._search(term, x, way) if searches else self._sent(*term.known())
-        end = layout.start + layout.n_owned
-        beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil, _ in self._found.values()]
-        more = np.setdiff1d(np.concatenate(beyond), self._fixed_layout.ghosts)
-        present = layout.ghosts[len(self._fixed_layout.ghosts) :]
-        others = bool(comm.allreduce(int(not np.isin(more, present).all()), MPI.MAX))
+        more, fixed = layout.ghosts[:0], self._fixed_layout.ghosts
+        if any(len(stencil) for stencil, _ in self._found.values()):
+            end = layout.start + layout.n_owned
+            stencils = [stencil for stencil, _ in self._found.values()]
+            beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil in stencils]
+            more = np.setdiff1d(np.concatenate(beyond), fixed)
+        lacking = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
+        others = any(layout.largest(lacking))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()
             self.layout = layout = self._fixed_layout.with_ghosts(more)
+        else:  # where nothing is near and nothing was, nothing is new
+            asked = [term for term, n in zip(asked, had, strict=True) if n or len(self._found[term][0])]
         for term in self._changing if others else asked:
             elements = self._elements(*self._found[term])
             if others or not np.array_equal(elements.stencil, term.stencil):
@@ -161,30 +182,22 @@ class Discretisation:
 
         If any that search, then all that do, and they come first.
         """
-        flags = [True, True, True]
+        flags = True, True, True
         if self._way is not None:
-            reach = 0.5 * min([term.skin for term in self._searching], default=np.inf)
             # all are at one and the same part of the way that was searched
-            from_start, from_end, along, back = self._from_way(here, to, reach)
-            flags = [from_start or along, from_end or back, from_start or from_end]
-        stale = [term.stale for term in self._changing]
-        found = np.array([*flags, *stale], dtype=np.int64)
-        self.layout.comm.Allreduce(MPI.IN_PLACE, found, MPI.MAX)
-        searches = bool(self._searching) and bool(found[:3].all())
-        told = [term for term, new in zip(self._changing, found[3:], strict=True) if new]
-        searches |= any(term in self._searching for term in told)
+            start, end = _leaves(here, *self._way, self._reach)
+            along, back = (start, end) if to is here else _leaves(to, *self._way, self._reach)
+            flags = start or along, end or back, start or back
+        left, right, apart, *told = self.layout.largest(*flags, *(term.stale for term in self._changing))
+        leaves = bool(left and right and apart)
+        if self._found and not leaves and not any(told):
+            return []
+        searches = leaves and bool(self._searching)
+        new = [term for term, stale in zip(self._changing, told, strict=True) if stale]
         if not self._found:
-            return [*self._searching, *(term for term in self._changing if term not in self._searching)]
-        return [*(self._searching if searches else []), *(t for t in told if t not in self._searching)]
-
-    def _from_way(self, x: Array, to: Array, reach: float) -> tuple[bool, bool, bool, bool]:
-        """Whether points of this rank on a way from x to ``to`` are farther than ``reach`` [m] from the
-        way that was searched: x from its start, ``to`` from its end, ``to`` from its start, x from its end.
-        """
-        assert self._way is not None
-        start, back = _leaves(x, *self._way, reach)
-        along, end = (start, back) if x is to else _leaves(to, *self._way, reach)
-        return start, end, along, back
+            searches, new = True, self._changing
+        searches |= any(term in self._searching for term in new)
+        return [*(self._searching if searches else []), *(t for t in new if t not in self._searching)]
 
     @property
     def guards(self) -> bool:
@@ -201,30 +214,31 @@ class Discretisation:
         reach = 0.5 * min(term.unseen for term in self._searching)
         x, way = x[:n], way[:n]
         start, end = self._way
-        from_start, from_end, _, back = self._from_way(x, x + way, reach)
-        flags = np.array([from_start, back, from_start or from_end], dtype=np.int64)
-        self.layout.comm.Allreduce(MPI.IN_PLACE, flags, MPI.MAX)
-        *left, apart = flags
+        from_start, back, from_end = _leaves_on(x, way, start, end, reach)
+        *left, apart = self.layout.largest(from_start, back, from_start or from_end)
         if not apart:
             return 1.0
         # near both ends of a short way there may be no room left at the one, and all at the other
         places = zip(left, (start, end), strict=True)
-        parts = np.array([0.0 if gone else _free_part(x, way, place, reach) for gone, place in places])
-        self.layout.comm.Allreduce(MPI.IN_PLACE, parts, MPI.MIN)
-        return float(parts.max())
+        less = self.layout.largest(
+            *(-_free_part(x, way, at, reach) if not gone else 0.0 for gone, at in places)
+        )
+        return -min(less)
 
     def _search(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints]:
         """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on
         their ways (n_local, 3); collective.
         """
         layout, n = self.layout, self.layout.n_vertices
-        own, moves = layout.start + np.arange(n), np.stack([x, way], axis=1)
-        triangles = np.empty((0, 3), dtype=np.int64)
+        own = layout.start + np.arange(n)
+        if layout.comm.size == 1 and term.surface is not None:
+            if term not in self._triangles:
+                self._triangles[term] = _marked(term.surface.astype(np.int64), term)
+            return term.neighbours(x[:n], way[:n], own, self._triangles[term])
+        triangles, moves = np.empty((0, 3), dtype=np.int64), np.stack([x, way], axis=1)
         if term.surface is None:
             numbers, moves = self._with_near(own, moves[:n, None], term.search_distance, own >= 0)
             moves = moves[:, 0]
-        elif layout.comm.size == 1:
-            numbers, moves, triangles = own, moves[:n], _marked(term.surface.astype(np.int64), term)
         else:
             corners, places = _marked(layout.global_number[term.surface], term), moves[term.surface]
             mine = term.surface[:, 0] < layout.n_owned  # each triangle is sent once
@@ -322,8 +336,9 @@ class Discretisation:
         if fits:
             pattern.locate({name: stencil for name, stencil in stencils.items() if name not in self._located})
             self._located = set(stencils)
-            fits = not any(pattern.lacks(term.name, acting[term]) for term in self._changing)
-        if not self.layout.comm.allreduce(int(not fits), MPI.MAX):
+            acts = [term for term in self._changing if term.n_elements]
+            fits = not any(pattern.lacks(term.name, acting[term]) for term in acts)
+        if not any(self.layout.largest(not fits)):
             return False
         # with those of elements that do not act yet: some soon will
         soon = self.fixed.pattern.missing(stencils.values(), n_local)

@@ -73,9 +73,10 @@ class Flat(NamedTuple):
         The triangles patch by patch, and where those of each patch begin.
     inverse : (F, 2, 2)
         Of each triangle the inverse of the sides that leave its first corner, in the material plane [1/m].
+    beside : (k, 2)
+        Patches next to each other, or the same: the smaller first, in ascending order.
     pairs : (m, 2)
-        Patches next to each other, or the same, which a convex part holds: the smaller first, in ascending
-        order.
+        Those of them which a convex part holds.
     around, height : (m + 1,), (m,)
         Where the patches that this part reaches begin in ``reached``, and the smallest altitude [m] in them.
     reached : (k,)
@@ -84,6 +85,7 @@ class Flat(NamedTuple):
     order: Ints
     first: Ints
     inverse: Array
+    beside: Ints
     pairs: Ints
     around: Ints
     height: Array
@@ -137,7 +139,7 @@ def flat(triangles: Ints, uv: Array, patch: Ints) -> Flat:
     inside = _runs_through(*segments, *(part[crossed[:, 0], :2] for part in parts))
     kept = np.ones(len(pairs), dtype=np.bool_)
     kept[crossed[inside, 0]] = False
-    parts, pairs = (parts[0][kept], parts[1][kept]), pairs[kept]
+    beside, parts, pairs = pairs, (parts[0][kept], parts[1][kept]), pairs[kept]
     met = near(parts, boxes)
     met = met[np.lexsort(met.T[::-1])]
     around = np.searchsorted(met[:, 0], np.arange(len(pairs) + 1))
@@ -147,7 +149,8 @@ def flat(triangles: Ints, uv: Array, patch: Ints) -> Flat:
     height = np.maximum(least, -most)  # below 0 unless the corners of all run alike
     some, sizes = np.asarray(height > 0.0), np.diff(around)
     around = np.append(0, np.cumsum(sizes[some]))
-    return Flat(order, first, inverse, pairs[some], around, height[some], met[np.repeat(some, sizes), 1])
+    reached = met[np.repeat(some, sizes), 1]
+    return Flat(order, first, inverse, beside, pairs[some], around, height[some], reached)
 
 
 def _with_others_beside(pairs: Ints, boxes: tuple[Array, Array], reach: float) -> tuple[Ints, Ints]:
@@ -215,32 +218,59 @@ def _singular(m):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def gradients(x, way, triangles, order, first, inverse, each, mean, spread, least):  # type: ignore[no-untyped-def]
+def _place(pairs, i, j):  # type: ignore[no-untyped-def]
+    """Where a pair stands among pairs (m, 2) in ascending order; −1 if it does not."""
+    lo, hi = 0, len(pairs)
+    while lo < hi:
+        at = (lo + hi) // 2
+        if pairs[at, 0] < i or (pairs[at, 0] == i and pairs[at, 1] < j):
+            lo = at + 1
+        else:
+            hi = at
+    return lo if lo < len(pairs) and pairs[lo, 0] == i and pairs[lo, 1] == j else -1
+
+
+@cached()
+def needed(met, pairs, around, reached, place, needs):  # type: ignore[no-untyped-def]
+    """Where pairs of patches met (n, 2) stand among ``pairs``, and which patches' gradients tell of them."""
+    for n in range(len(met)):
+        place[n] = _place(pairs, met[n, 0], met[n, 1])
+        if place[n] >= 0:
+            for at in range(around[place[n]], around[place[n] + 1]):
+                needs[reached[at]] = True
+
+
+@cached()
+def gradients(x, way, triangles, order, first, inverse, needs, mean, spread, least):  # type: ignore[no-untyped-def]
     """Q of each patch (P, 6), the mean deformation gradient, how far others are from it (P,), and σ(Q) (P,).
 
-    Of points x (N, 3) [m] before and after their ways (N, 3) [m]; ``each`` (2, F, 6) takes all gradients.
+    Of points x (N, 3) [m] before and after their ways (N, 3) [m], and of patches that are needed (P,).
     """
-    for at in range(len(order)):
-        a, b, c = triangles[order[at]]
-        inv = inverse[order[at]]
-        for end in range(2):
-            for k in range(3):
-                start = x[a, k] + end * way[a, k]
-                u, v = x[b, k] + end * way[b, k] - start, x[c, k] + end * way[c, k] - start
-                each[end, at, 2 * k] = u * inv[0, 0] + v * inv[1, 0]
-                each[end, at, 2 * k + 1] = u * inv[0, 1] + v * inv[1, 1]
+    each = np.empty((2, SIZE, 6))
     for p in range(len(spread)):
-        weight = 0.5 / (first[p + 1] - first[p])
+        if not needs[p]:
+            continue
+        size = first[p + 1] - first[p]
+        for at in range(size):
+            number = order[first[p] + at]
+            a, b, c = triangles[number]
+            inv = inverse[number]
+            for end in range(2):
+                for k in range(3):
+                    start = x[a, k] + end * way[a, k]
+                    u, v = x[b, k] + end * way[b, k] - start, x[c, k] + end * way[c, k] - start
+                    each[end, at, 2 * k] = u * inv[0, 0] + v * inv[1, 0]
+                    each[end, at, 2 * k + 1] = u * inv[0, 1] + v * inv[1, 1]
         for k in range(6):
             total = 0.0
-            for at in range(first[p], first[p + 1]):
+            for at in range(size):
                 total += each[0, at, k] + each[1, at, k]
-            mean[p, k] = weight * total
+            mean[p, k] = 0.5 / size * total
         q = mean[p, 0], mean[p, 1], mean[p, 2], mean[p, 3], mean[p, 4], mean[p, 5]
         least[p] = _singular(q)[1]
         most = 0.0
         for end in range(2):
-            for at in range(first[p], first[p + 1]):
+            for at in range(size):
                 f = each[end, at]
                 off = f[0] - q[0], f[1] - q[1], f[2] - q[2], f[3] - q[3], f[4] - q[4], f[5] - q[5]
                 square = 0.0  # of the Frobenius norm, which is no less than the other
@@ -255,38 +285,31 @@ def gradients(x, way, triangles, order, first, inverse, each, mean, spread, leas
 
 
 @cached()
-def distances_kept(met, reach, least_reach, pairs, around, height, reached, mean, spread, least, out):  # type: ignore[no-untyped-def]
-    """Distances (n,) [m] that simplices of pairs of patches met (n, 2), the smaller first, surely keep.
+def distances_kept(place, least_reach, around, height, reached, i, mean, spread, least, out):  # type: ignore[no-untyped-def]
+    """Distances (n,) [m] that simplices of pairs of patches, of which i (n,) are the first, surely keep.
 
-    Of simplices without a common vertex. Where it may be less than ``least_reach`` [m] it is 0, and ``reach``
-    [m] stands for any that are more. ``mean``, ``spread`` and ``least`` as `gradients` gives them.
+    Of simplices without a common vertex. Where it may be less than ``least_reach`` [m] it is 0. ``place`` as
+    of `needed`; ``mean``, ``spread`` and ``least`` as `gradients` gives them.
     """
-    for n in range(len(met)):
+    for n in range(len(place)):
         out[n] = 0.0
-        i, j = met[n]
-        lo, hi = 0, len(pairs)
-        while lo < hi:
-            at = (lo + hi) // 2
-            if pairs[at, 0] < i or (pairs[at, 0] == i and pairs[at, 1] < j):
-                lo = at + 1
-            else:
-                hi = at
-        if lo == len(pairs) or pairs[lo, 0] != i or pairs[lo, 1] != j:
+        lo = place[n]
+        if lo < 0:
             continue
-        q, most, enough = mean[i], least[i] - reach / height[lo], least[i] - least_reach / height[lo]
+        q, enough = mean[i[n]], least[i[n]] - least_reach / height[lo]
         worst = 0.0
         for at in range(around[lo], around[lo + 1]):
             f, near = mean[reached[at]], spread[reached[at]]
+            off = f[0] - q[0], f[1] - q[1], f[2] - q[2], f[3] - q[3], f[4] - q[4], f[5] - q[5]
             square = 0.0  # of the Frobenius norm, which is no less than the other
             for k in range(6):
-                square += (f[k] - q[k]) ** 2
-            if near <= most and square <= (most - near) ** 2:
+                square += off[k] * off[k]
+            if near <= worst and square <= (worst - near) ** 2:
                 continue
-            off = f[0] - q[0], f[1] - q[1], f[2] - q[2], f[3] - q[3], f[4] - q[4], f[5] - q[5]
             apart = near + _singular(off)[0]
             if not apart <= worst:  # or no number
                 worst = apart
             if not worst <= enough:
                 break
         if worst <= enough:
-            out[n] = reach if worst <= most else height[lo] * (least[i] - worst)
+            out[n] = height[lo] * (least[i[n]] - worst)

@@ -109,6 +109,15 @@ class Points:
             self.comm.Allreduce(MPI.IN_PLACE, sums)
         return sums
 
+    def largest(self, *numbers: float) -> list[float]:
+        """The largest of all ranks' each of the numbers; collective."""
+        if self.comm.size == 1:
+            return list(numbers)
+        most = np.array(numbers, dtype=np.float64)
+        self.comm.Allreduce(MPI.IN_PLACE, most, MPI.MAX)
+        found: list[float] = most.tolist()
+        return found
+
     def destroy(self) -> None:
         """Free the communication objects; collective."""
         self._forest.destroy()

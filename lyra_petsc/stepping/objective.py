@@ -59,6 +59,8 @@ class Objective:
         change = v - of.history
         parts, square = [0.5 * sigma * float(np.sum(of.mass[:, None] * change * change))], 0.0
         for term in of.active.elastic:
+            if not term.n_elements:
+                continue
             each = term.energies(x, of.active.frozen[term])
             parts.append(rate * float(each.sum()))
             stiffness = self.stiffnesses.get(term)

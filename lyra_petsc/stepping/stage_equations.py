@@ -210,8 +210,9 @@ class StageEquations:
         ahead = self._expected() if self.discretisation.guards else None
         self._follow(self.x, ahead)
         self._freeze(t0 + after)
-        ahead = None if ahead is None else self._expected()  # with the ghosts that there are now
-        self._follow(self.x, ahead)  # obstacles may have come near
+        if self.active.pushing:  # obstacles may have come near
+            ahead = None if ahead is None else self._expected()  # with the ghosts that there are now
+            self._follow(self.x, ahead)
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
@@ -481,7 +482,8 @@ class StageEquations:
         turn = 0.0 if self.integrator.moves else self._farthest_turn(way * self.stage.reach)
         most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
         for _ in range(SEARCHES):
-            x, ahead = self._ahead(v + gone * way, (most - gone) * way)
+            whole = gone == 0.0 and most == 1.0  # mostly
+            x, ahead = self._ahead(v, way) if whole else self._ahead(v + gone * way, (most - gone) * way)
             seen = fraction = self.discretisation.largest_step(x, ahead)
             if seen < FEW:
                 x, ahead = self._look(v + gone * way, (most - gone) * way)
@@ -535,7 +537,7 @@ class StageEquations:
 
     def _least_of(self, number: float) -> float:
         """The least of all ranks; collective."""
-        return float(self.points.comm.allreduce(number, MPI.MIN))
+        return -self.points.largest(-number)[0]
 
     def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
@@ -706,7 +708,7 @@ class StageEquations:
         acting = {term: term.acting(x, frozen.get(term)) for term in self.active.near}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
-            self.touches = bool(self.points.comm.allreduce(number, MPI.MAX))
+            self.touches = any(self.points.largest(number))
         return self.discretisation.renew_pattern(acting)
 
     def new_iterate(self, v: Array | None) -> None:

@@ -140,6 +140,8 @@ class Obstacles:
         Planes are a point and a normal.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
+    moving : bool
+        Whether any of them does.
     smooth_points : (n,) bool
         Of all points: those at which triangles make no sharp edge.
     smooth_edges : (m,) int64
@@ -152,10 +154,11 @@ class Obstacles:
         parts: dict[str, list[Ints]] = {
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
         }
-        radius, first = np.zeros(len(obstacles) + 1), 0
+        radius, first, begins = np.zeros(len(obstacles) + 1), 0, []
         smooth_points, smooth_edges = [np.empty(0, dtype=np.bool_)], [np.empty((0, 2), dtype=np.int64)]
         for number, obstacle in enumerate(obstacles):
             n = len(obstacle.points)
+            begins.append(first)
 
             def rows(of: Ints, number: int = number, first: int = first) -> Ints:
                 filled = np.concatenate([of, np.repeat(of[:, :1], 3 - of.shape[1], axis=1)], axis=1)
@@ -190,6 +193,9 @@ class Obstacles:
             np.concatenate([empty, *part]).astype(np.int64) for part in parts.values()
         )
         self.radius, self.n_points = radius, first
+        self.moving = any(obstacle.motion is not None for obstacle in obstacles)
+        self._first = np.array(begins, dtype=np.int64)
+        self._stays = [(np.eye(3), np.zeros(3))] * len(obstacles)
 
     def at(self, time: float) -> Array:
         """Points and normals (m, 3) at a time [s]."""
@@ -199,6 +205,12 @@ class Obstacles:
             if isinstance(obstacle, Container) and obstacle.kind == "planes":
                 rows.append(obstacle.normals_at(time))
         return np.concatenate(rows)
+
+    def extents(self, places: Array) -> tuple[Array, Array]:
+        """Low and high corners (obstacles, 3) [m] of what is at places (k, m, 3) [m]."""
+        return np.minimum.reduceat(places.min(axis=0), self._first), np.maximum.reduceat(
+            places.max(axis=0), self._first
+        )
 
     def bulges(self, start: float, end: float) -> Array:
         """How far [m] points of each leave their straight ways between two times [s], (obstacles,)."""
@@ -216,6 +228,8 @@ class Obstacles:
 
     def moved(self, start: float, end: float) -> list[tuple[Array, Array]]:
         """Rotation (3, 3) and translation (3,) [m] of each from one time [s] to another."""
+        if not self.moving:
+            return self._stays
         found = []
         for each in self.each:
             (turn, way), (later, there) = each.displacement(start), each.displacement(end)
@@ -246,7 +260,9 @@ class ContactBarrier(Elastic):
         self.surface_marks = rings
         self._room = 0
         self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
+        self._extents: tuple[Array, Array] | None = None  # of obstacles in ``_places``
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
+        self._taken: Ints | None = None  # triangles that the search has
         self._meeting = Remembered(self._meet)
 
     def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
@@ -260,7 +276,7 @@ class ContactBarrier(Elastic):
         self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
         self._places = self._swept = np.stack([self.obstacles.at(0.0)] * 3)
         self.stale = False
-        self._bulge = np.zeros(1)
+        self._bulge, self._extents = np.zeros(1), None
 
     def take(self, elements: Elements) -> None:
         super().take(elements)
@@ -291,28 +307,40 @@ class ContactBarrier(Elastic):
     # -- obstacles ---------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> Places:
+        if not self.moving:
+            before, now, after = self._places
+            return Places(before, now, after, self.obstacles.moved(step.start, step.at))
         before, now, after = (self.obstacles.at(time) for time in (step.start, step.at, step.end))
         self._swept = np.stack([before, now, after])
         moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
         self.stale = bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
-        self._bulge = self.obstacles.bulges(step.start, step.end) if self.moving else np.zeros(1)
+        self._bulge = self.obstacles.bulges(step.start, step.end)
         return Places(before, now, after, self.obstacles.moved(step.start, step.at))
 
     @property
     def moving(self) -> bool:
-        return any(obstacle.motion is not None for obstacle in self.obstacles.each)
+        return self.obstacles.moving
 
     # -- search ------------------------------------------------------------------------------------
 
     def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
-        self._places, self.stale = self._swept, False
-        self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
-        found = [np.empty((0, 7), dtype=np.int64), *self._at_obstacles(x, way)]
+        if self.moving:
+            self._places, self._extents = self._swept, None
+        self.stale = False
+        if triangles is not self._taken:
+            self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
+            self._taken = triangles
+        boxes = self._sheets.boxes(x, way)
+        found = [np.empty((0, 7), dtype=np.int64)]
+        if self.obstacles.each:
+            found += self._at_obstacles(x, way, boxes)
         if self.itself:
             reach = self.search_distance
             edges = reach - (1.0 - EDGES) * self.barrier.gap
-            found.append(self._sheets.pairs(x, way, numbers, reach, edges))
+            found.append(self._sheets.pairs(x, way, numbers, reach, edges, boxes))
         every = np.concatenate(found)
+        if not len(every):
+            return every[:, :4], every
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]
         sheet = points >= 0
         first = points[np.arange(len(points)), sheet.argmax(axis=1)]
@@ -331,17 +359,33 @@ class ContactBarrier(Elastic):
         nearer: Ints = np.column_stack([kinds, obstacle, points, rings])[found < reach]
         return nearer
 
-    def _at_obstacles(self, x: Array, way: Array) -> list[Ints]:
-        """Pairs with obstacles, wherever on their way in the step these are near."""
-        of, sheets, found = self.obstacles, self._sheets, []
-        patches = sheets.boxes(x, way)
+    def _at_obstacles(self, x: Array, way: Array, boxes: Array) -> list[Ints]:
+        """Pairs with obstacles, wherever on their way in the step these are near patches in ``boxes``."""
+        of, sheets = self.obstacles, self._sheets
+        patches = np.minimum(boxes[0], boxes[2]), np.maximum(boxes[1], boxes[3])
+        if not len(patches[0]):
+            return []
+        low, high = patches[0].min(axis=0), patches[1].max(axis=0)
+        reach = self.search_distance + self._bulge.max()
+        places = self._places if self.moving else self._places[:1]
+        found = self._in_containers(x, way, patches, places, reach)
+        if self._extents is None:
+            self._extents = of.extents(places)
+        around = (reach + of.radius[:-1])[:, None]
+        least, most = self._extents
+        near_by = ((least - around <= high) & (most + around >= low)).all(axis=1)
+        if not near_by.any():
+            return found
 
         def meet(kind: int, sheet: Simplices, others: Ints, size: int, *, sheet_first: bool) -> None:
+            others = others[near_by[others[:, 3]]]
             if not len(others):
                 return
-            places = self._places[:, others[:, :size]]
-            reach = (self.search_distance + of.radius[others[:, 3]] + self._bulge.max())[:, None]
-            boxes = places.min(axis=(0, 2)) - reach, places.max(axis=(0, 2)) + reach
+            at = places[:, others[:, :size]]
+            around = (reach + of.radius[others[:, 3]])[:, None]
+            boxes = at.min(axis=(0, 2)) - around, at.max(axis=(0, 2)) + around
+            some = ((boxes[0] <= high) & (boxes[1] >= low)).all(axis=1)
+            others, boxes = others[some], (boxes[0][some], boxes[1][some])
             met = near(patches, boxes)
             if not len(met):
                 return
@@ -355,21 +399,48 @@ class ContactBarrier(Elastic):
         meet(VERTEX_TRIANGLE, sheets.vertices, of.triangles, 3, sheet_first=True)
         meet(VERTEX_TRIANGLE, sheets.triangles, of.points, 1, sheet_first=False)
         meet(EDGE_EDGE, sheets.edges, of.edges, 2, sheet_first=True)
-        single = sheets.vertices.corners[:, 0]
-        for kind, others in ((VERTEX_PLANE, of.planes), (VERTEX_INSIDE, of.segments)):
-            for one in others:
-                points = np.column_stack([single, np.tile(~one[:3], (len(single), 1))])
-                obstacle = np.full(len(points), one[3])
-                kinds = np.full(len(points), kind)
-                rows = np.column_stack([kinds, obstacle, points, np.zeros(len(points), dtype=np.int64)])
-                close = np.zeros(len(points), dtype=bool)
-                for at in (x, x + way):  # along straight ways these distances are least at an end
-                    for places in self._places:
-                        distance = np.empty(len(points))
-                        contact_pairs.distances(at, places, rows[:, 0], rows[:, 2:6], distance)
-                        close |= distance - of.radius[obstacle] < self.search_distance + self._bulge.max()
-                found.append(rows[close])
         return found
+
+    def _in_containers(
+        self, x: Array, way: Array, patches: tuple[Array, Array], places: Array, reach: float
+    ) -> list[Ints]:
+        """Pairs of vertices with planes, and of vertices inside with segments."""
+        found = []
+        for kind, others in ((VERTEX_PLANE, self.obstacles.planes), (VERTEX_INSIDE, self.obstacles.segments)):
+            if not len(others):
+                continue
+            low, high = patches[0].min(axis=0, keepdims=True), patches[1].max(axis=0, keepdims=True)
+            # distances differ no more than points are apart
+            for least, most in ((low, high), patches):
+                half = 0.5 * np.linalg.norm(most - least, axis=1)
+                close = self._close(0.5 * (least + most), kind, others, places, reach + half)
+                others = others[close.any(axis=0)]
+                if not len(others):
+                    break
+            else:
+                single = self._sheets.vertices.of(np.flatnonzero(close.any(axis=1)))[:, 0]
+                close = np.zeros((len(single), len(others)), dtype=np.bool_)
+                for at in (x, x + way):  # along straight ways these distances are least at an end
+                    close |= self._close(at[single], kind, others, places, reach)
+                number, plane = np.nonzero(close)
+                points = np.column_stack([single[number], ~others[plane, :3]])
+                rest = np.zeros(len(points), dtype=np.int64)
+                found.append(np.column_stack([rest + kind, others[plane, 3], points, rest]))
+        return found
+
+    def _close(
+        self, points: Array, kind: int, others: Ints, places: Array, reach: float | Array
+    ) -> NDArray[np.bool_]:
+        """Which of points (n, 3) [m] are within reach [m] of planes or segments (m, 5), (n, m)."""
+        n, m = len(points), len(others)
+        pairs = np.column_stack([np.repeat(np.arange(n), m), np.tile(~others[:, :3], (n, 1))])
+        kinds, out, least = np.full(n * m, kind), np.empty(n * m), np.full((n, m), np.inf)
+        for at in places:
+            contact_pairs.distances(points, at, kinds, pairs, out)
+            least = np.minimum(least, out.reshape(n, m))
+        least -= self.obstacles.radius[others[:, 3]]
+        close: NDArray[np.bool_] = least < np.reshape(reach, (-1, 1))
+        return close
 
     # -- energy ------------------------------------------------------------------------------------
 
@@ -398,6 +469,8 @@ class ContactBarrier(Elastic):
         return self.kind, self.points, self.offset, self.gap, self.barrier.stiffness, self.barrier.parallel
 
     def energies(self, x: Array, frozen: Places) -> Array:
+        if not self.n_elements:
+            return _NONE
         met = self.meeting(x, frozen.now)
         counts = met.counted != 0.0  # these are among the owned pairs, as they come first
         energies = (met.counted * met.energy)[counts]
@@ -405,13 +478,16 @@ class ContactBarrier(Elastic):
         return out
 
     def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
+        if not self.n_elements:
+            return
         met, pull = self.meeting(x, frozen.now), np.zeros_like(frozen.now)
         given = met.at, met.weight, met.beta, met.felt
         contact_pairs.add_gradient(x, frozen.now, *self._of_pairs, given, out, pull)
 
     def acting(self, x: Array, frozen: Places) -> NDArray[np.bool_]:
         out = np.zeros(self.n_elements, dtype=np.bool_)
-        out[self.meeting(x, frozen.now).at] = True
+        if self.n_elements:
+            out[self.meeting(x, frozen.now).at] = True
         return out
 
     def add_hessian(

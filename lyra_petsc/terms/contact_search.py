@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.mesh import patches
-from lyra_petsc.mesh.near import near
+from lyra_petsc.mesh.near import near_in_order
 from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.terms.contact_margins import Margins
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distance, speed
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+SPARE = 0.7
+"""Over the reach, how much farther simplices of neighbouring patches are looked for: as long as they do not
+come nearer by that, they need not be looked for again."""
 
 
 class Simplices:
@@ -55,6 +60,13 @@ class SheetSearch:
         patch = np.unique(patches.connected(surface, patch), return_inverse=True)[1].astype(np.int64)
         self._patch, self._flat = patch, patches.flat(surface, uv, patch)
         self._n = len(self._flat.first) - 1
+        # the vertices of each patch once, as places among the corners of all triangles
+        at = np.column_stack([np.repeat(patch, 3), surface.ravel()])
+        found, corner = np.unique(at, axis=0, return_index=True)
+        self._corners, self._n_own = corner, len(corner)
+        self._own_first = np.searchsorted(found[:, 0], np.arange(self._n + 1))
+        self._margins = Margins(self._flat.beside, self._own_first)
+        self._alone = np.repeat(np.arange(self._n)[:, None], 2, axis=1)
         self._given: Ints | None = None
         self._room = 1024
 
@@ -71,6 +83,11 @@ class SheetSearch:
         patch = np.concatenate([self._patch, self._n + more])
         n = self._n + int(more.max(initial=-1)) + 1
         self.triangles = Simplices(triangles, patch, n)
+        theirs = self.triangles.first[self._n :]
+        self._vertices = np.concatenate(
+            [triangles.ravel()[self._corners], self.triangles.corners[theirs[0] :].ravel()]
+        )
+        self._first = np.concatenate([self._own_first, self._n_own + 3 * (theirs[1:] - theirs[0])])
         self._rings = (
             np.zeros(len(triangles), dtype=np.int64) if rings is None else rings[self.triangles.order]
         )
@@ -85,28 +102,47 @@ class SheetSearch:
         least = np.minimum.reduceat(patch[table.sides // 3], table.first) if len(edges) else patch[:0]
         self.edges = Simplices(edges, least, n)
 
-    def boxes(self, x: Array, way: Array) -> tuple[Array, Array]:
-        """Low and high corners (P, 3) [m] of what patches pass on their ways (N, 3) [m]."""
-        low, high = np.empty((2, len(self.triangles.first) - 1, 3))
-        _boxes(x, way, self.triangles.corners, self.triangles.first, low, high)
-        return low, high
+    def boxes(self, x: Array, way: Array) -> Array:
+        """Low and high corners (4, P, 3) [m] of patches at the start and the end of their ways (N, 3) [m]."""
+        out = np.empty((4, len(self._first) - 1, 3))
+        _boxes(x, way, self._vertices, self._first, out)
+        return out
 
-    def pairs(self, x: Array, way: Array, numbers: Ints, reach: float, edges: float | None = None) -> Ints:
+    def pairs(
+        self,
+        x: Array,
+        way: Array,
+        numbers: Ints,
+        reach: float,
+        edges: float | None = None,
+        boxes: Array | None = None,
+    ) -> Ints:
         """Rows (m, 7) of pairs that may come within ``reach`` [m] on their ways: kind, −1, vertices, and what
         is around the triangle.
 
-        Two edges within ``edges`` [m], not more than ``reach``.
+        Two edges within ``edges`` [m], not more than ``reach``. ``boxes`` are those of `boxes`.
         """
-        way = way - way.mean(axis=0)  # what all of them go together brings none nearer
-        met = near(self.boxes(x, way), reach=reach)
-        n = len(self.triangles.first) - 1
-        met = np.concatenate([np.repeat(np.arange(n)[:, None], 2, axis=1), met])
         reaches = reach, reach if edges is None else edges
-        kept = self.kept(x, way, met, *reaches)
-        some = kept < reach
-        met, kept = met[some], kept[some]
+        if len(self._first) == 1:
+            return np.empty((0, 7), dtype=np.int64)
+        low, high, low_then, high_then = self.boxes(x, way) if boxes is None else boxes
+        # what all of them go together brings none nearer
+        drift = (low_then + high_then - low - high).mean(axis=0) * 0.5
+        swept = np.minimum(low, low_then - drift), np.maximum(high, high_then - drift)
+        met = np.concatenate([self._alone, near_in_order(*swept, reach)])
+        lasting = self._margins.spend(x, way, self._vertices[: self._n_own])
+        met, row, known = self._margins.among(met, lasting, *reaches)
         if not len(met):
             return np.empty((0, 7), dtype=np.int64)
+        if np.count_nonzero(row >= 0) > self._n:  # to look at gradients takes less time than at simplices
+            known = np.maximum(known, self.kept(x, way, met, reaches[1])[:, None])
+            self._margins.learn(row, known)
+        some = (known < reaches).any(axis=1)
+        met, row, known = met[some], row[some], known[some]
+        if not len(met):
+            return np.empty((0, 7), dtype=np.int64)
+        more = np.where(row >= 0, SPARE * reach, 0.0)
+        n = len(self._first) - 1
         mean, whole = np.empty((n, 3)), np.empty((n, 7))
         asked = np.zeros(n, dtype=np.bool_)
         asked[met] = True
@@ -117,37 +153,40 @@ class SheetSearch:
             _around(x, way, of.corners, of.first, asked, mean, around, whole)  # last of triangles, all of it
             given.append((of.corners, of.first, around))
         while True:
-            out = np.empty((self._room, 7), dtype=np.int64)
-            most = 3 * patches.SIZE
-            found = _pairs(x, way, met, kept, mean, whole, *given, numbers, *reaches, most, self._rings, out)
+            out, apart = np.empty((self._room, 7), dtype=np.int64), known.copy()
+            between = met, known, more, apart, mean, whole
+            found = _pairs(x, way, *between, *given, numbers, *reaches, 3 * patches.SIZE, self._rings, out)
             if found <= self._room:
+                self._margins.learn(row, apart)
                 return out[:found]
             self._room = found + found // 4
 
-    def kept(self, x: Array, way: Array, met: Ints, reach: float, least: float) -> Array:
+    def kept(self, x: Array, way: Array, met: Ints, least: float) -> Array:
         """Distances (n,) [m] that simplices of pairs of patches met (n, 2) surely keep, without those that
-        have a vertex in common: 0 where it may be less than ``least`` [m], any of more than ``reach`` [m].
+        have a vertex in common: 0 where it may be less than ``least`` [m].
         """
-        flat, n = self._flat, self._n
+        flat, n, out = self._flat, self._n, np.empty(len(met))
         found: tuple[Array, Array, Array] = np.empty((n, 6)), np.empty(n), np.empty(n)
-        each = np.empty((2, len(flat.order), 6))
-        patches.gradients(x, way, self._given, flat.order, flat.first, flat.inverse, each, *found)
-        out = np.empty(len(met))
-        flats = flat.pairs, flat.around, flat.height, flat.reached
-        patches.distances_kept(met, reach, least, *flats, *found, out)
+        place, needs = np.empty(len(met), dtype=np.int64), np.zeros(n, dtype=np.bool_)
+        patches.needed(met, flat.pairs, flat.around, flat.reached, place, needs)
+        patches.gradients(x, way, self._given, flat.order, flat.first, flat.inverse, needs, *found)
+        flats = flat.around, flat.height, flat.reached
+        patches.distances_kept(place, least, *flats, np.ascontiguousarray(met[:, 0]), *found, out)
         return out
 
 
 @kernel()
-def _boxes(x, way, corners, first, low, high):  # type: ignore[no-untyped-def]
-    for p in range(len(low)):
-        low[p], high[p] = np.inf, -np.inf
-        for at in range(first[p], first[p + 1]):
-            for i in corners[at]:
-                for k in range(3):
-                    here = x[i, k]
-                    to = here + way[i, k]
-                    low[p, k], high[p, k] = min(low[p, k], here, to), max(high[p, k], here, to)
+def _boxes(x, way, vertices, first, out):  # type: ignore[no-untyped-def]
+    for p in range(len(first) - 1):
+        for k in range(3):
+            low = low_then = np.inf
+            high = high_then = -np.inf
+            for at in range(first[p], first[p + 1]):
+                here = x[vertices[at], k]
+                to = here + way[vertices[at], k]
+                low, high = min(low, here), max(high, here)
+                low_then, high_then = min(low_then, to), max(high_then, to)
+            out[0, p, k], out[1, p, k], out[2, p, k], out[3, p, k] = low, high, low_then, high_then
 
 
 @kernel()
@@ -211,12 +250,14 @@ def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def
 
 @kernel()
 def _pairs(  # type: ignore[no-untyped-def]
-    x, way, met, kept, mean, whole, vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out
+    x, way, met, known, more, apart, mean, whole,
+    vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out,
 ):  # fmt: skip
     """Rows of the near simplices of pairs of patches, as many as fit; how many there are.
 
-    No patch has more than ``most`` vertices, edges or triangles. Simplices of a pair of patches ``kept`` (n,)
-    [m] apart, as `SheetSearch.kept` has it, are looked at where that is less than their reach. ``mean`` and
+    No patch has more than ``most`` vertices, edges or triangles. Vertices and triangles, and edges, of a pair
+    of patches that are ``known`` (n, 2) [m] to be apart are looked at where that is less than their reach;
+    ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``mean`` and
     ``whole`` as of `_means` and `_around`.
     """
     found = 0
@@ -230,15 +271,18 @@ def _pairs(  # type: ignore[no-untyped-def]
                 if i == j:
                     continue
             kind, size = (EDGE_EDGE, 2) if part == 2 else (VERTEX_TRIANGLE, 1)
-            within = edges_reach if part == 2 else reach
-            if kept[n] >= within:
+            within, column = (edges_reach, 1) if part == 2 else (reach, 0)
+            if known[n, column] >= within:
                 continue
+            ample = within + more[n]
+            if part != 1:
+                apart[n, column] = ample
             mine, first, around = edges if part == 2 else vertices
             theirs, begin, others = edges if part == 2 else triangles
             square = 0.0
             for k in range(3):
                 square += (mean[i, k] - mean[j, k]) ** 2
-            together = within + math.sqrt(square)
+            together = ample + math.sqrt(square)
             for a in range(first[i], first[i + 1]):
                 start = a + 1 if part == 2 and i == j else begin[j]
                 end = begin[j + 1]
@@ -268,13 +312,17 @@ def _pairs(  # type: ignore[no-untyped-def]
                     for m in range(4):
                         for k in range(3):
                             w[m, k] = way[points[m], k]
-                    longest = within + speed(kind, w)
+                    nearer_by = speed(kind, w)
+                    longest = ample + nearer_by
                     if (nearer + others[6, b]) ** 2 - left[b - start] >= longest * longest:
                         continue
                     for m in range(4):
                         for k in range(3):
                             p[m, k] = x[points[m], k]
-                    if distance(kind, p) >= longest:
+                    left_over = distance(kind, p) - nearer_by
+                    if not left_over >= apart[n, column]:
+                        apart[n, column] = left_over
+                    if left_over >= within:
                         continue
                     if found < len(out):
                         turned = part == 2 and numbers[points[0]] > numbers[points[2]]

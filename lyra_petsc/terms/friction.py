@@ -126,6 +126,8 @@ class CoulombFriction(Elastic):
     def _renew(self, x: Array, places: Array, old: Pairs) -> None:
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
         contact = self._contact
+        if not contact.n_elements and not len(self._pairs.key):
+            return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
@@ -182,11 +184,14 @@ class CoulombFriction(Elastic):
 
     def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
         out = np.empty(self.n_owned)
+        if not self.n_elements:
+            return out
         friction_pairs.energies(x, *self._state(frozen.stage), out)
         return out
 
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
-        friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
+        if self.n_elements:
+            friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
 
     def add_hessian(
         self,
@@ -216,6 +221,10 @@ class CoulombFriction(Elastic):
         return self._spring * size
 
     def accept(self, x: Array, frozen: ObstacleMoves) -> None:
+        if not self.n_elements:
+            self._on_obstacles = np.zeros_like(self._on_obstacles)
+            self._renew(x, frozen.places, self._known)
+            return
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         state = list(self._state(frozen.end))
         self._on_obstacles = self._forces(x, tuple(state))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lyra_petsc.mesh.near import near, swept_boxes
+from lyra_petsc.mesh.near import near, near_in_order, swept_boxes
 
 Array = NDArray[np.float64]
 
@@ -44,6 +44,9 @@ def test_against_brute_force(n: int, size: str) -> None:
     assert as_set(near((low, high), others)) == as_set(np.argwhere(brute(low, high, *others)))
     mutual = np.argwhere(np.triu(brute(low, high, low, high), 1))
     assert as_set(near((low, high))) == as_set(mutual)
+    assert as_set(near_in_order(low, high, 0.0)) == as_set(mutual)
+    reach = 0.1
+    assert as_set(near_in_order(low, high, reach)) == as_set(near((low, high), reach=reach))
 
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-17, 1e-21, 1e-30, 1e-300])
