@@ -1,0 +1,56 @@
+"""A Newton iteration sees what would touch on its way, and does not stop at each of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import gathered, grid, scene_of
+
+from lyra_petsc.stepping.contact_model import ContactModel
+from lyra_petsc.stepping.simulation import SteppedScene
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+CELLS, GAP, STEPS = 24, 1e-5, 4
+
+
+def thrown_at_a_ball() -> dict[str, Any]:
+    """A sheet whose edges are far longer than the ball is round within a gap: few of its triangles touch."""
+    place = {"translate": [-0.5, -0.48, 0.0]}
+    return {
+        "mesh": grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": place},
+        "material": {"cloth": "gray-interlock", "damping": 0.0},
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"gap": GAP},
+        "obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.31], "radius": 0.3}}},
+        "time": {"end": 1.0, "step": 0.01, "integrator": "beuler"},
+    }
+
+
+def steps(comm: MPI.Comm) -> tuple[Array, list[int]]:
+    """Positions (V, 3) after the steps, in mesh order, and Newton iterations of each."""
+    simulation = SteppedScene(comm, scene_of(thrown_at_a_ball()))
+    newton = [simulation.step().newton_iterations for _ in range(STEPS)]
+    for option in simulation.stepper.our_options:
+        PETSc.Options().delValue(option)
+    system = simulation.problem.system
+    return gathered(system.points, system.x), newton
+
+
+def test_what_meets_in_a_step_is_found_in_few_iterations(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, newton = steps(comm)
+    assert np.linalg.norm(x - [0.0, 0.0, -0.31], axis=1).min() > 0.3
+    monkeypatch.setattr(ContactModel, "improve", lambda *_: False)
+    slow, before = steps(comm)
+    np.testing.assert_allclose(x, slow, atol=1e-9)
+    assert sum(newton) < 0.7 * sum(before)
