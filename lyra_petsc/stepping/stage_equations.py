@@ -535,7 +535,8 @@ class StageEquations:
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
         frozen = self.active.frozen
-        return {term: term.springs(x, ahead, frozen[term]) for term in self.active.limiting}
+        found = {term: term.springs(x, ahead, frozen[term]) for term in self.active.limiting}
+        return {term: springs for term, springs in found.items() if springs is not None}
 
     def add_springs(
         self, springs: Mapping[Elastic, Springs], stiffness: Mapping[Elastic, Array], values: Array

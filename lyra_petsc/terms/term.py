@@ -291,9 +291,11 @@ class Elastic(Term):
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
 
-    def springs(self, x: Array, way: Array, frozen: Any) -> Springs:
-        """What touches, or may after a way (n_local, 3) [m] from x; it is `acting` until `release`."""
-        raise NotImplementedError
+    def springs(self, x: Array, way: Array, frozen: Any) -> Springs | None:
+        """What touches, or may after a way (n_local, 3) [m] from x; it is `acting` until `release`. None of a
+        term whose elements are only known where they act.
+        """
+        return None
 
     def release(self, length: Array | None) -> None:
         """Take what springs push by where they are of this length (m,) [m] as foreseen, for `aims`; None:
