@@ -6,6 +6,8 @@ stays positive definite, and conjugate gradients see negative curvature only whe
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -187,6 +189,24 @@ class LinearSystem:
     def _set_regularised(self, v: Array) -> None:
         self._equations.jacobian(v, 1.0, self.preconditioner.rows)
         self.preconditioner.set(self.preconditioner.rows, self.shift.value)
+
+    def keep(self, v: Array) -> None:
+        """Keep what was assembled at v (n_owned, 3), for `with_more`."""
+        self._assembled = [self.operator.rows.copy()]
+        if self.preconditioner is not self.operator and self._regularised and not self.same:
+            if self.kept:
+                self._equations.jacobian(v, 1.0, self.preconditioner.rows)
+            self._assembled.append(self.preconditioner.rows.copy())
+
+    def with_more(self, add: Callable[[Array], None]) -> None:
+        """Let the matrices be those kept, and what ``add`` adds to their block rows."""
+        for matrix, rows in zip((self.operator, self.preconditioner), self._assembled, strict=False):
+            matrix.rows[:] = rows
+            add(matrix.rows)
+        self.operator.set(self.operator.rows)
+        if self.preconditioner is not self.operator:
+            own = self.preconditioner if len(self._assembled) > 1 else self.operator
+            self.preconditioner.set(own.rows, self.shift.value)
 
     def better_preconditioner(self, v: Array) -> bool:
         """Build another preconditioner at v after the linear solve failed; whether there is one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping.blend import Blend
+from lyra_petsc.stepping.contact_model import ContactModel
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.globalisation import Globalisation
 from lyra_petsc.stepping.inexact import Forcing
@@ -41,13 +42,15 @@ class Newton:
     convergence : Convergence
     iterates : bool
         There is more than one iteration (not so under ``semi-implicit``).
+    follow : callable
+        Lets the matrices be those of the present stencils; whether they are others; collective.
 
     Attributes
     ----------
     convergence : Convergence
     globalisation : Globalisation
-    more_linear : int
-        Linear iterations of directions that were solved for again.
+    more_linear, foreseen_linear : int
+        Linear iterations of directions that were solved for again, and with what touches on their way.
     allowed : float
         Fraction of the last direction that terms allowed to go.
     """
@@ -61,11 +64,14 @@ class Newton:
         convergence: Convergence,
         *,
         iterates: bool,
+        follow: Callable[[], bool],
     ) -> None:
         self._snes, self._ksp, self._equations = snes, snes.getKSP(), equations
         self._linear, self._blend, self._iterates = linear, blend, iterates
         self.convergence, self.globalisation = convergence, Globalisation(snes, equations, convergence)
         self._shape = (equations.points.n_owned, 3)
+        limits = iterates and bool(equations.active.limiting)
+        self._contact = ContactModel(self._ksp, equations, linear, follow) if limits else None
         self._from: PETSc.Vec | None = None
         self._began_convex = False
         still = not (equations.integrator.moves or equations.discretisation.guards)
@@ -77,7 +83,8 @@ class Newton:
 
     def begin_step(self) -> None:
         """Forget the step before."""
-        self.more_linear, self._length, self.allowed = 0, 0.0, 1.0
+        self.more_linear = self.foreseen_linear = 0
+        self._length, self.allowed = 0.0, 1.0
         # a step begins as the one before did
         self._convex = self._began_convex
         self._linear.begin()
@@ -134,6 +141,8 @@ class Newton:
             self.more_linear += self._ksp.getIterationNumber()
             changed = True
             useless = self._useless(residual, y)
+        if self._contact is not None and not useless:
+            changed |= self._foresee(x, residual, y)
         if self.globalisation.trusts:
             changed |= self._follow_triangles(x, residual, y)
         if self._equations.limits_steps:
@@ -145,6 +154,20 @@ class Newton:
             self._from.destroy()
         self._from, self._length = x.copy(), y.norm()
         self.globalisation.search_along(residual.dot(y))
+        return changed
+
+    def _foresee(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Let a step y be that of the linear model in which parts do not pass each other; whether it is
+        another.
+        """
+        assert self._contact is not None
+        v = self._array(x)
+
+        def assemble() -> None:
+            self._linear.set(v, self._blend.value, keep=False, convex=self._convex)
+
+        changed = self._contact.improve(v, residual, y, assemble, self.forcing.tolerance)
+        self.foreseen_linear += self._contact.linear_iterations
         return changed
 
     def _correct(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
@@ -217,7 +240,8 @@ class Newton:
 
     def converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int | None:
         """For ``SNES.setConvergenceTest``."""
-        return self.convergence.test(snes, iteration, norms[2], self.linear_iterations)
+        spent = self.linear_iterations - self.foreseen_linear
+        return self.convergence.test(snes, iteration, norms[2], spent)
 
     def memory(self) -> dict[str, float]:
         """What a checkpoint must hold for the next steps to be solved as they would be."""
@@ -240,4 +264,4 @@ class Newton:
     @property
     def linear_iterations(self) -> int:
         """Linear iterations of the present solve so far."""
-        return int(self._snes.getLinearSolveIterations()) + self.more_linear
+        return int(self._snes.getLinearSolveIterations()) + self.more_linear + self.foreseen_linear

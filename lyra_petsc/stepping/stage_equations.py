@@ -17,7 +17,7 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import Any, NamedTuple
 
@@ -36,6 +36,7 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
+from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, UpcomingStep, Viscous
@@ -529,6 +530,31 @@ class StageEquations:
             self.points.update_ghosts(ahead)
             pushed = True
         return ahead[:n] / self.stage.reach if pushed else None
+
+    def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
+        """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
+        x, ahead = self._ahead(v, way)
+        if self.discretisation.largest_step(x, ahead) < 1.0:
+            x, ahead = self._look(v, way)
+        frozen = self.active.frozen
+        found = {term: term.springs(x, ahead, frozen[term]) for term in self.active.limiting}
+        return {term: springs for term, springs in found.items() if springs is not None}
+
+    def add_springs(
+        self, springs: Mapping[Elastic, Springs], stiffness: Mapping[Elastic, Array], values: Array
+    ) -> None:
+        """Add springs of this stiffness [N/m] to the Jacobian's block rows (n_blocks, 3, 3)."""
+        rows, beside = self.discretisation.rows, self.prescribed.beside
+        for term, each in springs.items():
+            reach = self.stage.reach
+            each.add_stiffness(reach * stiffness[term], rows.pattern.offsets[term.name], values)
+        if len(beside.changing):
+            rows.constrain(values, self.prescribed.mask, beside)
+
+    def release(self, length: Mapping[Elastic, Array]) -> None:
+        """Let `springs` go, of a ``length`` [m] where the step leads, without one if it is another."""
+        for term in self.active.limiting:
+            term.release(length.get(term))
 
     def _farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""

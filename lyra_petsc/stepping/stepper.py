@@ -176,8 +176,9 @@ class Stepper:
         limit = presets.linear_limit(points.n_global, self.presets)
         convergence = Convergence(equations, scene.solver, self._spacing, self._floor, linear_limit=limit)
         self._newton = newton = Newton(
-            snes, equations, self.linear, self._blend, convergence, iterates=self._iterates
-        )
+            snes, equations, self.linear, self._blend, convergence,
+            iterates=self._iterates, follow=self._follow_stencils,
+        )  # fmt: skip
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
         if equations.discretisation.changes or (equations.active.edged and self._iterates):
@@ -230,10 +231,12 @@ class Stepper:
             snes.computeFunction(snes.getSolution(), snes.getFunction()[0])
             self._newton.globalisation.begin()
 
-    def _follow_stencils(self) -> None:
-        """Let the matrices be those of the present stencils; collective."""
-        if self.linear.renew():
-            self._set_jacobian()
+    def _follow_stencils(self) -> bool:
+        """Let the matrices be those of the present stencils; whether they are others; collective."""
+        if not self.linear.renew():
+            return False
+        self._set_jacobian()
+        return True
 
     def _fill(self, options: Mapping[str, Value]) -> None:
         self._filled = fill_gaps(options)

@@ -26,6 +26,7 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import contact_pairs, surface_shares
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_INSIDE, VERTEX_PLANE, VERTEX_TRIANGLE
 from lyra_petsc.terms.contact_search import SheetSearch, Simplices
+from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
@@ -34,7 +35,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 KEPT = 0.2
-"""Part of its distance that a pair keeps in a Newton iteration."""
+"""Part of its distance, or of the gap where it is farther, that a pair keeps in a Newton iteration."""
 
 TOUCHES = 0.7
 """Part of the gap at which pairs that meet in a Newton iteration shall be after it."""
@@ -288,6 +289,8 @@ class ContactBarrier(Elastic):
         self.shares = surface_shares.shares(what[:, 6])
         self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
+        self._foreseen = np.zeros(self.n_elements)
+        self._springs: Springs | None = None
 
     def _between_others(self) -> NDArray[np.bool_]:
         """Pairs (E,) that see to what vertices of sheets and triangles do not: edges of sheets, and edges and
@@ -488,6 +491,8 @@ class ContactBarrier(Elastic):
         out = np.zeros(self.n_elements, dtype=np.bool_)
         if self.n_elements:
             out[self.meeting(x, frozen.now).at] = True
+            if self._springs is not None:
+                out[self._springs.at] = True
         return out
 
     def add_hessian(
@@ -519,13 +524,38 @@ class ContactBarrier(Elastic):
         still = np.zeros_like(frozen.now)
         left, nearer = self.meeting(x, frozen.now).least, contact_pairs.approach(way, still)
         at = np.flatnonzero(nearer > (1.0 - KEPT) * left)
-        pairs = self.kind[at], self.points[at], self.offset[at]
+        pairs = self.kind[at], self.points[at], self.offset[at], self.gap[at]
         return float(contact_pairs.free_way(x, frozen.now, way, still, *pairs, KEPT, 1.0))
+
+    def springs(self, x: Array, way: Array, frozen: Places) -> Springs:
+        met, room = self.meeting(x, frozen.now), self._room
+        stiffness = HALFWAY * self.barrier.stiffness
+        pairs = self.kind, self.points, self.offset, self.gap, stiffness, self.barrier.parallel
+        given = met.at, met.weight, met.counted, met.beta, met.felt
+        while True:
+            numbers = np.empty(room, dtype=np.int64)
+            found = numbers, np.empty((room, 4)), np.empty((room, 3)), *np.empty((3, room))
+            counted = self.n_owned
+            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, TOUCHES, given, counted, found)
+            if n <= room:
+                break
+            room = n
+        at, beta, normal, spring, length, counts = (part[:n] for part in found)
+        acts = np.arange(n) < touch
+        self._springs = Springs(at, self.points[at], beta, normal, spring, length, counts, acts)
+        return self._springs
+
+    def release(self, length: Array | None) -> None:
+        self._foreseen[:] = 0.0
+        if length is not None and self._springs is not None:
+            push = np.where(self._springs.acts, 0.0, np.maximum(-length, 0.0))
+            self._foreseen[self._springs.at] = HALFWAY * push
+        self._springs = None
 
     def aims(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:
         aim, before = np.empty(self.n_elements), np.zeros((self.n_elements, 3))
         pairs, presses = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements, np.bool_)
-        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, aim, before, presses)
+        contact_pairs.aims(x, frozen.now, way, *pairs, TOUCHES, self._foreseen, aim, before, presses)
         return aim, before, presses
 
     def push_apart(
@@ -540,7 +570,7 @@ class ContactBarrier(Elastic):
         bent = np.flatnonzero(self._bulge > BULGE * self.barrier.gap)
         if len(bent) and np.isin(self.obstacle, bent).any():
             return False
-        pairs = self.kind, self.points, self.offset
+        pairs = self.kind, self.points, self.offset, self.gap
         return bool(contact_pairs.free_way(x, *_during(frozen, part, way), *pairs, KEPT, 1.0) == 1.0)
 
     def distances(self, x: Array, others: Array) -> Array:
@@ -554,7 +584,7 @@ class ContactBarrier(Elastic):
         return self.distances(x, frozen.now)[: self.n_owned]
 
     def free_parts(self, x: Array, way: Array, frozen: Places, part: Part) -> Array:
-        pairs, out = (self.kind, self.points, self.offset), np.empty(self.n_owned)
+        pairs, out = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_owned)
         contact_pairs.free_ways(x, *_during(frozen, part, way), *pairs, KEPT, out)
         return out
 
@@ -594,7 +624,7 @@ class ContactBarrier(Elastic):
     def carried(self, x: Array, way: Array, frozen: Places) -> Array:
         if not self.moving:
             return way
-        pairs, free = (self.kind, self.points, self.offset), np.empty(self.n_elements)
+        pairs, free = (self.kind, self.points, self.offset, self.gap), np.empty(self.n_elements)
         contact_pairs.free_ways(x, *_during(frozen, Part(0.0, 1.0), way), *pairs, KEPT, free)
         taken = way.copy()
         for number, (turn, there) in enumerate(frozen.moved):

@@ -898,7 +898,7 @@ def _where(force, gap):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def aims(x, others, way, kind, points, offset, gap, most, aim, before, presses):  # type: ignore[no-untyped-def]
+def aims(x, others, way, kind, points, offset, gap, most, foreseen, aim, before, presses):  # type: ignore[no-untyped-def]  # fmt: skip
     """Least distances less the offsets (E,) [m] that pairs should have after a ``way`` (n_local, 3) [m] of
     Newton's.
 
@@ -929,8 +929,73 @@ def aims(x, others, way, kind, points, offset, gap, most, aim, before, presses):
                         along += beta[i] * n[k] * way[Index(points[e, i]), k]
             _, slope, second = barrier(delta, gap[e])
             force = -slope - second * along
-            if force > 0.0:
-                aim[e], presses[e] = min(aim[e], _where(force, gap[e])), True
+        else:
+            force = foreseen[e]
+        if force > 0.0:
+            aim[e], presses[e] = min(aim[e], _where(force, gap[e])), True
+
+
+@kernel()
+def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, most, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Springs that stand for what touches, or would after a ``way`` (n_local, 3) [m], in a linear model.
+
+    They push while their length s is below 0, with the force −κ s. What touches has the second derivative of
+    the barrier, and its force at x; what does not, b″ in the middle of the gap, and s = 0 at the part
+    ``most`` of the gap.
+
+    Parameters
+    ----------
+    met : tuple
+        Numbers, how often they count, for this rank too, β and what is felt of the pairs of `meeting`.
+    found : tuple of (room,), (room, 4), (room, 3), (room,), (room,), (room,)
+        Numbers of the pairs, β, unit normals, κ [N/m], s at x [m], and how often they count for this rank.
+
+    Returns
+    -------
+    n, m : int
+        How many there are: the first rows of ``found``, of which n touch.
+    """
+    numbers, beta, normal, spring, length, counted = found
+    at, often, ours, given, felt = met
+    p, u, b, none, n = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3), 0
+    touches = np.zeros(len(kind), dtype=np.bool_)
+    for m in range(len(at)):
+        e = at[m]
+        touches[e] = True
+        if not often[m] > 0.0 or not felt[m, 4] > 0.0 or not felt[m, 4] < np.inf:
+            continue
+        if kind[e] == EDGE_EDGE:
+            _load(x, others, points, e, p)
+            if _fades(p, parallel):
+                continue
+        d = math.sqrt(felt[m, 0] ** 2 + felt[m, 1] ** 2 + felt[m, 2] ** 2)
+        numbers[n], spring[n], counted[n] = e, often[m] * felt[m, 4] * d * d, ours[m] / often[m]
+        d = -d if kind[e] == VERTEX_INSIDE else d
+        length[n] = felt[m, 3] / (felt[m, 4] * d)
+        for i in range(4):
+            beta[n, i] = given[m, i]
+        for k in range(3):
+            normal[n, k] = felt[m, k] / d
+        n += 1
+    first, nearer = n, 2.0 * _farthest(way)
+    for e in range(len(kind)):
+        if touches[e]:
+            continue
+        _load(x, others, points, e, p)
+        if at_least(p, kind[e]) - offset[e] - nearer >= gap[e]:
+            continue
+        delta = _ahead_of(p, kind[e], none, b, u) - offset[e]
+        if not most * gap[e] < delta < gap[e] + nearer or (kind[e] == EDGE_EDGE and _fades(p, parallel)):
+            continue
+        if n < len(numbers):
+            numbers[n], spring[n], length[n] = e, stiffness, delta - most * gap[e]
+            counted[n] = 1.0 if e < n_counted else 0.0
+            for i in range(4):
+                beta[n, i] = b[i]
+            for k in range(3):
+                normal[n, k] = u[k]
+        n += 1
+    return first, n
 
 
 @kernel()
@@ -988,19 +1053,20 @@ def approach(way, others_way):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def free_way(x, others, way, others_way, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+def free_way(x, others, way, others_way, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
     """Fraction, up to ``most``, of ways (n_local, 3), (m, 3) [m] along which no pair comes too near.
 
-    Each keeps at least the part ``keep`` of its distance less the offset. Additive continuous collision
+    Each keeps at least the part ``keep`` of its distance less the offset, or of ``far`` (E,) [m] where that
+    is less. Additive continuous collision
     detection: Li, Kaufman & Jiang, Codimensional incremental potential contact, ACM Trans. Graph. 40 (2021)
     170, algorithm 1. Of a plane that turns by more than 120° nothing is free.
     """
     nearer = approach(way, others_way)
-    return _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, most)
+    return _free_way(x, others, way, others_way, nearer, kind, points, offset, far, keep, most)
 
 
 @kernel()
-def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, most):  # type: ignore[no-untyped-def]
+def _free_way(x, others, way, others_way, nearer, kind, points, offset, far, keep, most):  # type: ignore[no-untyped-def]  # fmt: skip
     """The same; no two points come nearer by more than ``nearer`` [m]."""
     p, w = np.empty((4, 3)), np.empty((4, 3))
     for e in range(len(kind)):
@@ -1012,11 +1078,12 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, keep, mo
         pace = _plane_speed(p, w, most) if plane else speed(kind[e], w)
         d = distance(kind[e], p)
         left = d - offset[e]
-        if left - most * pace >= keep * left or pace == 0.0:
+        counts = min(left, far[e])
+        if left - most * pace >= keep * counts or pace == 0.0:
             continue
         if not pace < math.inf:
             return 0.0
-        least, enough, t = keep * left, (1.0 - keep) * CLOSE * left, 0.0
+        least, enough, t = keep * counts, (1.0 - keep) * CLOSE * counts, 0.0
         # each advance is shorter than what is left of the way to the least distance
         advances = 0
         while left - least > enough and advances < ADVANCES:
@@ -1115,12 +1182,12 @@ def share_negative(kind, vertex, normal, force):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def free_ways(x, others, way, others_way, kind, points, offset, keep, out):  # type: ignore[no-untyped-def]
+def free_ways(x, others, way, others_way, kind, points, offset, far, keep, out):  # type: ignore[no-untyped-def]
     """What `free_way` gives for each of the first len(out) pairs alone."""
     nearer = approach(way, others_way)
     for e in range(len(out)):
         one = slice(e, e + 1)
-        pair = kind[one], points[one], offset[one]
+        pair = kind[one], points[one], offset[one], far[one]
         out[e] = _free_way(x, others, way, others_way, nearer, *pair, keep, 1.0)
 
 

@@ -23,6 +23,7 @@ from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
 if TYPE_CHECKING:
+    from lyra_petsc.terms.one_sided import Springs
     from lyra_petsc.terms.registry import Registration
 
 Array = NDArray[np.float64]
@@ -293,6 +294,17 @@ class Elastic(Term):
     def largest_step(self, x: Array, way: Array, frozen: Any) -> float:
         """Largest fraction, up to 1, of the way (n_local, 3) [m] from x that one Newton iteration may go."""
         return 1.0
+
+    def springs(self, x: Array, way: Array, frozen: Any) -> Springs | None:
+        """What touches, or may after a way (n_local, 3) [m] from x; it is `acting` until `release`. None of a
+        term whose elements are only known where they act.
+        """
+        return None
+
+    def release(self, length: Array | None) -> None:
+        """Take what springs push by where they are of this length (m,) [m] as foreseen, for `aims`; None:
+        they are not.
+        """
 
     def aims(self, x: Array, way: Array, frozen: Any) -> Any:
         """What `push_apart` is to reach after a Newton iteration's way (n_local, 3) [m] from x."""

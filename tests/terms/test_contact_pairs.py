@@ -88,7 +88,7 @@ class Pairs:
 
     def free_way(self, way: Array, others_way: Array, e: int | None = None, most: float = 1.0) -> float:
         at = slice(None) if e is None else slice(e, e + 1)
-        pairs = self.kind[at], self.points[at], self.offset[at]
+        pairs = self.kind[at], self.points[at], self.offset[at], np.full(len(self), GAP)[at]
         return float(contact_pairs.free_way(self.x, self.others, way, others_way, *pairs, KEPT, most))
 
 
@@ -311,12 +311,15 @@ def test_nothing_is_felt_beyond_the_gap_and_the_barrier_is_smooth_there() -> Non
 
 
 def closest(pairs: Pairs, e: int, way: Array, others_way: Array, end: float) -> tuple[float, float]:
-    """Least of what is left on the way to a fraction of it, over what is left at first; that at the end."""
+    """Least of what is left on the way to a fraction of it, over what is left at first or the gap if that is
+    less; that at the end.
+    """
     left = [
         pairs.distances(pairs.x + t * way, pairs.others + t * others_way)[e] - pairs.offset[e]
         for t in np.linspace(0.0, end, 100)
     ]
-    return min(left) / left[0], left[-1] / left[0]
+    counts = min(left[0], GAP)
+    return min(left) / counts, left[-1] / counts
 
 
 @pytest.mark.parametrize("speed", [0.5, 2.0, 100.0])
@@ -349,7 +352,7 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
     way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
     aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, aim, before, presses)
+    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, np.zeros(n), aim, before, presses)
 
     def slopes(delta: Array) -> Array:
         return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])

@@ -1,0 +1,58 @@
+"""A Newton iteration sees what would touch on its way, and does not stop at each of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+from physics import direct_solver, gathered, grid, scene_of
+
+from lyra_petsc.stepping.contact_model import ContactModel
+from lyra_petsc.stepping.simulation import SteppedScene
+
+Array = NDArray[np.float64]
+
+pytestmark = pytest.mark.parallel
+
+CELLS, GAP, STEPS = 24, 1e-5, 3
+
+
+def thrown_at_a_ball() -> dict[str, Any]:
+    """A sheet whose edges are far longer than the ball is round within a gap: few of its triangles touch."""
+    place = {"translate": [-0.5, -0.48, 0.0]}
+    return {
+        "mesh": grid(1.0, 1.0, CELLS, CELLS, "alternating") | {"transform": place},
+        "material": {"cloth": "gray-interlock", "damping": 0.0},
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"gap": GAP},
+        "obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -0.31], "radius": 0.3}}},
+        "time": {"end": 1.0, "step": 0.01, "integrator": "beuler"},
+    }
+
+
+def steps(comm: MPI.Comm) -> tuple[Array, list[int]]:
+    """Positions (V, 3) after the steps, in mesh order, and Newton iterations of each."""
+    options = direct_solver(comm) | {"ksp_rtol": "1e-10"}  # which triangles are tried hangs on round-off
+    for name, value in options.items():
+        PETSc.Options().setValue(name, value)
+    simulation = SteppedScene(comm, scene_of(thrown_at_a_ball()))
+    newton = [simulation.step().newton_iterations for _ in range(STEPS)]
+    for name in [*options, *simulation.stepper.our_options]:
+        PETSc.Options().delValue(name)
+    system = simulation.problem.system
+    return gathered(system.points, system.x), newton
+
+
+def test_what_meets_in_a_step_is_found_in_few_iterations(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, newton = steps(comm)
+    assert np.linalg.norm(x - [0.0, 0.0, -0.31], axis=1).min() > 0.3
+    monkeypatch.setattr(ContactModel, "improve", lambda *_: False)
+    _, before = steps(comm)  # some of these may be repeated, and lead less far
+    assert sum(newton) < 0.7 * sum(before)
