@@ -21,6 +21,7 @@ from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern, union
 from lyra_petsc.mesh.elements import Elements
+from lyra_petsc.mesh.near import swept_boxes
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
 
@@ -235,61 +236,75 @@ class Discretisation:
             if term not in self._triangles:
                 self._triangles[term] = _marked(term.surface.astype(np.int64), term)
             return term.neighbours(x[:n], way[:n], own, self._triangles[term])
-        triangles, moves = np.empty((0, 3), dtype=np.int64), np.stack([x, way], axis=1)
+        distance, triangles = term.search_distance, np.empty((0, 3), dtype=np.int64)
         if term.surface is None:
-            numbers, moves = self._with_near(own, moves[:n, None], term.search_distance, own >= 0)
-            moves = moves[:, 0]
+            theirs, moves = self._near_others(own, np.arange(n)[:, None], x, way, distance, own >= 0)
+            numbers, points, ways, moves = np.concatenate([own, theirs]), x[:n], way[:n], moves[:, 0]
         else:
-            corners, places = _marked(layout.global_number[term.surface], term), moves[term.surface]
-            mine = term.surface[:, 0] < layout.n_owned  # each triangle is sent once
+            surface, place = term.surface.astype(np.int64), np.arange(layout.n_local)
+            corners = _marked(layout.global_number[surface], term)
+            mine = surface[:, 0] < layout.n_owned  # each triangle is sent once
             # who meets a triangle that reaches out to a ghost counts for its owned vertices, too
-            corners, places = self._with_near(corners, places, term.search_distance, mine)
-            _, first = np.unique(np.sort(corners[:, :3], axis=1), axis=0, return_index=True)
-            corners, places = corners[np.sort(first)], places[np.sort(first)]
-            corners, marks = corners[:, :3], corners[:, 3:]
-            others, first = np.unique(corners, return_index=True)
-            more = ~np.isin(others, own)
-            numbers = np.concatenate([own, others[more]])
-            moves = np.concatenate([moves[:n], places.reshape(-1, 2, 3)[first[more]]])
-            order = np.argsort(numbers)
+            corners, moves = self._near_others(corners, surface, x, way, distance, mine)
+            # those that touch owned vertices are here already
+            new = ((corners[:, :3] < layout.start) | (corners[:, :3] >= layout.start + n)).all(axis=1)
+            corners, moves = corners[new], moves[new].reshape(-1, 2, 3)
+            ghosts = np.unique(surface[surface >= n])
+            place[ghosts] = n + np.arange(len(ghosts))
+            numbers = np.concatenate([own, layout.global_number[ghosts]])
+            others, first = np.unique(corners[:, :3], return_index=True)
+            more = ~np.isin(others, numbers[n:])
+            numbers = np.concatenate([numbers, others[more]])
+            points, ways = (np.concatenate([each[:n], each[ghosts]]) for each in (x, way))
+            moves = moves[first[more]]
+            order = n + np.argsort(numbers[n:])
+            at = np.minimum(np.searchsorted(numbers[order], corners[:, :3]), max(len(order) - 1, 0))
             triangles = np.concatenate(
-                [order[np.searchsorted(numbers, corners, sorter=order)], marks], axis=1
+                [_marked(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
             )
-        points, ways = np.ascontiguousarray(moves[:, 0]), np.ascontiguousarray(moves[:, 1])
+        points, ways = np.concatenate([points, moves[:, 0]]), np.concatenate([ways, moves[:, 1]])
         stencil, what = term.neighbours(points, ways, numbers, triangles)
         touching = (stencil < n).any(axis=1)
         return numbers[stencil[touching]], what[touching]
 
-    def _with_near(
-        self, numbers: Ints, moves: Array, distance: float, mine: NDArray[np.bool_]
+    def _near_others(
+        self, numbers: Ints, rows: Ints, x: Array, way: Array, distance: float, mine: NDArray[np.bool_]
     ) -> tuple[Ints, Array]:
-        """This rank's vertices or triangles and those of others that are near its box; collective.
+        """Other ranks' vertices or triangles that are near the box of this one's; collective.
 
         Parameters
         ----------
-        numbers, moves : (n, …), (n, m, 2, 3)
-            Global numbers of their points, and where these are and which way they go [m].
+        numbers, rows : (n, …), (n, m)
+            Global numbers of this rank's with what goes with them, and local rows of their points.
+        x, way : (n_local, 3)
+            Where points are and which way they go [m].
         distance : float [m]
         mine : (n,)
             Which of them this rank sends.
+
+        Returns
+        -------
+        numbers, moves : (k, …), (k, m, 2, 3)
+            Of the others, with places and ways of their points.
         """
         comm = self.layout.comm
-        if comm.size == 1:
-            return numbers, moves
-        passed = np.concatenate([moves[:, :, 0], moves.sum(axis=2)], axis=1)
-        low, high = passed.min(axis=1), passed.max(axis=1)
-        box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
-        boxes = np.empty((comm.size, 2, 3))
-        comm.Allgather(box, boxes)
-        sent: list[tuple[Ints, Array] | None] = []
-        for rank, (least, most) in enumerate(boxes):
-            near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
-            sent.append((numbers[near], moves[near]) if rank != comm.rank and near.any() else None)
-        received = [part for part in comm.alltoall(sent) if part is not None]
-        return (
-            np.concatenate([numbers, *(part[0] for part in received)]),
-            np.concatenate([moves, *(part[1] for part in received)]),
-        )
+        received = [(numbers[:0], np.empty((0, rows.shape[1], 2, 3)))]
+        if comm.size > 1:
+            low, high = swept_boxes(x, way, rows)
+            box = np.array([low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)])
+            boxes = np.empty((comm.size, 2, 3))
+            comm.Allgather(box, boxes)
+            sent: list[tuple[Ints, Array] | None] = []
+            for rank, (least, most) in enumerate(boxes):
+                if rank == comm.rank:
+                    sent.append(None)
+                    continue
+                near = mine & ((low <= most + distance) & (high >= least - distance)).all(axis=1)
+                some = rows[near]
+                moves = np.stack([x[some], way[some]], axis=2)
+                sent.append((numbers[near], moves) if len(some) else None)
+            received += [part for part in comm.alltoall(sent) if part is not None]
+        return np.concatenate([part[0] for part in received]), np.concatenate([part[1] for part in received])
 
     def _sent(self, stencil: Ints, what: Ints | Array) -> tuple[Ints, Ints | Array]:
         """Elements by global numbers (E, n) that this rank knows, and what others know of its vertices;
