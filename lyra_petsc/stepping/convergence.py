@@ -71,7 +71,7 @@ class Convergence:
         *,
         linear_limit: float,
     ) -> None:
-        self._equations, self._tolerances, self._spacing, self._floor = equations, tolerances, spacing, floor
+        self._equations, self._tolerances, self.spacing, self._floor = equations, tolerances, spacing, floor
         self._linear_limit = linear_limit
         self.usual, self.farthest = 0.0, np.inf
         self.begin()
@@ -140,10 +140,10 @@ class Convergence:
             self.stopped_by = "" if balanced else "-snes_rtol"
             return int(Reason.CONVERGED_FNORM_RELATIVE)
         was_balanced, self._balanced = self._balanced, balanced
-        if balanced and self.left <= self._tolerances.step_tolerance * self._spacing:
+        if balanced and self.left <= self._tolerances.step_tolerance * self.spacing:
             # which came last
             return int(Reason.CONVERGED_SNORM_RELATIVE if was_balanced else Reason.CONVERGED_FNORM_RELATIVE)
-        if 0.0 < self.left <= stol * self._spacing:
+        if 0.0 < self.left <= stol * self.spacing:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None

@@ -22,6 +22,10 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 
 Array = NDArray[np.float64]
 
+SMALL = 0.005
+"""Half the gap over the edges' mean length below which the linear model has what is on its way: with larger
+gaps it saves few iterations, and searches along long steps take more time than these."""
+
 CORRECTED = 0.5
 """Fraction of the residual at the end of a step below which a correction of it is taken."""
 
@@ -70,7 +74,8 @@ class Newton:
         self._linear, self._blend, self._iterates = linear, blend, iterates
         self.convergence, self.globalisation = convergence, Globalisation(snes, equations, convergence)
         self._shape = (equations.points.n_owned, 3)
-        limits = iterates and bool(equations.active.limiting)
+        skin = min((term.skin for term in equations.active.limiting), default=np.inf)
+        limits = iterates and skin < SMALL * convergence.spacing
         self._contact = ContactModel(self._ksp, equations, linear, follow) if limits else None
         self._from: PETSc.Vec | None = None
         self._began_convex = False
