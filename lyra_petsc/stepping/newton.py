@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,14 @@ from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import negative_pivots
 from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping.blend import Blend
-from lyra_petsc.stepping.contact_model import ContactModel
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.globalisation import Globalisation
 from lyra_petsc.stepping.inexact import Forcing
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.contact_model import ContactModel
 
 Array = NDArray[np.float64]
 
@@ -75,8 +78,11 @@ class Newton:
         self.convergence, self.globalisation = convergence, Globalisation(snes, equations, convergence)
         self._shape = (equations.points.n_owned, 3)
         skin = min((term.skin for term in equations.active.limiting), default=np.inf)
-        limits = iterates and skin < SMALL * convergence.spacing
-        self._contact = ContactModel(self._ksp, equations, linear, follow) if limits else None
+        self._contact: ContactModel | None = None
+        if iterates and skin < SMALL * convergence.spacing:
+            from lyra_petsc.stepping.contact_model import ContactModel  # of use for nothing else
+
+            self._contact = ContactModel(self._ksp, equations, linear, follow)
         self._from: PETSc.Vec | None = None
         self._began_convex = False
         still = not (equations.integrator.moves or equations.discretisation.guards)

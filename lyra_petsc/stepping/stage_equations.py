@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial, reduce
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -36,10 +36,12 @@ from lyra_petsc.stepping.objective import Objective
 from lyra_petsc.stepping.prescribed import Prescribed
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
-from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, UpcomingStep, Viscous
+
+if TYPE_CHECKING:
+    from lyra_petsc.terms.one_sided import Springs
 
 Array = NDArray[np.float64]
 
