@@ -112,8 +112,9 @@ WORTH, WORTH_INCOMPLETE = 4.0, 2.0
 PRICE, PRICE_INCOMPLETE = 4.0, 2.0
 """How many of them it costs."""
 
-INCOMPLETE_FROM = 5.0
-"""Iterations of block Jacobi from which a small sheet's Newton iterations use incomplete factors."""
+INCOMPLETE_FROM = 1.0
+"""Iterations that are expected of block Jacobi (it then takes some thirty) from which a small sheet's Newton
+iterations use incomplete factors."""
 
 TWICE_FROM = 30.0
 """Iterations of block Jacobi from which coarser levels are visited twice."""
