@@ -143,7 +143,9 @@ def candidates(
         return [*factors, *last]
     if n_vertices > DIRECT_UNTIL:
         return last
-    incomplete = "ilu" if ranks == 1 else "block-ilu"
+    # what matrices of one rank can, those for several cannot
+    several = ranks > 1 or PETSc.Options().getString("mat_type", "").startswith("mpi")
+    incomplete = "block-ilu" if several else "ilu"
     small = n_vertices < MULTIGRID_FROM[newton]
     if iterations > _factor_cost(n_vertices) * (WORTH_INCOMPLETE if small else WORTH):
         return [*factors, *last]

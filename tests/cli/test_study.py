@@ -133,7 +133,7 @@ def test_a_failed_combination_is_a_row_and_the_study_goes_on(tmp_path: Path) -> 
 
 
 def test_all_failed_is_exit_3_with_its_files(tmp_path: Path) -> None:
-    write_scene(tmp_path, HANGING)
+    write_scene(tmp_path, HANGING.replace("step: 0.01", "step: 0.04"))
     left = lyra(
         ["study", "scene.yaml", "--vary", "max_iterations=1", "--repeats", "1", "--out", "out"], tmp_path
     )

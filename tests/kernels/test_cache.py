@@ -24,6 +24,7 @@ def twice(x):  # type: ignore[no-untyped-def]
 
 @pytest.fixture(autouse=True)
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    config.reload_config()  # else the first compilation does, where a variable of numba's has changed
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     return tmp_path
 
