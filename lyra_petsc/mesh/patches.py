@@ -218,7 +218,7 @@ def _singular(m):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _place(pairs, i, j):  # type: ignore[no-untyped-def]
+def place(pairs, i, j):  # type: ignore[no-untyped-def]
     """Where a pair stands among pairs (m, 2) in ascending order; −1 if it does not."""
     lo, hi = 0, len(pairs)
     while lo < hi:
@@ -231,12 +231,12 @@ def _place(pairs, i, j):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def needed(met, pairs, around, reached, place, needs):  # type: ignore[no-untyped-def]
+def needed(met, pairs, around, reached, places, needs):  # type: ignore[no-untyped-def]
     """Where pairs of patches met (n, 2) stand among ``pairs``, and which patches' gradients tell of them."""
     for n in range(len(met)):
-        place[n] = _place(pairs, met[n, 0], met[n, 1])
-        if place[n] >= 0:
-            for at in range(around[place[n]], around[place[n] + 1]):
+        places[n] = place(pairs, met[n, 0], met[n, 1])
+        if places[n] >= 0:
+            for at in range(around[places[n]], around[places[n] + 1]):
                 needs[reached[at]] = True
 
 

@@ -330,9 +330,9 @@ class Stepper:
         self.ts.setTime(t0)
         self.ts.setStepNumber(number)
         self.ts.setConvergedReason(PETSc.TS.ConvergedReason.CONVERGED_ITERATING)
-        numbers = self.ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
-        outworn = self.linear.reuse.reused and self._linear_failed and numbers
-        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_() or outworn):
+        finite = self.ksp.getConvergedReason() != PETSc.KSP.ConvergedReason.DIVERGED_NANORINF
+        too_old = self.linear.reuse.reused and self._linear_failed and finite
+        if not self._iterates and (failed_factors.forget(self.ksp) or self.linear.shift.raise_() or too_old):
             self.linear.reuse.renew()
             return self.attempt(t0, t1)
         return Attempt(False, newton, linear, outcome.norm, words=words, stuck=stuck)

@@ -39,8 +39,6 @@ class Margins:
 
     def __init__(self, pairs: Ints, first: Ints) -> None:
         self._pairs, self._first = pairs, first
-        self._begin = np.searchsorted(pairs[:, 0], np.arange(len(first)))
-        self._other = np.ascontiguousarray(pairs[:, 1])
         self.left = np.zeros((len(pairs), 2))
         self._at: Array | None = None
 
@@ -64,7 +62,8 @@ class Margins:
         Pairs of other patches than those in the table's are known to be of no interest.
         """
         out, row, known = np.empty_like(met), np.empty(len(met), dtype=np.int64), np.empty((len(met), 2))
-        n = _among(met, lasting, self._begin, self._other, reach, edges, out, row, known)
+        own = len(self._first) - 1
+        n = _among(met, own, lasting, self._pairs, reach, edges, out, row, known)
         return out[:n], row[:n], known[:n]
 
     def learn(self, row: Ints, known: Array) -> None:
@@ -176,23 +175,13 @@ def _spend(pairs, moves, left, lasting):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _among(met, lasting, begin, other, reach, edges, out, row, known):  # type: ignore[no-untyped-def]
-    found, n = 0, len(begin) - 1
+def _among(met, n, lasting, pairs, reach, edges, out, row, known):  # type: ignore[no-untyped-def]
+    found = 0
     for m in range(len(met)):
         i, j = met[m]
         if i >= n:
             continue
-        at = -1
-        if j < n:
-            lo, hi = begin[i], begin[i + 1]
-            while lo < hi:
-                middle = (lo + hi) // 2
-                if other[middle] < j:
-                    lo = middle + 1
-                else:
-                    hi = middle
-            if lo < begin[i + 1] and other[lo] == j:
-                at = lo
+        at = patches.place(pairs, i, j)
         known[found] = 0.0
         if at >= 0:
             if lasting[at, 0] >= reach and lasting[at, 1] >= edges:
