@@ -18,6 +18,10 @@ STALLED = 0.5
 FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
+FINER_IN_CONTACT = 0.1
+"""Part of the tolerances above which one more iteration is taken where parts touch: an impact magnifies
+what a step leaves, which depends on the number of ranks."""
+
 SLOWEST = 0.5
 """Fraction of the increment before above which increments are not extrapolated."""
 
@@ -82,7 +86,7 @@ class Convergence:
         self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
-        self._balanced = self._ended = False
+        self._balanced = self._ended = self._was_good = False
         self.corrected = 1.0
 
     @property
@@ -140,13 +144,25 @@ class Convergence:
             self.stopped_by = "" if balanced else "-snes_rtol"
             return int(Reason.CONVERGED_FNORM_RELATIVE)
         was_balanced, self._balanced = self._balanced, balanced
-        if balanced and self.left <= self._tolerances.step_tolerance * self.spacing:
+        near = self._tolerances.step_tolerance * self.spacing
+        if balanced and self.left <= near and not self._finer_in_contact(near):
             # which came last
             return int(Reason.CONVERGED_SNORM_RELATIVE if was_balanced else Reason.CONVERGED_FNORM_RELATIVE)
         if 0.0 < self.left <= stol * self.spacing:
             self.stopped_by = "" if balanced else "-snes_stol"
             return int(Reason.CONVERGED_SNORM_RELATIVE)
         return None
+
+    def _finer_in_contact(self, near: float) -> bool:
+        """Whether a solve that is good enough, with corrections below ``near`` [m], takes another iteration
+        as parts touch; collective.
+        """
+        discretisation, was_good = self._equations.discretisation, self._was_good
+        self._was_good = True
+        if was_good or not discretisation.guards:
+            return False
+        enough, part = self._force_tolerance(), FINER_IN_CONTACT
+        return (self.norm > part * enough or self.left > part * near) and discretisation.meets
 
     def _force_tolerance(self) -> float:
         """Residual norm [N] that the scene asks for."""

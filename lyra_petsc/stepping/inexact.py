@@ -18,6 +18,10 @@ each of which evaluates all pairs."""
 STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
+ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
+"""Of the one linear solve of a semi-implicit step. An impact magnifies what a solve leaves, which depends
+on the number of ranks, thirty to a hundred times."""
+
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
 

@@ -23,7 +23,7 @@ from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.conditioning import expected_iterations
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.extrapolation import Extrapolation
-from lyra_petsc.stepping.inexact import LOOSEST, STATIC
+from lyra_petsc.stepping.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
 from lyra_petsc.stepping.initial_guess import first_guess
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
@@ -206,7 +206,7 @@ class Stepper:
             ksp.setTolerances(rtol=LOOSEST if equations.integrator.moves else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
-            ksp.setTolerances(rtol=1e-6, max_it=5000)
+            ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.discretisation.guards else ONCE, max_it=5000)
             ksp.setInitialGuessNonzero(True)
         # what PETSc frees when Python is gone must not call it
         self._at_exit = weakref.finalize(self, _forget_python, ksp)

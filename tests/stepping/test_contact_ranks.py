@@ -25,6 +25,9 @@ SQUARE = grid(0.1, 0.1, 1, 1)
 FLOOR = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
 
 
+TURNED = {"rotate": {"axis": [0.3, 1.0, 0.5], "degrees": 20.0}}
+
+
 def falling(above: float) -> dict[str, Any]:
     return {
         "mesh": [
@@ -55,7 +58,7 @@ def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
 
 def two_sheets(folder: Path) -> dict[str, Any]:
     """One falls, turned, on one that is held by two of its edges."""
-    turned = {"rotate": {"axis": [0.3, 1.0, 0.5], "degrees": 20.0}, "translate": [0.05, 0.05, 0.08]}
+    turned = TURNED | {"translate": [0.05, 0.05, 0.08]}
     return {
         "mesh": [grid(0.3, 0.3, 6, 6), grid(0.2, 0.2, 5, 5) | {"transform": turned}],
         "handles": [{"nodes": [row * 7 for row in range(7)]}, {"nodes": [row * 7 + 6 for row in range(7)]}],
@@ -112,6 +115,32 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -
         simulation.destroy()
     for alone, together, tolerance in zip(*ways, (1e-8, 1e-6), strict=True):
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
+
+
+@pytest.mark.parametrize("integrator", ["semi-implicit", "beuler", "bdf2"])
+def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) -> None:
+    """An impact magnifies what a step leaves, which depends on the number of ranks."""
+    content = {
+        "mesh": grid(0.5, 0.5, 12, 12) | {"transform": TURNED | {"translate": [-0.25, -0.25, 0.35]}},
+        "gravity": [0.0, 0.0, -9.81],
+        "material": {"cloth": "gray-interlock", "damping": 0.01},
+        "initial": {"velocity": [0.0, 0.0, -10.0]},
+        "contact": {"friction": 0.3},
+        "obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, 0.1], "radius": 0.15}}},
+        "time": {"end": 1.0, "step": 0.004, "integrator": integrator},
+        "solver": {},
+    }
+    ways, contacts = [], 0.0
+    for ranks in (MPI.COMM_SELF, comm):
+        simulation = SteppedScene(ranks, scene_of(content))
+        for _ in range(20):
+            simulation.step()
+            contacts = max(contacts, simulation.ledger.columns()["contacts"])
+        size = simulation.problem.outline.size
+        ways.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        simulation.destroy()
+    assert contacts > 10.0
+    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
 
 
 def test_there_is_room_near_the_start_of_a_way() -> None:
