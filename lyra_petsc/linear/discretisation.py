@@ -32,6 +32,9 @@ Ints = NDArray[np.int64]
 TELLING = 6
 """Of the numbers that go with an element, how many tell it from others with its stencil."""
 
+SHORTER = 1.0, 0.25, 0.0625, 0.015625, 0.0
+"""Parts of a way that are searched one after the other, until there are not too many elements along it."""
+
 FEW = 0.1
 """Blocks that are of no use any longer, over all of fixed stencils, up to which they are kept."""
 
@@ -128,6 +131,7 @@ class Discretisation:
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
         self._way: tuple[Array, Array] | None = None  # along which what is near is known
         self._reach = 0.0  # how far from it points may be [m]
+        self._searched = 1.0  # part of the way that was asked for
         self._triangles: dict[Elastic, Ints] = {}  # where a rank has them all
         self._found: dict[Elastic, tuple[Ints, Ints | Array]] = {}
         self._extra = np.empty(0, dtype=np.int64)  # keys of the blocks that ``fixed`` has not
@@ -151,12 +155,12 @@ class Discretisation:
             return False
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
-            self._way = here.copy(), to.copy()
+            way = self._search(x, np.zeros_like(x) if ahead is None else ahead)
+            self._way = here.copy(), here + way[: len(here)]
             self._reach = 0.5 * min(term.skin for term in self._searching)
-        way = np.zeros_like(x) if ahead is None else ahead
         for term in asked:
-            searches = term.search_distance > 0.0
-            self._found[term] = self._search(term, x, way) if searches else self._sent(*term.known())
+            if term.search_distance == 0.0:
+                self._found[term] = self._sent(*term.known())
         more, fixed = layout.ghosts[:0], self._fixed_layout.ghosts
         if any(len(stencil) for stencil, _ in self._found.values()):
             end = layout.start + layout.n_owned
@@ -220,10 +224,13 @@ class Discretisation:
         reach = 0.5 * min(term.unseen for term in self._searching)
         x, way = x[:n], way[:n]
         start, end = self._way
-        from_start, back, from_end = _leaves_on(x, way, start, end, reach)
-        *left, apart = self.layout.largest(from_start, back, from_start or from_end)
-        if not apart:
-            return 1.0
+        for part in (1.0, self._searched):
+            from_start, back, from_end = _leaves_on(x, part * way, start, end, reach)
+            *left, apart = self.layout.largest(from_start, back, from_start or from_end)
+            if not apart:
+                return part
+            if self._searched in (0.0, 1.0):
+                break
         # near both ends of a short way there may be no room left at the one, and all at the other
         places = zip(left, (start, end), strict=True)
         less = self.layout.largest(
@@ -231,9 +238,22 @@ class Discretisation:
         )
         return -min(less)
 
-    def _search(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints]:
+    def _search(self, x: Array, way: Array) -> Array:
+        """Find the elements of all terms that search, along ways (n_local, 3) [m] that are shortened where
+        there would be too many; these ways; collective.
+        """
+        for part in SHORTER:
+            less = part * way
+            found = {term: self._near(term, x, less) for term in self._searching}
+            if not any(self.layout.largest(any(each is None for each in found.values()))):
+                break
+        self._searched = part
+        self._found |= {term: each for term, each in found.items() if each is not None}
+        return less
+
+    def _near(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints] | None:
         """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on
-        their ways (n_local, 3); collective.
+        their ways (n_local, 3); None if these are too long; collective.
         """
         layout, n = self.layout, self.layout.n_vertices
         own = layout.start + np.arange(n)
@@ -268,7 +288,10 @@ class Discretisation:
                 [_marked(place[surface], term), np.concatenate([order[at], corners[:, 3:]], axis=1)]
             )
         points, ways = np.concatenate([points, moves[:, 0]]), np.concatenate([ways, moves[:, 1]])
-        stencil, what = term.neighbours(points, ways, numbers, triangles)
+        found = term.neighbours(points, ways, numbers, triangles)
+        if found is None:
+            return None
+        stencil, what = found
         touching = (stencil < n).any(axis=1)
         return numbers[stencil[touching]], what[touching]
 

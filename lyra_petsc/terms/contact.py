@@ -64,6 +64,10 @@ SHARP = 0.5
 SKIN = 0.5
 """Over the gap, how far points may come nearer to each other between two searches."""
 
+MANY = 100
+"""Pairs per vertex above which shorter ways are looked at: a step of Newton's method may lead through all of
+a crumpled sheet, and none of that is gone at once."""
+
 STRAIN = 0.01
 """Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
 which takes Newton's method many iterations."""
@@ -326,7 +330,7 @@ class ContactBarrier(Elastic):
 
     # -- search ------------------------------------------------------------------------------------
 
-    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         if self.moving:
             self._places, self._extents = self._swept, None
         self.stale = False
@@ -334,14 +338,20 @@ class ContactBarrier(Elastic):
             self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
             self._taken = triangles
         boxes = self._sheets.boxes(x, way)
+        most = MANY * len(x) if way.any() else np.inf
         found = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.each:
             found += self._at_obstacles(x, way, boxes)
         if self.itself:
             reach = self.search_distance
             edges = reach - (1.0 - EDGES) * self.barrier.gap
-            found.append(self._sheets.pairs(x, way, numbers, reach, edges, boxes))
+            of_sheets = self._sheets.pairs(x, way, numbers, reach, edges, boxes, most)
+            if of_sheets is None:
+                return None
+            found.append(of_sheets)
         every = np.concatenate(found)
+        if len(every) > most:
+            return None
         if not len(every):
             return every[:, :4], every
         kind, obstacle, points = every[:, 0], every[:, 1], every[:, 2:6]

@@ -116,9 +116,10 @@ class SheetSearch:
         reach: float,
         edges: float | None = None,
         boxes: Array | None = None,
-    ) -> Ints:
+        most: float = math.inf,
+    ) -> Ints | None:
         """Rows (m, 7) of pairs that may come within ``reach`` [m] on their ways: kind, −1, vertices, and what
-        is around the triangle.
+        is around the triangle; None if there are more than ``most``.
 
         Two edges within ``edges`` [m], not more than ``reach``. ``boxes`` are those of `boxes`.
         """
@@ -155,7 +156,10 @@ class SheetSearch:
         while True:
             out, apart = np.empty((self._room, 7), dtype=np.int64), known.copy()
             between = met, known, more, apart, mean, whole
-            found = _pairs(x, way, *between, *given, numbers, *reaches, 3 * patches.SIZE, self._rings, out)
+            several = 3 * patches.SIZE, self._rings, most
+            found = _pairs(x, way, *between, *given, numbers, *reaches, *several, out)
+            if found > most:
+                return None
             if found <= self._room:
                 self._margins.learn(row, apart)
                 return out[:found]
@@ -251,19 +255,22 @@ def _near(around, a, others, lo, hi, reach, out):  # type: ignore[no-untyped-def
 @kernel()
 def _pairs(  # type: ignore[no-untyped-def]
     x, way, met, known, more, apart, mean, whole,
-    vertices, edges, triangles, numbers, reach, edges_reach, most, rings, out,
+    vertices, edges, triangles, numbers, reach, edges_reach, size_of_patch, rings, most, out,
 ):  # fmt: skip
-    """Rows of the near simplices of pairs of patches, as many as fit; how many there are.
+    """Rows of the near simplices of pairs of patches, as many as fit; how many there are, or more than
+    ``most``.
 
-    No patch has more than ``most`` vertices, edges or triangles. Vertices and triangles, and edges, of a pair
-    of patches that are ``known`` (n, 2) [m] to be apart are looked at where that is less than their reach;
-    ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``mean`` and
-    ``whole`` as of `_means` and `_around`.
+    No patch has more than ``size_of_patch`` vertices, edges or triangles. Vertices and triangles, and edges,
+    of a pair of patches that are ``known`` (n, 2) [m] to be apart are looked at where that is less than their
+    reach; ``apart`` takes what is known then, which is not beyond their reach and ``more`` (n,) [m]. ``mean``
+    and ``whole`` as of `_means` and `_around`.
     """
     found = 0
-    left, p, w = np.empty(most), np.empty((4, 3)), np.empty((4, 3))
-    points, hits = np.empty(4, np.int64), np.empty(most, np.int64)
+    left, p, w = np.empty(size_of_patch), np.empty((4, 3)), np.empty((4, 3))
+    points, hits = np.empty(4, np.int64), np.empty(size_of_patch, np.int64)
     for n in range(len(met)):
+        if found > most:
+            break
         for part in range(3):
             i, j = met[n]
             if part == 1:

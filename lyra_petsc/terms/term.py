@@ -271,12 +271,13 @@ class Elastic(Term):
 
     # -- terms whose stencils change ---------------------------------------------------------------
 
-    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints]:
+    def neighbours(self, x: Array, way: Array, numbers: Ints, triangles: Ints) -> tuple[Ints, Ints] | None:
         """Elements (E, n) among points x (N, 3) [m] that are nearer to each other than ``search_distance``.
 
         And whole numbers (E, m) that go with each; ``take`` gets them as data ``what``. ``numbers`` (N,) are
         the points' global numbers, ``triangles`` (F, 3 or 4) near ones of ``surface``. Where ``unseen``
-        is given, also those that come so near on their straight ways (N, 3) [m]. Ranks that see the same
+        is given, also those that come so near on their straight ways (N, 3) [m]; None where these are so long
+        that there are too many: it is asked again with shorter ones. Ranks that see the same
         points must name them in the same order within an element; the owner of the first counts it.
         """
         raise NotImplementedError
