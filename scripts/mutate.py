@@ -299,7 +299,7 @@ CHANGES: list[Change] = [
         ("tests/scene/test_material_library.py",),
     ),
     Change(
-        "lyra_petsc/mesh/grids.py",
+        "lyra_petsc/mesh/build.py",
         "cell[:, [[0, 1, 3], [1, 2, 3]]]",
         "cell[:, [[0, 1, 3], [1, 3, 2]]]",
         ("tests/mesh/test_grids.py",),
@@ -341,7 +341,7 @@ CHANGES: list[Change] = [
         ("tests/mesh/test_crossings.py",),
     ),
     Change(
-        "lyra_petsc/mesh/overlaps.py",
+        "lyra_petsc/mesh/start_crossings.py",
         "reach = radius - _rounding(",
         "reach = radius + _rounding(",
         ("tests/mesh/test_overlaps.py",),

@@ -17,8 +17,8 @@ from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_fence import in_words, standing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.json_schema import schema_text
+from lyra_petsc.scene.load import default_scene
 from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.simulation import SteppedScene

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.mesh.overlaps import Overlaps
+from lyra_petsc.mesh.start_crossings import Overlaps
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_crossings import RunCrossings

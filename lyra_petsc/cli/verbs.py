@@ -12,11 +12,9 @@ from typing import Any
 import click
 
 from lyra_petsc import __version__
-from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
 from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, trust_mesh, verb
-from lyra_petsc.cli.render import render
-from lyra_petsc.cli.report import report
+from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError, nearest
 

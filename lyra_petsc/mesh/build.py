@@ -1,4 +1,4 @@
-"""From the mesh sources of a scene to one checked mesh; serial, for rank 0."""
+"""From the mesh sources of a scene, files and grids, to one checked mesh; serial, for rank 0."""
 
 from __future__ import annotations
 
@@ -10,13 +10,127 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
-from lyra_petsc.mesh.grids import grid_sheet, grid_vertices
-from lyra_petsc.mesh.groups import GroupTable
 from lyra_petsc.mesh.measures import lay_out
-from lyra_petsc.mesh.mesh import Mesh, Sheet, Source, TriangleSurface
-from lyra_petsc.mesh.orientation import orient
-from lyra_petsc.mesh.validate import check_shape, check_topology
-from lyra_petsc.scene.schema import MeshSource, Rotation, Scene, Transform
+from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
+from lyra_petsc.mesh.select import DIMENSION_NAMES
+from lyra_petsc.mesh.validate import check_shape, check_topology, orient
+from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
+
+
+def grid_sheet(grid: Grid) -> Sheet:
+    """Triangles of an nx × ny grid of cells, from the origin to (width, height, 0).
+
+    Vertex ``j (nx + 1) + i`` lies at column i, row j. ``diagonal`` joins (i, j) to (i+1, j+1);
+    ``alternating`` flips that where i + j is odd; ``criss-cross`` adds the centre of cell (i, j) as
+    vertex ``(nx + 1)(ny + 1) + j nx + i``. All triangles run anticlockwise seen from +z, those of a
+    cell follow each other. Groups: surface ``sheet``, curves ``left``, ``right``, ``bottom``, ``top``,
+    points ``corners``.
+    """
+    nx, ny = grid.nx, grid.ny
+    points = _lattice(nx, ny, grid.width, grid.height)
+    low_left = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)[None, :]).reshape(-1)
+    cell = np.stack([low_left, low_left + 1, low_left + nx + 2, low_left + nx + 1], axis=1)
+    if grid.pattern == "criss-cross":
+        points = np.concatenate([points, points[cell[:, [0, 2]]].mean(axis=1)])
+        centre = np.arange(nx * ny) + (nx + 1) * (ny + 1)
+        triangles = np.stack(
+            [np.stack([cell[:, k], cell[:, (k + 1) % 4], centre], axis=1) for k in range(4)], axis=1
+        )
+    else:
+        column, row = np.arange(nx)[None, :], np.arange(ny)[:, None]
+        flipped = ((column + row) % 2 == 1).reshape(-1) & (grid.pattern == "alternating")
+        triangles = np.where(
+            flipped[:, None, None],
+            cell[:, [[0, 1, 3], [1, 2, 3]]],
+            cell[:, [[0, 1, 2], [0, 2, 3]]],
+        )
+    triangles = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.int64)
+    return Sheet(points, triangles, groups=_grid_groups(nx, ny, len(triangles)))
+
+
+def grid_vertices(grid: Grid) -> int:
+    """Number of vertices of a grid."""
+    nx, ny = grid.nx, grid.ny
+    return (nx + 1) * (ny + 1) + (nx * ny if grid.pattern == "criss-cross" else 0)
+
+
+def _lattice(nx: int, ny: int, width: float, height: float) -> NDArray[np.float64]:
+    points = np.zeros(((nx + 1) * (ny + 1), 3))
+    points[:, 0] = np.tile(np.linspace(0.0, width, nx + 1), ny + 1)
+    points[:, 1] = np.repeat(np.linspace(0.0, height, ny + 1), nx + 1)
+    return points
+
+
+def _grid_groups(nx: int, ny: int, n_triangles: int) -> list[NamedSet]:
+    across, up = np.arange(nx + 1, dtype=np.int64), np.arange(ny + 1, dtype=np.int64) * (nx + 1)
+    chains = {"left": up, "right": up + nx, "bottom": across, "top": across + ny * (nx + 1)}
+    groups = [NamedSet("sheet", 2, np.arange(n_triangles, dtype=np.int64))]
+    for name, chain in chains.items():
+        groups.append(NamedSet(name, 1, np.stack([chain[:-1], chain[1:]], axis=1)))
+    groups.append(NamedSet("corners", 0, np.array([0, nx, up[-1], up[-1] + nx], dtype=np.int64)))
+    return groups
+
+
+Ints = NDArray[np.int64]
+
+
+class GroupTable:
+    """Collects the groups of each source, then makes one dictionary of them."""
+
+    def __init__(self) -> None:
+        self._members: dict[tuple[str, int], list[Ints]] = {}
+
+    def add(
+        self,
+        groups: list[NamedSet],
+        source: str | None,
+        n_triangles: int,
+        first_vertex: int,
+        first_triangle: int,
+    ) -> None:
+        """Take the groups of one source of ``n_triangles``, numbered from the given vertex and triangle."""
+        for group in groups:
+            members = group.members + (first_triangle if group.dimension == 2 else first_vertex)
+            self._put(group.name, group.dimension, members)
+            if source is not None:
+                self._put(f"{source}.{group.name}", group.dimension, members)
+        if source is not None:
+            self._put(source, 2, np.arange(first_triangle, first_triangle + n_triangles, dtype=np.int64))
+
+    def finish(self, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
+        """Groups by unique name, and a note for each name that had to change.
+
+        ``triangles`` is (F, 3), of the whole mesh.
+        """
+        groups: dict[str, Group] = {}
+        notes: list[str] = []
+        # surfaces first: they keep the name, as materials can be told by surface groups only
+        for name, dimension in sorted(self._members, key=lambda entry: -entry[1]):
+            members = np.concatenate(self._members[name, dimension])
+            unique = name
+            while unique in groups:
+                unique = f"{unique}.{DIMENSION_NAMES[dimension]}"
+            if unique != name:
+                notes.append(
+                    f"group '{name}' is used for several dimensions; that of {DIMENSION_NAMES[dimension]}s "
+                    f"is called '{unique}'"
+                )
+            groups[unique] = _group(dimension, members, triangles)
+        return groups, notes
+
+    def _put(self, name: str, dimension: int, members: Ints) -> None:
+        self._members.setdefault((name, dimension), []).append(members)
+
+
+def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
+    no_triangles, no_edges = np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+    if dimension == 2:
+        inside = np.unique(members)
+        return Group(2, np.unique(triangles[inside]), inside, no_edges)
+    if dimension == 1:
+        edges = np.unique(np.sort(members, axis=1), axis=0)
+        return Group(1, np.unique(edges), no_triangles, edges)
+    return Group(0, np.unique(members), no_triangles, no_edges)
 
 
 def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import reason, replace_text
 from lyra_petsc.output.hdf5 import NewFile, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.xdmf import MESH_FILE, StoredField, TimeSeries, WrittenState, group_name

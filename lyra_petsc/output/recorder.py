@@ -12,8 +12,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import reason, replace_text
 from lyra_petsc.output.background import Background
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
 from lyra_petsc.output.failure_files import StateInTime, remove_failure, write_failure

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
-from lyra_petsc.mesh.overlaps import Overlaps
-from lyra_petsc.mesh.start_crossings import overlaps_of
+from lyra_petsc.mesh.start_crossings import Overlaps, overlaps_of
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_obstacles import run_obstacles
 

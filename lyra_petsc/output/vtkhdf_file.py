@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.atomic import replace_bytes
+from lyra_petsc.output.agreement import HDF5_ERRORS, reason, replace_bytes
 from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor

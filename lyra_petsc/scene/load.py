@@ -175,3 +175,10 @@ def _check_mesh_file(file: Path, key: str, scene: Path | None) -> None:
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
     raise InputError(f"{what}: {file}", file=scene, key=key)
+
+
+def default_scene() -> Path:
+    """The scene of a run without one: in the wheel beside the package's modules, else in the checkout."""
+    package = Path(__file__).resolve().parent.parent
+    inside = package / "configs" / "flag.yaml"
+    return inside if inside.exists() else package.parent / "configs" / "flag.yaml"

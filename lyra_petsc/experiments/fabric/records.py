@@ -12,7 +12,7 @@ from typing import Any
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
 from lyra_petsc.experiments.results import Line, View
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -263,13 +262,10 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
     InputError
         If the launched program refuses what it was asked for.
     """
-    with tempfile.TemporaryDirectory(prefix="lyra-stress-") as folder:
-        code, words = launcher([*asked, "--only", case.name, "--job", folder], watch)
-        outcome = restore(Path(folder), case)
+    words = [*asked, "--only", case.name]
+    outcome, told = launcher.restored(words, watch, lambda folder: restore(folder, case))
     if outcome is None:
-        if code == InputError.exit_code:
-            raise InputError(words)
-        record = Record(case.steps, stopped=words)
+        record = Record(case.steps, stopped=told)
         outcome = StressOutcome(case, of_physics(record), record=record)
     return outcome
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.extras import missing
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import in_use

@@ -27,8 +27,8 @@ from lyra_petsc.show.render.render_plan import scene_shown
 from lyra_petsc.show.render.scene_drawing import Bounds, near_points, wind_arrows
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
-from lyra_petsc.show.view.access import Access
 from lyra_petsc.show.view.cloth import Cloth
+from lyra_petsc.show.view.server import Access
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface

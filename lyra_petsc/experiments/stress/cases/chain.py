@@ -18,7 +18,7 @@ from lyra_petsc.experiments.case import Verdict
 from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import QUICK, USUAL, Content, Setting, StressCase, family
 from lyra_petsc.experiments.verification.answers import isotropic
-from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
+from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
 
 Array = NDArray[np.float64]
 

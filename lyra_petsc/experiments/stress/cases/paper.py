@@ -24,9 +24,8 @@ from lyra_petsc.experiments.stress.stress_scenes import (
     scale,
 )
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.default import default_scene
 from lyra_petsc.scene.dump import dump_scene
-from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.load import default_scene, load_scene
 from lyra_petsc.scene.text import parse_yaml
 
 KINETIC, SPREAD = 0.4646114, 0.0030549
