@@ -323,13 +323,13 @@ CHANGES: list[Change] = [
         ("tests/mesh/test_measure.py",),
     ),
     Change(
-        "lyra_petsc/mesh/orient3d.py",
+        "lyra_petsc/mesh/crossings.py",
         "_RELATIVE = (7.0 + 56.0 * _HALF_ULP) * _HALF_ULP",
         "_RELATIVE = 0.0",
         ("tests/mesh/test_crossings.py::test_sides_of_points_within_rounding_of_a_plane[0.0]",),
     ),
     Change(
-        "lyra_petsc/mesh/orient3d.py",
+        "lyra_petsc/mesh/crossings.py",
         "if part != 0.0 and not _LEAST < part < _MOST:",
         "if False:",
         ("tests/mesh/test_crossings.py::test_sides_that_only_expansions_or_rational_numbers_tell",),

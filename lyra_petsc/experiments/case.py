@@ -163,6 +163,11 @@ class Registry(Generic[T]):
         return [self.load(name) for name in self.modules]
 
 
+def in_modules(*modules: tuple[str, str]) -> dict[str, str]:
+    """Names and their modules, of modules and the names that each defines, in the order of both."""
+    return {name: module for module, names in modules for name in names.split()}
+
+
 Watch = Callable[[], None]
 """Called before every step, or again and again while a process runs; may raise to end the work."""
 

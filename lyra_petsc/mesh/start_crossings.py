@@ -12,8 +12,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
@@ -21,10 +21,6 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.scene.schema import Scene
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ROUNDING = 1e-14
 """Depth that may be rounding, over the largest coordinate and radius: some fifty units in the last place."""

@@ -32,6 +32,11 @@ def missing_folder(path: Path) -> str:
     return "" if path.parent.is_dir() else os.strerror(errno.ENOENT)
 
 
+def cannot_write(path: Path, error: BaseException) -> OutputError:
+    """The refusal of a file that could not be written."""
+    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
+
+
 def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
     """Raise on every rank the problem of the lowest rank that has one. Collective.
 
@@ -97,4 +102,4 @@ def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:
         os.replace(part, path)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+        raise cannot_write(path, error) from error

@@ -14,8 +14,6 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
 from lyra_petsc.scene.values import shown
 
-__all__ = ["dump_scene", "load_scene"]
-
 # A JSON file with one of these is a scene of ours, not one of the original program.
 _OUR_KEYS = {"mesh", "material", "time"}
 

@@ -153,11 +153,11 @@ class Fabric(View[FabricOutcome]):
             yield common
 
     def told(self, outcome: FabricOutcome) -> dict[str, Any]:
-        numbers = [
-            {key: None if value != value else value for key, value in vars(number).items()}
-            for number in outcome.record.numbers
-        ]
-        return {"numbers": numbers, "passed": outcome.passed, "wall_seconds": outcome.seconds}
+        return {
+            "numbers": [vars(number) for number in outcome.record.numbers],
+            "passed": outcome.passed,
+            "wall_seconds": outcome.seconds,
+        }
 
     def page(self, report: Report, outcomes: Sequence[FabricOutcome], summary: str, *, drawn: bool) -> None:
         self._outcomes = outcomes

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError, nearest
 from lyra_petsc.experiments.bench import Bench, Trial, problem_of
 from lyra_petsc.experiments.case import Launcher, Watch
@@ -44,13 +44,11 @@ from lyra_petsc.experiments.fabric.records import (
     restore,
 )
 from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
-from lyra_petsc.experiments.meshes import Ints, irregular_rectangle, rectangle
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
 from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 TOLERANCES = {"force_tolerance": 1e-8, "step_tolerance": 1e-8}
 

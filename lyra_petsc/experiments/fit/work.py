@@ -12,20 +12,21 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from lyra_petsc.api.scenes import SceneLike, load
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, in_python
 from lyra_petsc.experiments.case import Watch, load_record, save_record
 from lyra_petsc.experiments.fit.estimate import Conclusion, Trial, Unknown, conclude, refuse_idle, search
 from lyra_petsc.experiments.fit.model import Model, check_keys, value_of
 from lyra_petsc.experiments.fit.readings import Reading, readings_of, readings_without_values
-from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose
+from lyra_petsc.output.run_folder import FolderKind, RunDirectory, choose, present
 from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.fit_block import Quantity
@@ -34,17 +35,10 @@ from lyra_petsc.scene.overrides import plain
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import shown
 
-Array = NDArray[np.float64]
-
 TRIALS_FILE = "trials.json"
 
 FARTHEST = 1e8
 """Uncertainties by which a start may miss a measurement: beyond, rounding errors of a simulation count."""
-
-
-def _resumable(folder: Path) -> list[Path]:
-    """The evaluations from which a fit can go on."""
-    return [file for file in [folder / TRIALS_FILE] if file.is_file()]
 
 
 FIT = FolderKind(
@@ -52,7 +46,7 @@ FIT = FolderKind(
     Path("fits"),
     "fit.lock",
     re.compile(r"(trials\.json|fit\.(csv|json)|report\.(html|md)|[\w-]+\.(png|svg))(\.part)?"),
-    _resumable,
+    partial(present, TRIALS_FILE),
     "no evaluations to go on from",
     folders=("plots",),
 )
@@ -114,7 +108,7 @@ class Fitted:
     trials: list[Trial]
     words: str
     shapes: tuple[Array | None, Array | None]
-    triangles: NDArray[np.int64] | None
+    triangles: Ints | None
     runs: int
     seconds: float
 
@@ -311,9 +305,6 @@ def _read(path: Path, new: Trials) -> Trials:
             "another folder",
             file=path,
         )
-    for trial in found.trials:
-        for name in ("numbers", "residuals", "jacobian"):
-            setattr(trial, name, np.asarray(getattr(trial, name), dtype=np.float64))
     return found
 
 

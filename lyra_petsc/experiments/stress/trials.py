@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, problem_of
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, read_record, save_record
@@ -37,8 +37,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
 from lyra_petsc.show.report.plots import Series, over_time, surface
-
-Array = NDArray[np.float64]
 
 LONGEST = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
 """Wall seconds [s], but for those in which kernels are compiled, after which a case is ended between two

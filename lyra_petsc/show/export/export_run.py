@@ -16,7 +16,7 @@ from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
-from lyra_petsc.show.export.exported_states import choose
+from lyra_petsc.show.export import formats
 
 OURS = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
 """Files that an export writes: --force removes no folder that holds others."""
@@ -114,13 +114,11 @@ def export_run(
     found = StoredRun(run)
     folder = out if out is not None else found.folder / to
     check_folder(folder, force=force)
-    states = replace(choose(found, times, every), displacement=displacement)
+    states = replace(formats.choose(found, times, every), displacement=displacement)
     # without characters that Windows or a shell treats specially; letters of any script stay
     name = re.sub(r"[^\w.+-]", "_", found.name).strip(".") or "run"
 
     def work(part: Path) -> None:
-        from lyra_petsc.show.export import formats
-
         getattr(formats, f"write_{to}")(states, part, name)
         if FORMATS[to].sequence and len(states) > 1:
             with open(part / "times.csv", "w", encoding="utf-8", newline="") as file:

@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.verification.answers import (
@@ -33,6 +32,7 @@ from lyra_petsc.experiments.verification.flat_plates import (
     DENSITY,
     KINDS,
     MEMBRANE,
+    lowest_squares,
     plate_material,
     strip,
     strip_mesh,
@@ -45,7 +45,6 @@ from lyra_petsc.experiments.verification.rods import (
     overhang_weight,
     tall_cantilever,
 )
-from lyra_petsc.experiments.verification.spectrum import lowest_squares
 from lyra_petsc.parallel import on_root
 
 COUNTS: dict[str, Any] = {"quick": 1, "counts": "cells along the strip"}
@@ -357,8 +356,6 @@ def elastica_overhang(bench: Bench, n: float) -> Iterator[Measured]:
     angles = {"one cell": (7.1, 41.5), "0.1 L": (45.0,), "0.25 L": (41.5,)}
     yield from _overhangs(bench, directed(bench, n, angles), cloth)
 
-
-Array = NDArray[np.float64]
 
 COLUMNS: dict[str, tuple[list[dict[str, Any]], float]] = {
     "pinned": ([{"group": "left"}, {"group": "right"}], math.pi**2),

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.drape import (
     CLOTH,
@@ -40,8 +40,6 @@ from lyra_petsc.experiments.verification.flat_plates import plate_material
 from lyra_petsc.output.fields import FIELDS
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.terms.contact import ContactBarrier
-
-Array = NDArray[np.float64]
 
 G = 9.81
 SLOPES = (5.0, 30.0, 60.0)
@@ -419,8 +417,6 @@ def layers(bench: Bench, n: float) -> Iterator[Measured]:
     yield Measured("way on the others", way, 0.5 * PUSH**2 / slows, "m")
     yield Measured("work of friction", work, 0.5 * float(mass[top].sum()) * PUSH**2 * (1.0 - part), "J")
 
-
-Ints = NDArray[np.int64]
 
 # -- ruck ------------------------------------------------------------------------------------------------
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.experiments.bench import Bench, Trial, direct_solver
 from lyra_petsc.experiments.verification.answers import (
     ASSEMBLED,
@@ -35,9 +35,6 @@ from lyra_petsc.experiments.verification.flat_plates import DENSITY, strip
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 BENDING_TERMS = ("bending", "clamp")
 
@@ -115,7 +112,7 @@ class Stiffness:
     rows: Ints
     columns: Ints
     values: Array
-    held: NDArray[np.bool_]
+    held: Mask
 
     def dense(self) -> Array:
         """The matrix of the free heights (n_free, n_free)."""
@@ -319,7 +316,7 @@ CELLS = 8
 ENTRIES = {"D11": (0, 0), "D22": (1, 1), "D12": (0, 1), "D13": (0, 2), "D23": (1, 2), "D33": (2, 2)}
 
 
-def _lattice(mesh: str) -> NDArray[np.float64]:
+def _lattice(mesh: str) -> Array:
     """Edge vectors [m] of the smallest cell, as columns."""
     if mesh == "equilateral":
         return np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])

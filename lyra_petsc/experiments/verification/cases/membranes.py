@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
 from lyra_petsc.experiments.verification.answers import (
@@ -26,7 +27,7 @@ from lyra_petsc.experiments.verification.answers import (
     isotropic,
     scene,
 )
-from lyra_petsc.experiments.verification.spectrum import lowest_modes
+from lyra_petsc.experiments.verification.flat_plates import lowest_modes
 
 DATA = data("patch_states")
 BASE, HEIGHT = 1.0, 0.7
@@ -281,7 +282,7 @@ def hanging_chain(bench: Bench, n: float) -> Sequence[Measured]:
     ]
 
 
-def _hanging(y: NDArray[np.float64], n: float) -> NDArray[np.float64]:
+def _hanging(y: Array, n: float) -> Array:
     """Heights at which every bar between two rows carries what hangs below its middle."""
     tension = DENSITY * G * LENGTH * (np.arange(int(n)) + 0.5) / n
     # λ³ − λ = 2 T/C by two Newton steps from the linear answer

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import SIDES
 from lyra_petsc.experiments.verification.answers import (
@@ -26,11 +26,8 @@ from lyra_petsc.experiments.verification.answers import (
     farthest,
     scene,
 )
-from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, plate_material
-from lyra_petsc.experiments.verification.spectrum import lowest_modes
+from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, lowest_modes, plate_material
 from lyra_petsc.terms.midedge import MidEdge
-
-Array = NDArray[np.float64]
 
 EXACT = data("linear_plate")
 AT_ONCE = STATIC | {"step": 1.0}
