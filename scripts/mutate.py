@@ -299,7 +299,7 @@ CHANGES: list[Change] = [
         ("tests/scene/test_material_library.py",),
     ),
     Change(
-        "lyra_petsc/mesh/grids.py",
+        "lyra_petsc/mesh/build.py",
         "cell[:, [[0, 1, 3], [1, 2, 3]]]",
         "cell[:, [[0, 1, 3], [1, 3, 2]]]",
         ("tests/mesh/test_grids.py",),
@@ -323,13 +323,13 @@ CHANGES: list[Change] = [
         ("tests/mesh/test_measure.py",),
     ),
     Change(
-        "lyra_petsc/mesh/orient3d.py",
+        "lyra_petsc/mesh/crossings.py",
         "_RELATIVE = (7.0 + 56.0 * _HALF_ULP) * _HALF_ULP",
         "_RELATIVE = 0.0",
         ("tests/mesh/test_crossings.py::test_sides_of_points_within_rounding_of_a_plane[0.0]",),
     ),
     Change(
-        "lyra_petsc/mesh/orient3d.py",
+        "lyra_petsc/mesh/crossings.py",
         "if part != 0.0 and not _LEAST < part < _MOST:",
         "if False:",
         ("tests/mesh/test_crossings.py::test_sides_that_only_expansions_or_rational_numbers_tell",),
@@ -341,7 +341,7 @@ CHANGES: list[Change] = [
         ("tests/mesh/test_crossings.py",),
     ),
     Change(
-        "lyra_petsc/mesh/overlaps.py",
+        "lyra_petsc/mesh/start_crossings.py",
         "reach = radius - _rounding(",
         "reach = radius + _rounding(",
         ("tests/mesh/test_overlaps.py",),

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.quick
 PACKAGE = Path(__file__).resolve().parent.parent / "lyra_petsc"
 
 LEVELS = [
-    {"errors"},
+    {"arrays", "errors"},
     {"extras", "parallel", "phases"},
     {"kernels"},
     {"scene"},

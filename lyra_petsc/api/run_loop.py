@@ -14,9 +14,9 @@ from petsc4py import PETSc
 from lyra_petsc.api.waiting import Waiting
 from lyra_petsc.errors import InputError, Interrupted, LyraError, OutputError, SolverError
 from lyra_petsc.linear.petsc_options import unused
-from lyra_petsc.output.h5py_loader import import_ahead
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.output.run_folder import FolderChoice, RunDirectory
+from lyra_petsc.output.self_contained import import_ahead
 from lyra_petsc.output.summary import read_summary, versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases

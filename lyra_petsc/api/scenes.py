@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from lyra_petsc.errors import InputError, in_python
-from lyra_petsc.scene.default import default_scene
-from lyra_petsc.scene.load import load_scene, scene_of
+from lyra_petsc.scene.load import default_scene, load_scene, scene_of
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.values import shown
 

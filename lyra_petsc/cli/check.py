@@ -8,22 +8,19 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from rich.console import Console
 from rich.table import Table
 
+from lyra_petsc.arrays import Ints
 from lyra_petsc.cli.run import read_scene, say
 from lyra_petsc.mesh.gmsh_fence import in_words, standing
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.default import default_scene
-from lyra_petsc.scene.json_schema import schema_text
+from lyra_petsc.scene.load import default_scene
 from lyra_petsc.scene.schema import Contact, Friction, Scene, coefficients
 from lyra_petsc.scene.values import one_line
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Counts = NDArray[np.int64]
 
 LISTED_RANKS = 16
 """Ranks shown one by one; of more, only the extremes."""
@@ -48,7 +45,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
             points.n_owned,
             points.n_local - points.n_owned,
             pattern.n_couplings,
-            _elements(simulation),
+            sum(term.n_elements for term in problem.terms.values()),
             points.n_vertices,
             points.n_edges,
         ]
@@ -59,17 +56,7 @@ def check(comm: MPI.Comm, path: Path | None, settings: Sequence[str], *, trust_m
     simulation.destroy()
 
 
-def print_schema(comm: MPI.Comm) -> None:
-    """Print the JSON Schema of scene files on rank 0."""
-    if comm.rank == 0:
-        print(schema_text(), end="")
-
-
-def _elements(simulation: SteppedScene) -> int:
-    return sum(term.n_elements for term in simulation.problem.terms.values())
-
-
-def _print(simulation: SteppedScene, path: Path, ranks: Counts) -> None:
+def _print(simulation: SteppedScene, path: Path, ranks: Ints) -> None:
     problem, scene, control = simulation.problem, simulation.scene, simulation.control
     outline = problem.outline
     blocks = int(ranks[:, 2].sum())
@@ -158,7 +145,7 @@ def _count(ratio: float) -> float:
     return math.ceil(ratio - 1e-9) if math.isfinite(ratio) else ratio
 
 
-def _rank_table(ranks: Counts) -> Table:
+def _rank_table(ranks: Ints) -> Table:
     """What each rank has; ghosts are rows of vertices, and of edges three to a row."""
     edges = ["owned edges"] if ranks[:, 5].any() else []
     heads = ["rank", "owned vertices", *edges, "ghosts", "ghost share", "blocks", "elements"]
@@ -174,7 +161,7 @@ def _rank_table(ranks: Counts) -> Table:
     return table
 
 
-def _megabytes(ranks: Counts) -> float:
+def _megabytes(ranks: Ints) -> float:
     """Matrix and preconditioner, their assembly buffers, and element constants, roughly."""
     return float((ranks[:, 2] * 9 * 8 * 4 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 

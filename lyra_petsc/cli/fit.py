@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.api.mpirun import environment, find_launcher
 from lyra_petsc.cli.experiments import command, petsc_words, watched, words_of
-from lyra_petsc.cli.progress import LINE_AT_LEAST_SECONDS, ProgressBar, duration
+from lyra_petsc.cli.progress import ProgressBar, duration
 from lyra_petsc.cli.run import petsc_speaks, tell_unused
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Case
@@ -30,22 +30,15 @@ class FitProgress(ProgressBar, Observer):
 
     def __init__(self, comm: MPI.Comm, *, plain: bool) -> None:
         super().__init__(comm, plain=plain)
-        self._last, self._cost = self._clock(), ""
+        self._cost = ""
 
     def progress(self, number: int, part: float) -> None:
-        if not self._shown:
-            return
-        state = f"evaluation {number}{self._cost}"
-        self._draw(min(part, 0.999), state)
-        if self._bar is None and self._clock() - self._last >= LINE_AT_LEAST_SECONDS:
-            self._last = self._clock()
-            self.say(f"{part:4.0%}  {state}")
+        self._show(min(part, 0.999), f"evaluation {number}{self._cost}")
 
     def trial(self, number: int, trial: Trial, *, resumed: bool) -> None:
         self._cost = f"  sum of squares {2.0 * trial.cost:.5g}"
         again = " (from before)" if resumed else ""
-        self.say(f"evaluation {number}{self._cost}{again}")
-        self._last = self._clock()
+        self._line(f"evaluation {number}{self._cost}{again}")
 
 
 def fit(
@@ -110,7 +103,6 @@ def fit(
         outcome = results.outcomes[0]
         for line in view.terminal(outcome):
             click.echo(line)
-        assert outcome.fitted is not None
         told = f"{len(outcome.fitted.trials)} evaluations in {duration(outcome.fitted.seconds)}"
         click.echo(f"{told}; results: {folder}")
         if note:

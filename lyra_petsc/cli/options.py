@@ -12,17 +12,22 @@ from typing import Any
 
 import click
 
-
-def _show_help(ctx: click.Context, param: click.Parameter, value: bool) -> None:
-    if value and not ctx.resilient_parsing:
-        if ctx.obj.rank == 0:
-            click.echo(ctx.get_help())
-        ctx.exit()
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-helped = click.option(
-    "--help", is_flag=True, is_eager=True, expose_value=False, callback=_show_help, help="Show this and exit."
-)
+def tells(name: str, text: Callable[[click.Context], str], says: str) -> Decorator:
+    """An option that prints a text on rank 0 and ends."""
+
+    def tell(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        if value and not ctx.resilient_parsing:
+            if ctx.obj.rank == 0:
+                click.echo(text(ctx))
+            ctx.exit()
+
+    return click.option(name, is_flag=True, is_eager=True, expose_value=False, callback=tell, help=says)
+
+
+helped = tells("--help", click.Context.get_help, "Show this and exit.")
 
 
 SETTINGS: dict[str, Any] = {"help_option_names": [], "token_normalize_func": None}

@@ -50,7 +50,7 @@ class ProgressBar:
     ) -> None:
         self._shown = comm.rank == 0
         self._stream, self._clock = stream or sys.stderr, clock
-        self._began, self._drawn = clock(), -math.inf
+        self._drawn, self._told = -math.inf, clock()
         self._first: tuple[float, float] | None = None
         self._bar: Bar | None = None
         if self._shown and not plain and self._stream.isatty():
@@ -77,6 +77,16 @@ class ProgressBar:
             if fraction >= 1.0 or self._clock() - self._drawn >= REDRAW_SECONDS:
                 self._drawn = self._clock()
                 self._bar.refresh()
+
+    def _show(self, fraction: float, state: str, seconds: float = LINE_AT_LEAST_SECONDS) -> None:
+        """Move the bar, or print a line where none has come for so many seconds."""
+        self._draw(fraction, state)
+        if self._bar is None and self._clock() - self._told >= seconds:
+            self._line(f"{fraction:4.0%}  {state}")
+
+    def _line(self, text: str) -> None:
+        self.say(text)
+        self._told = self._clock()
 
     def _left(self, done: float, whole: float = 1.0) -> float:
         """Estimated seconds left, at the mean speed since the first call; NaN at the first call."""
@@ -167,14 +177,14 @@ class Progress(ProgressBar):
         far = fraction - self._fraction_shown >= LINE_FRACTION - 1e-9
         if since >= LINE_SECONDS and (self._last_shown is None or far or since >= LINE_AT_LEAST_SECONDS):
             self._last_shown, self._fraction_shown = now, fraction
-            self._line()
+            self._say_latest()
 
     def close(self) -> None:
         """Show the last step and leave the terminal as it was."""
         super().close()
-        self._line()
+        self._say_latest()
 
-    def _line(self) -> None:
+    def _say_latest(self) -> None:
         if self._latest is not None:
             self.say(self._latest)
             self._latest = None
@@ -187,18 +197,13 @@ class FrameProgress(ProgressBar):
 
     def __init__(self, comm: MPI.Comm, **options: Any) -> None:
         super().__init__(comm, **options)
-        self._last_line, self._first = self._began, (self._began, 0.0)
+        self._first = self._told, 0.0
 
     def update(self, done: int, count: int) -> None:
         """Show how many of the states are drawn."""
-        if not self._shown:
-            return
-        now = self._clock()
-        text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
-        self._draw(done / count, text)
-        if self._bar is None and now - self._last_line >= self.LINE_SECONDS:
-            self._last_line = now
-            self.say(f"{done / count:4.0%}  {text}")
+        if self._shown:
+            text = f"{done} of {count} states drawn  {duration(self._left(done, count))} left"
+            self._show(done / count, text, self.LINE_SECONDS)
 
 
 class StudyProgress(ProgressBar):
@@ -218,8 +223,7 @@ class StudyProgress(ProgressBar):
     def __init__(self, comm: MPI.Comm, stop: Callable[[], None], combinations: int, **options: Any) -> None:
         super().__init__(comm, **options)
         self._stop, self._combinations = stop, combinations
-        self._label, self._number = "", 0
-        self._last_shown = -math.inf
+        self._label, self._number, self._told = "", 0, -math.inf
 
     def case(self, label: str, *, resumed: bool) -> None:
         """A case begins, or was found finished."""
@@ -236,19 +240,11 @@ class StudyProgress(ProgressBar):
             return
         fraction = min(max(done / whole, 0.0), 1.0) if whole > 0.0 else 1.0
         # what was finished before took no time now
-        state = f"{self._label}  {duration(self._left(done, whole))} left"
-        self._draw(fraction, state)
-        if self._bar is None and self._clock() - self._last_shown >= LINE_AT_LEAST_SECONDS:
-            self._line(f"{fraction:4.0%}  {state}")
+        self._show(fraction, f"{self._label}  {duration(self._left(done, whole))} left")
 
     def note(self, text: str) -> None:
         """A line for the user, above the bar."""
         self._line(f"note: {text}")
-
-    def _line(self, text: str) -> None:
-        self.say(text)
-        if self._bar is None:
-            self._last_shown = self._clock()
 
 
 def closing_table(

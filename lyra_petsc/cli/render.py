@@ -1,14 +1,16 @@
-"""``render``: pictures and films of a run."""
+"""``render``, ``export`` and ``report``: pictures, films, files for other programs, and a page of a run."""
 
 from __future__ import annotations
 
 import signal
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from lyra_petsc.cli.options import results, verb
+from lyra_petsc.cli.signals import watched
 
 if TYPE_CHECKING:
     from lyra_petsc.show.render.render_plan import FilmTiming
@@ -87,3 +89,51 @@ def _line(path: Path, film: tuple[Path, FilmTiming] | None) -> str:
     timing = film[1]
     count = len(timing.states)
     return f"{'film':<8} {path}  ({count / timing.fps:.3g} s, {count} frames, {timing.fps:g} a second)"
+
+
+@verb("lyra-petsc export runs/flag --to gltf")
+@results
+@click.option("--to", required=True, metavar="FORMAT", help="obj, ply, gltf, usd, vtkhdf or npz.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="DIR", help="Folder of the files (RUN/FORMAT)."
+)
+@click.option("--times", metavar="T,T,…", help="The states nearest to these times [s].")
+@click.option("--every", type=int, metavar="N", help="Every Nth state.")
+@click.option(
+    "--displacement", is_flag=True, help="Add the displacement from the start, as for Warp By Vector."
+)
+@click.option("--force", is_flag=True, help="Replace a former export in DIR.")
+def export(comm: Any, /, run: Path, **asked: Any) -> None:
+    """Write the states of RUN for other programs."""
+    from lyra_petsc.parallel import on_root
+    from lyra_petsc.show.export.export_run import export_run
+
+    for number in watched():  # rank 0 does the work and prints the message
+        signal.signal(number, _give_up if comm.rank == 0 else signal.SIG_IGN)
+    done = on_root(comm, lambda: export_run(run, **asked))
+    if comm.rank == 0 and done is not None:
+        states = f"{done.states} state{'s' if done.states > 1 else ''}"
+        files = [name for name in done.files if name != "times.csv"]
+        named = files[0] if len(files) == 1 else f"{files[0]} to {files[-1]}"
+        click.echo(f"{states} in {done.folder}: {named}")
+
+
+def _give_up(number: int, frame: FrameType | None) -> None:
+    from lyra_petsc.errors import Interrupted
+
+    raise Interrupted(f"stopped by {signal.Signals(number).name}; nothing was written", number)
+
+
+@verb("lyra-petsc report runs/flag")
+@results
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="The page (RUN/report.html).")
+def report(comm: Any, run: Path, out: Path | None) -> None:
+    """One HTML page about RUN: pictures, energy, steps, time, settings, notes, what to change."""
+    from lyra_petsc.extras import require
+    from lyra_petsc.parallel import on_root
+    from lyra_petsc.show.report.run_page import write_page
+
+    require("report", ("matplotlib", "jinja2"))
+    path = on_root(comm, lambda: write_page(run, out))
+    if comm.rank == 0:
+        click.echo(f"report       {path}")

@@ -20,8 +20,7 @@ from lyra_petsc.linear.petsc_options import unused
 from lyra_petsc.output.run_folder import choose
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
-from lyra_petsc.scene.default import default_scene
-from lyra_petsc.scene.load import load_scene
+from lyra_petsc.scene.load import default_scene, load_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 

@@ -20,7 +20,7 @@ from lyra_petsc.experiments.study.study_report import Study
 from lyra_petsc.experiments.study.work import Work, choose_references
 from lyra_petsc.output.run_folder import RunDirectory, choose
 from lyra_petsc.parallel import on_root
-from lyra_petsc.scene.default import default_scene
+from lyra_petsc.scene.load import default_scene
 
 
 def study(comm: MPI.Comm, *, out: Path | None, resume: bool, force: bool, **said: Any) -> None:

@@ -12,11 +12,9 @@ from typing import Any
 import click
 
 from lyra_petsc import __version__
-from lyra_petsc.cli.export import export
 from lyra_petsc.cli.new import new
-from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, trust_mesh, verb
-from lyra_petsc.cli.render import render
-from lyra_petsc.cli.report import report
+from lyra_petsc.cli.options import SETTINGS, example, helped, out, scene, settings, tells, trust_mesh, verb
+from lyra_petsc.cli.render import export, render, report
 from lyra_petsc.cli.view import Served, view, where_served
 from lyra_petsc.errors import InputError, nearest
 
@@ -40,13 +38,6 @@ class _Verbs(click.Group):
         return super().resolve_command(ctx, args)
 
 
-def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
-    if value and not ctx.resilient_parsing:
-        if ctx.obj.rank == 0:
-            click.echo(f"lyra-petsc {__version__}")
-        ctx.exit()
-
-
 @click.group(
     cls=_Verbs,
     context_settings=SETTINGS,
@@ -54,14 +45,7 @@ def _version(ctx: click.Context, param: click.Parameter, value: bool) -> None:
     epilog=example("lyra-petsc new kite", "mpirun -n 2 lyra-petsc run kite.yaml"),
 )
 @helped
-@click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_version,
-    help="Show the version and exit.",
-)
+@tells("--version", lambda _: f"lyra-petsc {__version__}", "Show the version and exit.")
 @click.pass_context
 def verbs(ctx: click.Context) -> None:
     """Thin-shell simulation (cloth, membranes, plates) in parallel on PETSc.
@@ -115,13 +99,15 @@ def check(
         from lyra_petsc.cli.check_run import check_run
 
         return check_run(comm, path, crossings=crossings)
-    from lyra_petsc.cli.check import check as check_scene
-    from lyra_petsc.cli.check import print_schema
-
     if schema:
-        print_schema(comm)
-    else:
-        check_scene(comm, path, settings, trust_mesh=trust_mesh)
+        from lyra_petsc.scene.json_schema import schema_text
+
+        if comm.rank == 0:
+            click.echo(schema_text(), nl=False)
+        return 0
+    from lyra_petsc.cli.check import check as check_scene
+
+    check_scene(comm, path, settings, trust_mesh=trust_mesh)
     return 0
 
 

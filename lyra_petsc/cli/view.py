@@ -79,8 +79,7 @@ class Served:
 
     def announce(self, url: str, say: Callable[[str], Any]) -> None:
         """Print the address of the page and who can reach it, and open it."""
-        from lyra_petsc.show.view.access import is_loopback
-        from lyra_petsc.show.view.server import open_browser
+        from lyra_petsc.show.view.server import is_loopback, open_browser
 
         say(f"view: {url}")
         if not is_loopback(self.host):

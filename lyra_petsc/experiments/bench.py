@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import LyraError, SolverError
 from lyra_petsc.parallel import all_here, on_root
 from lyra_petsc.phases import Phases
@@ -21,9 +21,6 @@ from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
 from lyra_petsc.terms.midedge import MidEdge
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 """Default where a case's scene has no tolerance: Newton being quadratic, it ends at round-off."""

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar, cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from pydantic import PlainValidator, TypeAdapter
 
 from lyra_petsc.api.mpirun import last_words, run_launched
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -162,6 +163,11 @@ class Registry(Generic[T]):
         return [self.load(name) for name in self.modules]
 
 
+def in_modules(*modules: tuple[str, str]) -> dict[str, str]:
+    """Names and their modules, of modules and the names that each defines, in the order of both."""
+    return {name: module for module, names in modules for name in names.split()}
+
+
 Watch = Callable[[], None]
 """Called before every step, or again and again while a process runs; may raise to end the work."""
 
@@ -188,3 +194,20 @@ class Launcher:
         program = [*self.command, sys.executable, "-m", "lyra_petsc", self.verb]
         code, heard = run_launched([*program, *words, *self.petsc], watch, keep_open)
         return code, last_words(heard, code)
+
+    def restored(
+        self, words: Sequence[str], watch: Watch, restore: Callable[[Path], T | None]
+    ) -> tuple[T | None, str]:
+        """What a case leaves in the folder of ``--job``, read by ``restore``, and the program's last words.
+
+        Raises
+        ------
+        InputError
+            If the program refuses what it is asked for.
+        """
+        with TemporaryDirectory(prefix=f"lyra-{self.verb}-") as folder:
+            code, told = self([*words, "--job", folder], watch)
+            found = restore(Path(folder))
+        if found is None and code == InputError.exit_code:
+            raise InputError(told)
+        return found, told

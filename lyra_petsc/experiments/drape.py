@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Picture = NDArray[np.bool_]
+from lyra_petsc.arrays import Array, Ints, Mask
+
+Picture = Mask
 
 CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
 """Radii and gap [m]"""

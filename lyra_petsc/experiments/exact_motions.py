@@ -26,15 +26,13 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.mesh.build import mesh_of
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import active
 from lyra_petsc.terms.rest import RestShape
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from lyra_petsc.arrays import Array, Ints, Mask
 
 
 def rectangle(
@@ -63,7 +61,7 @@ def rectangle_script(width: float, height: float, size: float, inside: Sequence[
     return "\n".join(['SetFactory("Built-in");', *lines, 'Physical Surface("sheet") = {1};', ""])
 
 
-def _halved(nx: int, column: Ints, row: Ints, flipped: NDArray[np.bool_]) -> Ints:
+def _halved(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
     """Two triangles of every cell, cut from its low left to its high right corner or the other way."""
     a = row * (nx + 1) + column
     b, c, d = a + 1, a + nx + 2, a + nx + 1

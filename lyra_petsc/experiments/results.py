@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError, Interrupted
 from lyra_petsc.experiments.case import Case, Outcome, passed_of
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.summary import versions, write_summary
 from lyra_petsc.parallel import on_root
 from lyra_petsc.show.report.document import Report, close, lacking

@@ -1,22 +1,285 @@
-"""From the mesh sources of a scene to one checked mesh; serial, for rank 0."""
+"""From the mesh sources of a scene, files and grids, to one checked mesh; serial, for rank 0.
+
+What cannot be simulated is refused, with the numbers of vertices and triangles; neighbouring triangles are
+turned so that they run along their common edge in opposite directions.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import check_capacity
-from lyra_petsc.mesh.grids import grid_sheet, grid_vertices
-from lyra_petsc.mesh.groups import GroupTable
 from lyra_petsc.mesh.measures import lay_out
-from lyra_petsc.mesh.mesh import Mesh, Sheet, Source, TriangleSurface
-from lyra_petsc.mesh.orientation import orient
-from lyra_petsc.mesh.validate import check_shape, check_topology
-from lyra_petsc.scene.schema import MeshSource, Rotation, Scene, Transform
+from lyra_petsc.mesh.mesh import Group, Mesh, NamedSet, Sheet, Source, TriangleSurface
+from lyra_petsc.mesh.readers import first_few
+from lyra_petsc.mesh.select import DIMENSION_NAMES
+from lyra_petsc.mesh.topology import edge_table
+from lyra_petsc.scene.schema import Grid, MeshSource, Rotation, Scene, Transform
+
+# a triangle is degenerate if twice its area is below this share of its longest side squared: slivers of
+# aspect 1e9 pass, and three points on a line do not, whatever their round-off
+_FLATNESS = 1e-10
+
+
+def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None) -> None:
+    """Refuse a mesh that is no surface, however it is scaled and moved.
+
+    Raises
+    ------
+    InputError
+        No triangles, non-finite coordinates, a triangle that uses a vertex twice, duplicate triangles,
+        vertices in no triangle. Triangles and vertices are counted from 0 in file order, after splitting
+        quads.
+    """
+
+    def refuse(message: str) -> None:
+        raise InputError(message, file=file, key=key)
+
+    triangles = sheet.triangles
+    if len(triangles) == 0:
+        refuse("the mesh has no triangles")
+    if (bad := np.flatnonzero(~np.isfinite(sheet.points).all(axis=1))).size:
+        refuse(f"coordinates that are not finite: vertices {first_few(bad.tolist())} (counted from 0)")
+    if sheet.uv is not None and (bad := np.flatnonzero(~np.isfinite(sheet.uv).all(axis=(1, 2)))).size:
+        refuse(f"vt that are not finite: triangles {first_few(bad.tolist())} (counted from 0)")
+    if (bad := np.flatnonzero((triangles == np.roll(triangles, 1, axis=1)).any(axis=1))).size:
+        refuse(f"degenerate triangles (a vertex used twice): {first_few(bad.tolist())} (counted from 0)")
+    if (bad := _duplicates(triangles)).size:
+        refuse(f"triangles that repeat another one: {first_few(bad.tolist())} (counted from 0)")
+    used = np.zeros(len(sheet.points), dtype=np.bool_)
+    used[triangles] = True
+    if (bad := np.flatnonzero(~used)).size:
+        refuse(f"vertices in no triangle have no mass: {first_few(bad.tolist())} (counted from 0)")
+
+
+def check_shape(corners: Array, shape: str, *, file: object | None, key: str | None = None) -> None:
+    """Refuse triangles without area.
+
+    Parameters
+    ----------
+    corners : (F, 3, d) float64
+        Corners of the triangles [m], d = 2 or 3.
+    shape : str
+        Which shape this is (``rest`` or ``start``), for the message.
+
+    Raises
+    ------
+    InputError
+        Triangles whose area is zero, up to round-off, or too large for a number.
+    """
+    with np.errstate(all="ignore"):
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        longest = np.sqrt(np.maximum(np.maximum((a * a).sum(1), (b * b).sum(1)), ((b - a) ** 2).sum(1)))
+        if corners.shape[2] == 2:
+            double_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        else:
+            double_area = np.linalg.norm(np.cross(a, b), axis=1)
+        # coordinates carry a round-off of their own size: what is left of a line far from the origin
+        noise = 16 * np.finfo(np.float64).eps * np.abs(corners).max(axis=(1, 2)) * longest
+        flat = double_area <= np.maximum(_FLATNESS * longest**2, noise)
+    for wrong, words in (
+        (~np.isfinite(double_area), f"triangles too large to compute in the {shape} shape"),
+        (flat, f"degenerate triangles (no area in the {shape} shape)"),
+    ):
+        if wrong.any():
+            numbers = first_few(np.flatnonzero(wrong).tolist())
+            raise InputError(f"{words}: {numbers} (counted from 0)", file=file, key=key)
+
+
+def _duplicates(triangles: Ints) -> Ints:
+    """Triangles with the three vertices of an earlier one, ascending."""
+    corners = np.sort(triangles, axis=1)
+    order = np.lexsort(corners.T[::-1])
+    same = (corners[order][1:] == corners[order][:-1]).all(axis=1)
+    return np.sort(order[1:][same])
+
+
+def orient(sheet: Sheet, *, file: object | None, key: str | None = None) -> None:
+    """Turn triangles over until the orientation is consistent in each connected piece, with a note.
+
+    In each piece the larger part keeps its orientation, in a tie that of the first triangle.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        At most two triangles on an edge.
+
+    Raises
+    ------
+    InputError
+        A one-sided surface (Möbius strip).
+    """
+    table = edge_table(sheet.triangles)
+    begin = table.first[table.sizes == 2]
+    first, second = table.sides[begin], table.sides[begin + 1]
+    corner = sheet.triangles.reshape(-1)
+    # both sides start at the same vertex: the two triangles disagree
+    disagree = corner[first] == corner[second]
+    if not disagree.any():
+        return
+    pairs = np.stack([first // 3, second // 3], axis=1)
+    turned = _walk(len(sheet.triangles), pairs, disagree)
+    contradiction = pairs[(turned[pairs[:, 0]] != turned[pairs[:, 1]]) != disagree]
+    if contradiction.size:
+        shown = first_few(f"{one}-{other}" for one, other in contradiction.tolist())
+        raise InputError(
+            f"the surface has one side only (a Möbius strip): cut it where triangles {shown} meet "
+            "(counted from 0)",
+            file=file,
+            key=key,
+        )
+    sheet.triangles = sheet.triangles.copy()
+    sheet.triangles[turned] = sheet.triangles[turned][:, [0, 2, 1]]
+    if sheet.uv is not None:
+        sheet.uv = sheet.uv.copy()
+        sheet.uv[turned] = sheet.uv[turned][:, [0, 2, 1]]
+    sheet.notes.append(
+        f"{int(turned.sum())} of {len(turned)} triangles turned over so that all are oriented alike"
+    )
+
+
+def _walk(n_triangles: int, pairs: Ints, disagree: Mask) -> Mask:
+    """Triangles to turn over, by a breadth-first walk over each connected piece."""
+    links: list[list[tuple[int, bool]]] = [[] for _ in range(n_triangles)]
+    for (one, other), differs in zip(pairs.tolist(), disagree.tolist(), strict=True):
+        links[one].append((other, differs))
+        links[other].append((one, differs))
+    turned: list[bool | None] = [None] * n_triangles
+    for seed in range(n_triangles):
+        if turned[seed] is not None:
+            continue
+        turned[seed] = False
+        piece, queue = [seed], deque([seed])
+        while queue:
+            here = queue.popleft()
+            for there, differs in links[here]:
+                if turned[there] is None:
+                    turned[there] = bool(turned[here]) != differs
+                    piece.append(there)
+                    queue.append(there)
+        if 2 * sum(bool(turned[member]) for member in piece) > len(piece):
+            for member in piece:
+                turned[member] = not turned[member]
+    return np.array(turned, dtype=np.bool_)
+
+
+def grid_sheet(grid: Grid) -> Sheet:
+    """Triangles of an nx × ny grid of cells, from the origin to (width, height, 0).
+
+    Vertex ``j (nx + 1) + i`` lies at column i, row j. ``diagonal`` joins (i, j) to (i+1, j+1);
+    ``alternating`` flips that where i + j is odd; ``criss-cross`` adds the centre of cell (i, j) as
+    vertex ``(nx + 1)(ny + 1) + j nx + i``. All triangles run anticlockwise seen from +z, those of a
+    cell follow each other. Groups: surface ``sheet``, curves ``left``, ``right``, ``bottom``, ``top``,
+    points ``corners``.
+    """
+    nx, ny = grid.nx, grid.ny
+    points = _lattice(nx, ny, grid.width, grid.height)
+    low_left = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)[None, :]).reshape(-1)
+    cell = np.stack([low_left, low_left + 1, low_left + nx + 2, low_left + nx + 1], axis=1)
+    if grid.pattern == "criss-cross":
+        points = np.concatenate([points, points[cell[:, [0, 2]]].mean(axis=1)])
+        centre = np.arange(nx * ny) + (nx + 1) * (ny + 1)
+        triangles = np.stack(
+            [np.stack([cell[:, k], cell[:, (k + 1) % 4], centre], axis=1) for k in range(4)], axis=1
+        )
+    else:
+        column, row = np.arange(nx)[None, :], np.arange(ny)[:, None]
+        flipped = ((column + row) % 2 == 1).reshape(-1) & (grid.pattern == "alternating")
+        triangles = np.where(
+            flipped[:, None, None],
+            cell[:, [[0, 1, 3], [1, 2, 3]]],
+            cell[:, [[0, 1, 2], [0, 2, 3]]],
+        )
+    triangles = np.ascontiguousarray(triangles.reshape(-1, 3), dtype=np.int64)
+    return Sheet(points, triangles, groups=_grid_groups(nx, ny, len(triangles)))
+
+
+def grid_vertices(grid: Grid) -> int:
+    """Number of vertices of a grid."""
+    nx, ny = grid.nx, grid.ny
+    return (nx + 1) * (ny + 1) + (nx * ny if grid.pattern == "criss-cross" else 0)
+
+
+def _lattice(nx: int, ny: int, width: float, height: float) -> Array:
+    points = np.zeros(((nx + 1) * (ny + 1), 3))
+    points[:, 0] = np.tile(np.linspace(0.0, width, nx + 1), ny + 1)
+    points[:, 1] = np.repeat(np.linspace(0.0, height, ny + 1), nx + 1)
+    return points
+
+
+def _grid_groups(nx: int, ny: int, n_triangles: int) -> list[NamedSet]:
+    across, up = np.arange(nx + 1, dtype=np.int64), np.arange(ny + 1, dtype=np.int64) * (nx + 1)
+    chains = {"left": up, "right": up + nx, "bottom": across, "top": across + ny * (nx + 1)}
+    groups = [NamedSet("sheet", 2, np.arange(n_triangles, dtype=np.int64))]
+    for name, chain in chains.items():
+        groups.append(NamedSet(name, 1, np.stack([chain[:-1], chain[1:]], axis=1)))
+    groups.append(NamedSet("corners", 0, np.array([0, nx, up[-1], up[-1] + nx], dtype=np.int64)))
+    return groups
+
+
+class GroupTable:
+    """Collects the groups of each source, then makes one dictionary of them."""
+
+    def __init__(self) -> None:
+        self._members: dict[tuple[str, int], list[Ints]] = {}
+
+    def add(
+        self,
+        groups: list[NamedSet],
+        source: str | None,
+        n_triangles: int,
+        first_vertex: int,
+        first_triangle: int,
+    ) -> None:
+        """Take the groups of one source of ``n_triangles``, numbered from the given vertex and triangle."""
+        for group in groups:
+            members = group.members + (first_triangle if group.dimension == 2 else first_vertex)
+            self._put(group.name, group.dimension, members)
+            if source is not None:
+                self._put(f"{source}.{group.name}", group.dimension, members)
+        if source is not None:
+            self._put(source, 2, np.arange(first_triangle, first_triangle + n_triangles, dtype=np.int64))
+
+    def finish(self, triangles: Ints) -> tuple[dict[str, Group], list[str]]:
+        """Groups by unique name, and a note for each name that had to change.
+
+        ``triangles`` is (F, 3), of the whole mesh.
+        """
+        groups: dict[str, Group] = {}
+        notes: list[str] = []
+        # surfaces first: they keep the name, as materials can be told by surface groups only
+        for name, dimension in sorted(self._members, key=lambda entry: -entry[1]):
+            members = np.concatenate(self._members[name, dimension])
+            unique = name
+            while unique in groups:
+                unique = f"{unique}.{DIMENSION_NAMES[dimension]}"
+            if unique != name:
+                notes.append(
+                    f"group '{name}' is used for several dimensions; that of {DIMENSION_NAMES[dimension]}s "
+                    f"is called '{unique}'"
+                )
+            groups[unique] = _group(dimension, members, triangles)
+        return groups, notes
+
+    def _put(self, name: str, dimension: int, members: Ints) -> None:
+        self._members.setdefault((name, dimension), []).append(members)
+
+
+def _group(dimension: int, members: Ints, triangles: Ints) -> Group:
+    no_triangles, no_edges = np.empty(0, dtype=np.int64), np.empty((0, 2), dtype=np.int64)
+    if dimension == 2:
+        inside = np.unique(members)
+        return Group(2, np.unique(triangles[inside]), inside, no_edges)
+    if dimension == 1:
+        edges = np.unique(np.sort(members, axis=1), axis=0)
+        return Group(1, np.unique(edges), no_triangles, edges)
+    return Group(0, np.unique(members), no_triangles, no_edges)
 
 
 def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
@@ -46,7 +309,7 @@ def _surface(
     return TriangleSurface(points, whole.triangles), sheet.notes
 
 
-def _placed(points: NDArray[np.float64], transform: Transform) -> tuple[NDArray[np.float64], ...]:
+def _placed(points: Array, transform: Transform) -> tuple[Array, ...]:
     """Points (n, 3) [m] after the scaling, and after the whole transform."""
     scaled = points * np.asarray(transform.scale)
     turned = scaled if transform.rotate is None else scaled @ _rotation_matrix(transform.rotate).T
@@ -89,7 +352,7 @@ def build_mesh(
     pieces: list[Mesh] = []
     notes: list[str] = []
     listed: list[Source] = []
-    tags: list[NDArray[np.int64]] = []
+    tags: list[Ints] = []
     n_vertices = n_triangles = 0
     for number, source in enumerate(sources):
         key = "mesh" if len(sources) == 1 else f"mesh[{number}]"
@@ -172,7 +435,7 @@ def _join(pieces: list[Mesh]) -> Mesh:
     )
 
 
-def _rotation_matrix(rotation: Rotation) -> NDArray[np.float64]:
+def _rotation_matrix(rotation: Rotation) -> Array:
     """Right-handed rotation matrix (3, 3); exact for multiples of 90° about x, y or z."""
     direction = np.asarray(rotation.axis)
     direction = direction / np.abs(direction).max()
@@ -185,7 +448,5 @@ def _rotation_matrix(rotation: Rotation) -> NDArray[np.float64]:
         cosine, sine = math.cos(math.radians(rotation.degrees)), math.sin(math.radians(rotation.degrees))
     x, y, z = direction
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix: NDArray[np.float64] = (
-        cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)
-    )
+    matrix: Array = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)
     return matrix

@@ -5,48 +5,156 @@ does not cross: a vertex or an edge that lies on the other triangle, triangles t
 sheet that is folded flat onto itself), triangles without area, which have no interior. Triangles with a
 common edge meet there alone, or lie in one plane; those with a common vertex may cross elsewhere.
 
-Candidates come from a tree of boxes, the decision from signs of determinants alone (Guigue & Devillers, Fast
-and Robust Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics Tools 8 (2003)
-25-42, with open instead of closed triangles).
+Candidates are triangles whose boxes meet; the decision comes from signs of determinants alone (Guigue &
+Devillers, Fast and Robust Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics
+Tools 8 (2003) 25-42, with open instead of closed triangles). These are exact for floating-point coordinates:
+the determinant in floating point with a bound of its error, and where that does not decide, as an expansion,
+an unevaluated sum of numbers without overlap (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast
+Robust Geometric Predicates, Discrete & Computational Geometry 18 (1997) 305-363).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.mesh.orient3d import UNDECIDED, rational_side, side
+from lyra_petsc.mesh.near import near
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+UNDECIDED = 2
+"""Where products of the coordinates overflow or underflow, so that expansions are not exact."""
 
-LEAF = 4
-"""Triangles in a leaf of the tree."""
+_HALF_ULP = 2.0**-53
+_RELATIVE = (7.0 + 56.0 * _HALF_ULP) * _HALF_ULP
+"""Bound of the determinant's error over the sum of its terms' magnitudes (Shewchuk 1997, figure 21)."""
+
+_UNDERFLOW = 1e-290
+"""Far above what underflow adds to the error of a term whose other factor is at most 1."""
+
+_LEAST, _MOST = 2.0**-300, 2.0**300
+"""Between them, products of three numbers and the rounding errors of these are exact."""
+
+_SPLITTER = 2.0**27 + 1.0
+_PARTS = 6 * 2**3 * 4
+"""Most numbers in the expansion: six products of three differences of two parts, each of four numbers."""
 
 
-class _Tree(NamedTuple):
-    """A complete binary tree of boxes: node k has the children 2 k and 2 k + 1, node 1 contains all.
+@cached()
+def side(points: Any, a: int, b: int, c: int, d: int) -> int:
+    """Sign of (b − a) × (c − a) · (d − a): 1 where d is where the normal of the triangle a, b, c points.
 
-    Attributes
+    Parameters
     ----------
-    order : (F,) int64
-        Triangles in the order of the leaves, `LEAF` to each.
-    low, high : (F, 3) float64
-        Boxes of the triangles, in this order [m].
-    node_low, node_high : (2 n, 3) float64
-        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
-    """
+    points : (V, 3) float64
+        Finite [m].
+    a, b, c, d : int
+        Rows of ``points``.
 
-    order: Ints
-    low: Array
-    high: Array
-    node_low: Array
-    node_high: Array
+    Returns
+    -------
+    int
+        1, −1, 0 for points in one plane, or `UNDECIDED`; `rational_side` decides then.
+    """
+    if a in (b, c, d) or b in (c, d) or c == d:
+        return 0
+    bx, by, bz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    cx, cy, cz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    dx, dy, dz = points[d, 0] - points[a, 0], points[d, 1] - points[a, 1], points[d, 2] - points[a, 2]
+    # a plane of constant x, y or z, which flat sheets are
+    if bx == cx == dx == 0.0 or by == cy == dy == 0.0 or bz == cz == dz == 0.0:
+        return 0
+    determinant = dx * (by * cz - bz * cy) + dy * (bz * cx - bx * cz) + dz * (bx * cy - by * cx)
+    size = (
+        abs(dx) * (abs(by * cz) + abs(bz * cy))
+        + abs(dy) * (abs(bz * cx) + abs(bx * cz))
+        + abs(dz) * (abs(bx * cy) + abs(by * cx))
+    )
+    error = _RELATIVE * size + _UNDERFLOW * (1.0 + abs(dx) + abs(dy) + abs(dz))
+    if determinant > error:
+        return 1
+    if determinant < -error:
+        return -1
+    return int(_exact_side(points, a, b, c, d))
+
+
+@cached()
+def _exact_side(points: Any, a: int, b: int, c: int, d: int) -> int:
+    """`side` by expansions."""
+    parts = np.empty((3, 3, 2))
+    for row, vertex in enumerate((b, c, d)):
+        for axis in range(3):
+            high, low = _sum(points[vertex, axis], -points[a, axis])
+            parts[row, axis, 0], parts[row, axis, 1] = high, low
+            for part in (abs(high), abs(low)):
+                if part != 0.0 and not _LEAST < part < _MOST:
+                    return UNDECIDED
+    expansion, size = np.empty(_PARTS), 0
+    for x in range(3):
+        for turn in (1, 2):
+            y, z = (x + turn) % 3, (x + 2 * turn) % 3
+            for choice in range(8):
+                first = parts[0, x, choice & 1]
+                second = parts[1, y, choice >> 1 & 1]
+                third = parts[2, z, choice >> 2]
+                if first == 0.0 or second == 0.0 or third == 0.0:
+                    continue
+                for half in _product(first, second):
+                    for part in _product(half, third):
+                        size = _add(expansion, size, part if turn == 1 else -part)
+    # the parts ascend, and none overlaps the next: the last one is larger than the sum of the others
+    return int(np.sign(expansion[size - 1])) if size else 0
+
+
+@cached()
+def _sum(a: float, b: float) -> tuple[float, float]:
+    """a + b rounded, and the rounding error (Knuth's two-sum)."""
+    total = a + b
+    virtual = total - a
+    return total, (a - (total - virtual)) + (b - virtual)
+
+
+@cached()
+def _product(a: float, b: float) -> tuple[float, float]:
+    """a b rounded, and the rounding error (Dekker's product with Veltkamp's splitting)."""
+    total = a * b
+    scaled = _SPLITTER * a
+    a_high = scaled - (scaled - a)
+    scaled = _SPLITTER * b
+    b_high = scaled - (scaled - b)
+    a_low, b_low = a - a_high, b - b_high
+    return total, a_low * b_low - (((total - a_high * b_high) - a_low * b_high) - a_high * b_low)
+
+
+@cached()
+def _add(expansion: Any, size: int, number: float) -> int:
+    """Add a number to the expansion in the first ``size`` entries, in place; its new size without zeros."""
+    kept = 0
+    for i in range(size):
+        number, error = _sum(number, expansion[i])
+        if error != 0.0:
+            expansion[kept] = error
+            kept += 1
+    if number != 0.0:
+        expansion[kept] = number
+        kept += 1
+    return kept
+
+
+def rational_side(points: Mapping[int, tuple[Fraction, ...]], a: int, b: int, c: int, d: int) -> int:
+    """`side` in rational numbers: slow, and exact for any coordinates."""
+    (bx, by, bz), (cx, cy, cz), (dx, dy, dz) = (
+        [one - other for one, other in zip(points[vertex], points[a], strict=True)] for vertex in (b, c, d)
+    )
+    determinant = dx * (by * cz - bz * cy) + dy * (bz * cx - bx * cz) + dz * (bx * cy - by * cx)
+    return (determinant > 0) - (determinant < 0)
+
+
+TINY = 2.0**-64
+"""By which boxes are made smaller: extents of what is as large as numbers go would overflow."""
 
 
 def self_crossings(points: Array, triangles: Ints) -> Ints:
@@ -63,8 +171,7 @@ def self_crossings(points: Array, triangles: Ints) -> Ints:
     (n, 2) int64
         Triangles, the smaller first, in lexicographic order. `have_common_vertex` tells those pairs apart.
     """
-    found = _search(points, triangles, triangles, *_tree(points, triangles), True)
-    return _certain(points, triangles, triangles, *found)
+    return _crossing_of(points, triangles, triangles, near(_boxes(points, triangles)))
 
 
 def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triangles: Ints) -> Ints:
@@ -84,69 +191,36 @@ def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triang
     """
     every = np.concatenate([points, others])
     theirs = other_triangles + len(points)
-    found = _search(every, triangles, theirs, *_tree(every, theirs), False)
-    return _certain(every, triangles, theirs, *found)
+    pairs = near(_boxes(every, triangles), _boxes(every, theirs))
+    return _crossing_of(every, triangles, theirs, pairs)
 
 
-def have_common_vertex(triangles: Ints, pairs: Ints) -> NDArray[np.bool_]:
+def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
     """(n,) whether the triangles of each of the ``pairs`` (n, 2) have a vertex in common."""
     first, second = triangles[pairs[:, 0]], triangles[pairs[:, 1]]
     return np.asarray((first[:, :, None] == second[:, None, :]).any(axis=(1, 2)))
 
 
-def _certain(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: NDArray[np.bool_]) -> Ints:
-    """The pairs found without those among the undecided that do not cross, in lexicographic order."""
-    kept = decided.copy()
-    for n in np.flatnonzero(~decided):
+def _boxes(points: Array, triangles: Ints) -> tuple[Array, Array]:
+    """Low and high corners (F, 3) of triangles."""
+    corners = TINY * points[triangles]
+    return corners.min(axis=1), corners.max(axis=1)
+
+
+def _crossing_of(points: Array, triangles: Ints, others: Ints, pairs: Ints) -> Ints:
+    """Those pairs (n, 2) of triangles and others that cross, in lexicographic order."""
+    found = np.empty(len(pairs), dtype=np.int64)
+    _decide(points, triangles, others, pairs, found)
+    for n in np.flatnonzero(found == UNDECIDED):
         vertices = [*triangles[pairs[n, 0]].tolist(), *others[pairs[n, 1]].tolist()]
         exact = {vertex: tuple(map(Fraction, points[vertex].tolist())) for vertex in vertices}
-        kept[n] = _rational_crossing(exact, *vertices)
-    pairs = pairs[kept]
+        found[n] = _rational_crossing(exact, *vertices)
+    pairs = pairs[found == 1]
     return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
 
 
-def _tree(points: Array, triangles: Ints) -> _Tree:
-    """The tree of boxes of triangles, along a space-filling curve."""
-    corners = points[triangles]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    order = np.argsort(_curve(low, high), kind="stable")
-    low, high = low[order], high[order]
-    leaves = 1 << max(0, -(-len(triangles) // LEAF) - 1).bit_length()
-    node_low, node_high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
-    begins = np.arange(0, len(triangles), LEAF)
-    if len(begins):
-        node_low[leaves:][: len(begins)] = np.minimum.reduceat(low, begins)
-        node_high[leaves:][: len(begins)] = np.maximum.reduceat(high, begins)
-    level = leaves
-    while level > 1:
-        below, level = slice(level, 2 * level), level // 2
-        node_low[level : 2 * level] = node_low[below].reshape(level, 2, 3).min(axis=1)
-        node_high[level : 2 * level] = node_high[below].reshape(level, 2, 3).max(axis=1)
-    return _Tree(order, low, high, node_low, node_high)
-
-
-def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
-    """(F,) places along Morton's curve of the centres of boxes, with 21 bits an axis."""
-    # a quarter each: coordinates may be as large as numbers go
-    centres = 0.25 * low + 0.25 * high
-    if not len(centres):
-        return np.empty(0, np.uint64)
-    least = centres.min(axis=0)
-    extent = (centres.max(axis=0) - least).max()
-    bits = ((centres - least) * (1.0 / extent if extent > 1e-300 else 0.0) * (2**21 - 1)).astype(np.uint64)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
-    return np.asarray(bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2))
-
-
 def _decides_crossing(side: Any) -> Callable[..., int]:
-    """The function that decides whether two triangles cross, by `orient3d.side` or its like."""
+    """The function that decides whether two triangles cross, by `side` or its like."""
 
     def crossing(points: Any, a: int, b: int, c: int, d: int, e: int, f: int) -> int:
         """1 where the triangles a, b, c and d, e, f cross, 0 where not, or `UNDECIDED`."""
@@ -186,58 +260,9 @@ _rational_crossing = _decides_crossing(rational_side)
 
 
 @cached()
-def _search(
-    points: Any,
-    queries: Any,
-    triangles: Any,
-    order: Any,
-    low: Any,
-    high: Any,
-    node_low: Any,
-    node_high: Any,
-    within: bool,
-) -> tuple[Any, Any]:
-    """The pairs of a query and a triangle of the tree that cross or are undecided, and which are decided.
-
-    ``within``: queries and triangles are the same; each pair is looked at once.
-    """
-    pairs, decided, count = np.empty((64, 2), np.int64), np.empty(64, np.bool_), 0
-    leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
-    for i in range(len(queries)):
-        a, b, c = queries[i, 0], queries[i, 1], queries[i, 2]
-        least, most = np.minimum(points[a], points[b]), np.maximum(points[a], points[b])
-        least, most = np.minimum(least, points[c]), np.maximum(most, points[c])
-        stack[0], top = 1, 1
-        while top > 0:
-            top -= 1
-            node = stack[top]
-            if _apart(least, most, node_low[node], node_high[node]):
-                continue
-            if node < leaves:
-                stack[top], stack[top + 1] = 2 * node, 2 * node + 1
-                top += 2
-                continue
-            first = (node - leaves) * LEAF
-            for place in range(first, min(first + LEAF, len(order))):
-                j = order[place]
-                if (within and j <= i) or _apart(least, most, low[place], high[place]):
-                    continue
-                d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
-                found = _crossing(points, a, b, c, d, e, f)
-                if found == 0:
-                    continue
-                if count == len(pairs):
-                    pairs, decided = np.concatenate((pairs, pairs)), np.concatenate((decided, decided))
-                pairs[count, 0], pairs[count, 1], decided[count] = i, j, found != UNDECIDED
-                count += 1
-    return pairs[:count], decided[:count]
-
-
-@cached()
-def _apart(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
-    """Whether two boxes have no point in common."""
-    return bool(
-        (low[0] > other_high[0] or high[0] < other_low[0])
-        or (low[1] > other_high[1] or high[1] < other_low[1])
-        or (low[2] > other_high[2] or high[2] < other_low[2])
-    )
+def _decide(points, triangles, others, pairs, found):  # type: ignore[no-untyped-def]
+    """1, 0 or `UNDECIDED` into found (n,) for each pair (n, 2) of a triangle and another one."""
+    for n in range(len(pairs)):
+        a, b, c = triangles[pairs[n, 0]]
+        d, e, f = others[pairs[n, 1]]
+        found[n] = _crossing(points, a, b, c, d, e, f)

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 from mpi4py.util import pkl5
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.partitioner import locality_order, partition, vertex_graph
-from lyra_petsc.mesh.points import Ints, Layout, Numbering, Unknowns
-
-Array = NDArray[np.float64]
+from lyra_petsc.mesh.points import Layout, Numbering, Unknowns
 
 
 @dataclass
@@ -141,7 +139,7 @@ class Rows:
         return np.concatenate([vertices, self.edge_owner[elements.edges]], axis=1)
 
 
-def split_elements(owner: NDArray[np.int64], n_ranks: int) -> list[tuple[Ints, int]]:
+def split_elements(owner: Ints, n_ranks: int) -> list[tuple[Ints, int]]:
     """Elements of each rank from the owners (E, n) of their rows.
 
     Returns

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
+
 
 @dataclass
 class Elements:
@@ -29,11 +31,11 @@ class Elements:
         Number of each element before distribution.
     """
 
-    stencil: NDArray[np.int32] | NDArray[np.int64]
-    data: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    stencil: NDArray[np.int32] | Ints
+    data: Mapping[str, Array] = field(default_factory=dict)
     n_owned: int = -1
-    index: NDArray[np.int32] | NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    edges: NDArray[np.int32] | NDArray[np.int64] | None = None
+    index: NDArray[np.int32] | Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    edges: NDArray[np.int32] | Ints | None = None
 
     def __post_init__(self) -> None:
         if self.n_owned < 0:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
-
-Floats = NDArray[np.float64]
 
 # below this length of x projected into a triangle's plane, y is the better guide
 _NEARLY_NORMAL = 0.1
 
 
-def triangle_sides(corners: Floats) -> tuple[Floats, Floats]:
+def triangle_sides(corners: Array) -> tuple[Array, Array]:
     """The two sides (n, d) each that leave the first corner; ``corners`` is (n, 3, d)."""
     return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
 
-def rest_matrices(mesh: Mesh, warp_degrees: Floats | float = 0.0) -> tuple[Floats, Floats]:
+def rest_matrices(mesh: Mesh, warp_degrees: Array | float = 0.0) -> tuple[Array, Array]:
     """Inverse rest matrices in material axes, and rest areas.
 
     With ``Dm = [u1 - u0, u2 - u0]`` (columns, in material axes) and ``Ds`` the same of current
@@ -66,19 +64,19 @@ def mean_edge_length(mesh: Mesh) -> float:
     return float(edge_lengths(mesh).mean())
 
 
-def edge_lengths(mesh: Mesh) -> Floats:
+def edge_lengths(mesh: Mesh) -> Array:
     """Rest lengths (F, 3) [m] of the triangles' sides (interior edges are there twice)."""
     uv = mesh.triangle_uv
-    lengths: Floats = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
+    lengths: Array = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
     return lengths
 
 
-def bounding_diagonal(points: Floats) -> float:
+def bounding_diagonal(points: Array) -> float:
     """Diagonal [m] of the axis-parallel bounding box of ``points`` (n, d)."""
     return float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
 
 
-def lay_out(rest: Floats, triangles: NDArray[np.int64]) -> Floats:
+def lay_out(rest: Array, triangles: Ints) -> Array:
     """Coordinates of each triangle's corners in its own plane.
 
     The first axis is x projected into the plane, or y where the plane is nearly normal to x (x makes
@@ -107,16 +105,16 @@ def lay_out(rest: Floats, triangles: NDArray[np.int64]) -> Floats:
     first[steep] = _projected(np.array([0.0, 1.0, 0.0]), normal[steep])
     first = _unit(first)
     second = np.cross(normal, first)
-    uv: Floats = np.einsum("fci,fai->fca", corners, np.stack([first, second], axis=1))
+    uv: Array = np.einsum("fci,fai->fca", corners, np.stack([first, second], axis=1))
     return uv
 
 
-def _projected(direction: Floats, normal: Floats) -> Floats:
+def _projected(direction: Array, normal: Array) -> Array:
     return direction - (normal @ direction)[:, None] * normal
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: Array) -> Array:
     # scaled first: the cross product of two tiny sides would underflow when squared
     vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
-    unit: Floats = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return unit

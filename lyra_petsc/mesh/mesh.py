@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from lyra_petsc.arrays import Array, Ints, Mask
 
 
 @dataclass
@@ -26,9 +25,9 @@ class Group:
     """
 
     dimension: int
-    vertices: NDArray[np.int64]
-    triangles: NDArray[np.int64]
-    edges: NDArray[np.int64]
+    vertices: Ints
+    triangles: Ints
+    edges: Ints
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,8 @@ class Source:
 class TriangleSurface(NamedTuple):
     """Points (n, 3) float64 [m], and the numbers (m, 3) int64 of those of each triangle."""
 
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
+    points: Array
+    triangles: Ints
 
 
 @dataclass
@@ -83,17 +82,17 @@ class Mesh:
         The scene's obstacles that are meshes, at t = 0; no part of the sheets.
     """
 
-    positions: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    triangle_uv: NDArray[np.float64]
-    flat_rest: NDArray[np.bool_]
+    positions: Array
+    rest: Array
+    triangles: Ints
+    triangle_uv: Array
+    flat_rest: Mask
     groups: dict[str, Group] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     has_seams: bool = False
     has_uv: bool = False
     sources: list[Source] = field(default_factory=list)
-    tags: NDArray[np.int64] | None = None
+    tags: Ints | None = None
     obstacles: dict[str, TriangleSurface] = field(default_factory=dict)
 
     @property
@@ -120,7 +119,7 @@ class NamedSet:
 
     name: str
     dimension: int
-    members: NDArray[np.int64]
+    members: Ints
 
 
 @dataclass
@@ -141,9 +140,9 @@ class Sheet:
         Numbers that the file itself gives its vertices, where they are not 1, 2, 3, …
     """
 
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    uv: NDArray[np.float64] | None = None
+    points: Array
+    triangles: Ints
+    uv: Array | None = None
     groups: list[NamedSet] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    tags: NDArray[np.int64] | None = None
+    tags: Ints | None = None

@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
 from lyra_petsc.mesh.readers import first_few, printable, read_bytes, split_quads
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 Names = dict[tuple[int, int], str]
 Width = Literal["int", "size"]
 
@@ -146,7 +144,7 @@ def _format(body: bytes, path: Path) -> _File:
     raise InputError("damaged: the byte-order mark of a binary file is not 1", file=path)
 
 
-def _nodes(content: _File) -> tuple[Ints, Floats]:
+def _nodes(content: _File) -> tuple[Ints, Array]:
     """Tags (n,) and points (n, 3) in file order."""
     if content.version == "4.1":
         values = content.values("Nodes")
@@ -231,7 +229,7 @@ class TextValues:
                 raise MshError("holds something that is no number") from None
         self._at = 0
 
-    def rows(self, n: int, integers: int, reals: int = 0, width: Width = "int") -> tuple[Ints, Floats]:
+    def rows(self, n: int, integers: int, reals: int = 0, width: Width = "int") -> tuple[Ints, Array]:
         """``n`` rows of ``integers`` whole numbers followed by ``reals`` numbers.
 
         Returns (n, integers) int64 and (n, reals) float64. ``width`` is the size of the whole numbers in
@@ -262,7 +260,7 @@ class BinaryValues:
         self._order = order
         self._at = 0
 
-    def rows(self, n: int, integers: int, reals: int = 0, width: Width = "int") -> tuple[Ints, Floats]:
+    def rows(self, n: int, integers: int, reals: int = 0, width: Width = "int") -> tuple[Ints, Array]:
         whole = f"{self._order}{'i4' if width == 'int' else 'u8'}"
         row = np.dtype([("whole", whole, (integers,)), ("real", f"{self._order}f8", (reals,))])
         if n < 0 or n * row.itemsize > len(self._body) - self._at:
@@ -289,7 +287,7 @@ def several(values: Values, n: int, width: Width = "int") -> list[int]:
     return found
 
 
-def _whole(table: Floats) -> Ints:
+def _whole(table: Array) -> Ints:
     # beyond 2^53 a float no longer holds a whole number exactly; no real tag is that large
     if not (
         np.isfinite(table).all() and (np.abs(table) < 2.0**53).all() and (table == np.floor(table)).all()
@@ -432,7 +430,7 @@ def _by_tag(members: Ints, tags: Ints) -> dict[int, Ints]:
 
 
 def assemble(
-    tags: Ints, points: NDArray[np.float64], blocks: list[ElementBlock], names: Names, *, note_loose: bool
+    tags: Ints, points: Array, blocks: list[ElementBlock], names: Names, *, note_loose: bool
 ) -> Sheet:
     """Sheet of the triangles in ``blocks``.
 
@@ -511,7 +509,7 @@ def _numbered(blocks: list[ElementBlock], tags: Ints) -> list[ElementBlock]:
 
 
 def _triangles(
-    points: NDArray[np.float64], blocks: list[ElementBlock], notes: list[str]
+    points: Array, blocks: list[ElementBlock], notes: list[str]
 ) -> tuple[Ints, Ints, dict[int, Ints]]:
     """Triangles (F, 3), their entities (F,) and the triangles of each physical tag."""
     parts = [np.empty((0, 3), dtype=np.int64)]
@@ -565,7 +563,7 @@ def _once(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints
 
 
 def _lower(
-    dimension: int, blocks: list[ElementBlock], names: Names, used: NDArray[np.bool_], new_number: Ints
+    dimension: int, blocks: list[ElementBlock], names: Names, used: Mask, new_number: Ints
 ) -> list[NamedSet]:
     """Groups of points or curves, reduced to vertices that are kept."""
     chosen = [block for block in blocks if block.dimension == dimension]

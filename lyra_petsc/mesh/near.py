@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_CELLS = 1 << 22
 

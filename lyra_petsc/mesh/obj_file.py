@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import NamedSet, Sheet
 from lyra_petsc.mesh.readers import first_few, printable, read_bytes, split_polygon, split_quads
-
-Ints = NDArray[np.int64]
 
 # of no use to a simulation, and no reason to worry anybody
 _IGNORED = re.compile(
@@ -169,7 +167,7 @@ def _logical_lines(text: str) -> Iterator[tuple[int, str]]:
         yield start, pending
 
 
-def _split(points: NDArray[np.float64], size: Ints, line: Ints, path: Path) -> tuple[Ints, Ints]:
+def _split(points: Array, size: Ints, line: Ints, path: Path) -> tuple[Ints, Ints]:
     """Corner numbers (F, 3) of the triangles in file order, and the first triangle of each face (+ end).
 
     ``points`` (C, 3) are those of the faces' corners, ``size`` and ``line`` each face's.

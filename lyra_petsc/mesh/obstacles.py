@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh, TriangleSurface
 from lyra_petsc.mesh.topology import unique_edges
 from lyra_petsc.parallel import on_root
@@ -17,8 +17,6 @@ from lyra_petsc.scene.schema import Cuboid, Keyframe, Obstacle, Scene, coefficie
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # corner i + 2 j + 4 k of a box stands at its upper end in x, y, z where i, j, k are 1
 _CORNERS = np.array([[i, j, k] for k in (0, 1) for j in (0, 1) for i in (0, 1)], dtype=np.float64)

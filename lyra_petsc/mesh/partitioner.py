@@ -6,14 +6,12 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.parallel import on_root
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Graph = tuple[Ints, Ints]
 
 PREFERRED = ("ptscotch", "parmetis", "chaco", "party")

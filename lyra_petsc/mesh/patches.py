@@ -15,14 +15,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.mesh.near import near
 from lyra_petsc.mesh.topology import edge_table
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SIZE = 24
 """Most triangles of a patch."""
@@ -193,7 +190,7 @@ def _pieces(n: int, pairs: Ints) -> Ints:
             return piece
 
 
-def _runs_through(a: Array, b: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+def _runs_through(a: Array, b: Array, low: Array, high: Array) -> Mask:
     """Whether segments a b (n, 2) run through the interior of boxes, not only along a side."""
     margin = SAME * (high - low).max(axis=1, initial=0.0, keepdims=True)
     low, high, way = low + margin, high - margin, b - a
@@ -202,7 +199,7 @@ def _runs_through(a: Array, b: Array, low: Array, high: Array) -> NDArray[np.boo
     still = way == 0.0
     enters = np.where(still, np.where((a > low) & (a < high), -np.inf, np.inf), np.minimum(one, two))
     leaves = np.where(still, np.inf, np.maximum(one, two))
-    through: NDArray[np.bool_] = np.maximum(enters.max(axis=1, initial=0.0), 0.0) < np.minimum(
+    through: Mask = np.maximum(enters.max(axis=1, initial=0.0), 0.0) < np.minimum(
         leaves.min(axis=1, initial=1.0), 1.0
     )
     return through

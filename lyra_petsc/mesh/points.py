@@ -9,8 +9,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
+from lyra_petsc.arrays import Array, Ints, Mask
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ class Points:
         local: Ints = np.where(inside, numbers - self.start, self.n_owned + ghost)
         return local
 
-    def update_ghosts(self, values: NDArray[np.float64] | NDArray[np.float32]) -> None:
+    def update_ghosts(self, values: Array | NDArray[np.float32]) -> None:
         """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
         if self.comm.size == 1:
             return
@@ -91,7 +90,7 @@ class Points:
         self._forest.bcastBegin(triple, owned, ghosts, MPI.REPLACE)
         self._forest.bcastEnd(triple, owned, ghosts, MPI.REPLACE)
 
-    def add_to_owners(self, values: NDArray[np.float64] | NDArray[np.float32]) -> None:
+    def add_to_owners(self, values: Array | NDArray[np.float32]) -> None:
         """Add the ghost rows of ``values`` (n_local, 3) to the owners' rows; collective."""
         if self.comm.size == 1:
             return
@@ -102,7 +101,7 @@ class Points:
         self._forest.reduceEnd(triple, ghosts, owned, MPI.SUM)
         values[: self.n_owned] = owned
 
-    def summed(self, *numbers: float) -> NDArray[np.float64]:
+    def summed(self, *numbers: float) -> Array:
         """Sums over all ranks of each rank's numbers; collective."""
         sums = np.array(numbers)
         if self.comm.size > 1:
@@ -197,11 +196,11 @@ class Layout(Points):
         """The same rows with further ghosts (n,) after the present ones, which keep their local numbers."""
         return Layout(self.comm, self.bounds, np.concatenate([self.ghosts, more]), self.unknowns)
 
-    def split(self, rows: Floats) -> tuple[Floats, Floats]:
+    def split(self, rows: Array) -> tuple[Array, Array]:
         """What owned rows (n_owned, 3) hold of vertices (n_vertices, 3), and of edges (n_edges,)."""
         return rows[: self.n_vertices], rows.ravel()[self.edge_places]
 
-    def joined(self, vertices: Floats, edges: Floats | None) -> Floats:
+    def joined(self, vertices: Array, edges: Array | None) -> Array:
         """Owned rows (n_owned, 3) of what is known of vertices and of edges."""
         if edges is None or self.n_owned == self.n_vertices:
             return vertices
@@ -220,10 +219,10 @@ class Layout(Points):
         found: Ints = known[:, 0].astype(np.int64)
         return found
 
-    def are_vertices(self, rows: Ints) -> NDArray[np.bool_]:
+    def are_vertices(self, rows: Ints) -> Mask:
         """Which of these rows, given by global numbers, are vertices."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
-        vertices: NDArray[np.bool_] = rows - self.bounds[rank] < self.unknowns.n_vertices[rank]
+        vertices: Mask = rows - self.bounds[rank] < self.unknowns.n_vertices[rank]
         return vertices
 
     @property

@@ -6,12 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _FIRST_DIAGONAL = np.array([[0, 1, 2], [0, 2, 3]])
 _SECOND_DIAGONAL = np.array([[0, 1, 3], [1, 2, 3]])
@@ -54,7 +51,7 @@ def printable(name: str) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
 
 
-def split_quads(corners: Floats) -> Ints:
+def split_quads(corners: Array) -> Ints:
     """Split quads on the shorter diagonal of those that lie inside.
 
     Parameters
@@ -79,7 +76,7 @@ def split_quads(corners: Floats) -> Ints:
     return split
 
 
-def split_polygon(corners: Floats) -> Ints | None:
+def split_polygon(corners: Array) -> Ints | None:
     """Split one polygon as a fan from the corner that gives the largest smallest triangle.
 
     Parameters
@@ -105,9 +102,9 @@ def split_polygon(corners: Floats) -> Ints | None:
     return best
 
 
-def _smallest_area(triangles: Floats, normal: Floats) -> Floats:
+def _smallest_area(triangles: Array, normal: Array) -> Array:
     """Smallest area along ``normal`` (n, 3) over the triangles (n, m, 3, 3) of each polygon."""
     sides = triangles[:, :, 1:] - triangles[:, :, :1]
     areas = np.einsum("nmi,ni->nm", np.cross(sides[:, :, 0], sides[:, :, 1]), normal)
-    smallest: Floats = areas.min(axis=1)
+    smallest: Array = areas.min(axis=1)
     return smallest

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Ints
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.mesh.mesh import Group, Mesh
@@ -16,9 +16,7 @@ from lyra_petsc.scene.schema import VertexChoice
 DIMENSION_NAMES = ("point", "curve", "surface", "volume")
 
 
-def select_vertices(
-    mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None
-) -> NDArray[np.int64]:
+def select_vertices(mesh: Mesh, selector: VertexChoice, *, key: str, file: object | None = None) -> Ints:
     """Vertices a selector names, ascending, each once.
 
     Parameters
@@ -48,9 +46,7 @@ def select_vertices(
     return _boxed(mesh, selector.box, key=f"{key}.box", file=file)
 
 
-def select_triangles(
-    mesh: Mesh, group: str | None, *, key: str, file: object | None = None
-) -> NDArray[np.int64]:
+def select_triangles(mesh: Mesh, group: str | None, *, key: str, file: object | None = None) -> Ints:
     """Triangles of a surface group, ascending; all triangles for ``None``.
 
     Raises
@@ -86,7 +82,7 @@ def find_group(mesh: Mesh, name: str, *, key: str, file: object | None = None) -
     raise InputError(f"no group '{name}' in the mesh; {nearest(name, mesh.groups)}", key=key, file=file)
 
 
-def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> NDArray[np.int64]:
+def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None) -> Ints:
     wrong = [node for node in nodes if node >= mesh.n_vertices]
     if wrong:
         raise InputError(
@@ -97,7 +93,7 @@ def _numbered(mesh: Mesh, nodes: Sequence[int], *, key: str, file: object | None
     return np.unique(np.asarray(nodes, dtype=np.int64))
 
 
-def _boxed(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> NDArray[np.int64]:
+def _boxed(mesh: Mesh, box: Sequence[Sequence[float]], *, key: str, file: object | None) -> Ints:
     corners = np.asarray(box, dtype=np.float64)
     slack = 1e-9 * bounding_diagonal(mesh.positions)
     low, high = corners.min(axis=0) - slack, corners.max(axis=0) + slack

@@ -1,4 +1,4 @@
-"""Errors of file operations: their cause in words, and raised alike on all ranks."""
+"""File operations: small files replaced at once, and errors in words, raised alike on all ranks."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from lyra_petsc.errors import LyraError
+from lyra_petsc.errors import LyraError, OutputError
 
 if TYPE_CHECKING:
     from mpi4py import MPI
+
 
 Result = TypeVar("Result")
 
@@ -29,6 +30,11 @@ def reason(error: BaseException) -> str:
 def missing_folder(path: Path) -> str:
     """Why a file cannot be written whose folder is gone, whatever HDF5 says of it; empty if it is there."""
     return "" if path.parent.is_dir() else os.strerror(errno.ENOENT)
+
+
+def cannot_write(path: Path, error: BaseException) -> OutputError:
+    """The refusal of a file that could not be written."""
+    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
 
 
 def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:
@@ -71,3 +77,29 @@ def on_each(comm: MPI.Comm, work: Callable[[], Result]) -> Result:
         problem = error
     raise_together(comm, problem)
     return cast(Result, result)
+
+
+def replace_text(path: str | os.PathLike[str], text: str) -> None:
+    """Put ``text`` into a file in one instant. Call on one rank.
+
+    Raises
+    ------
+    OutputError
+        If it could not be written; what stood there before stands.
+    """
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: str | os.PathLike[str], content: bytes) -> None:
+    """As `replace_text`, for content that is no text."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    try:
+        with open(part, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise cannot_write(path, error) from error

@@ -17,7 +17,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.hdf5 import NewFile, cannot_write, read_slab
+from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
 from lyra_petsc.output.stored import check_sums, open_stored, text_of

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.tensors import six_components
 from lyra_petsc.stepping.problem import Problem
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     OnHinges = Callable[[Bending, "Array"], "Array"]
     OnTriangles = Callable[[MidEdge, "Array", Frames], "Array"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 

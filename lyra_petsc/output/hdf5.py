@@ -1,12 +1,12 @@
 """Distributed arrays to and from HDF5 files, by any build of h5py.
 
-A file is built in three steps, so that a full disk is met where it does no harm: one rank
-reserves the whole size and lays the file out, then all ranks write their slabs, then it is
-synced and renamed in the background. (An HDF5 file that cannot grow while
-it is closed takes the process down with it.) As datasets are contiguous and have their
-places then, the slabs need no HDF5: its collective open alone takes longer than writing a
-state of moderate size. On one machine all ranks write at once, as processes may; on several
-they do so through MPI-IO, or where that fails one after the other.
+A file is built in three steps, so that a full disk is met where it does no harm: one rank reserves the whole
+size and lays the file out, then all ranks write their slabs, then it is synced and renamed in the background.
+(An HDF5 file that cannot grow while it is closed takes the process down with it.) As datasets are contiguous
+and have their places then, the slabs need no HDF5: its collective open alone takes longer than writing a
+state of moderate size. On one machine all ranks write at once, as processes may; on several they do so
+through MPI-IO, or where that fails one after the other. Syncing and renaming is done by a thread of rank 0
+while the steps go on.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from io import FileIO
@@ -24,16 +25,59 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import InputError, LyraError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, missing_folder, on_each, raise_together, reason
-from lyra_petsc.output.background import Background
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.errors import InputError, LyraError
+from lyra_petsc.output.agreement import (
+    HDF5_ERRORS,
+    cannot_write,
+    on_each,
+    raise_together,
+)
 from lyra_petsc.output.ordering import row_type
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.stored import open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:
     from lyra_petsc.output.ordering import FileOrder
+
+
+class Background:
+    """One task at a time, in a thread of rank 0; a task must not call MPI.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+        All ranks.
+    """
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self._comm = comm
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lyra-petsc files")
+        self._work: Future[None] | None = None
+
+    def begin(self, work: Callable[[], None]) -> None:
+        """Start a task on rank 0; call `settle` before."""
+        if self._comm.rank == 0:
+            self._work = self._worker.submit(work)
+
+    def settle(self) -> None:
+        """Wait for the task; collective.
+
+        Raises
+        ------
+        LyraError
+            On every rank what the task raised, once.
+        """
+        problem = None if self._work is None else self._work.exception()
+        self._work = None
+        if problem is not None and not isinstance(problem, LyraError):
+            raise problem  # a mistake of ours, which ends the other ranks as any does
+        raise_together(self._comm, problem)
+
+    def close(self) -> None:
+        """Wait for the task and end the thread; errors of the task are dropped. For one rank."""
+        self._worker.shutdown()
+
 
 Result = TypeVar("Result")
 Attributes: TypeAlias = Mapping[str, Mapping[str, int | float | str]]
@@ -289,10 +333,6 @@ def properties() -> tuple[Any, Any, Any, Any]:
     # older forms of groups and headers have no check sums, and damaged ones take HDF5 down with them
     access.set_libver_bounds(h5py.h5f.LIBVER_V18, h5py.h5f.LIBVER_V18)
     return early, links, access, h5py.h5s.create(h5py.h5s.SCALAR)
-
-
-def cannot_write(path: Path, error: BaseException) -> OutputError:
-    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
 
 
 def write_slabs(path: Path, part: Path, pieces: Sequence[Piece], comm: MPI.Comm) -> None:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from lyra_petsc.errors import InputError, OutputError
+from lyra_petsc.errors import InputError
+from lyra_petsc.output.agreement import cannot_write
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class History:
         try:
             self._write(lines.getvalue())
         except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise cannot_write(self.path, error) from error
 
     def close(self) -> None:
         """Close the file; nothing can be appended afterwards.
@@ -129,7 +130,7 @@ class History:
                 csv.writer(header, lineterminator="\n").writerow(self.columns)
                 self._write(header.getvalue())
         except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise cannot_write(self.path, error) from error
 
     def _write(self, line: str) -> None:
         if self._file is None:

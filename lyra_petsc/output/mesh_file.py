@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.hdf5 import NewFile, write_collective
@@ -69,7 +70,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     on_root(comm, work)
 
 
-def vertex_uv(mesh: Mesh) -> NDArray[np.float64] | None:
+def vertex_uv(mesh: Mesh) -> Array | None:
     """(V, 2) material coordinates [m], or ``None`` where a vertex has more than one."""
     uv = np.zeros((mesh.n_vertices, 2))
     uv[mesh.triangles] = mesh.triangle_uv
@@ -132,7 +133,7 @@ def _arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
     }
 
 
-def _parts(group: Group) -> dict[str, NDArray[np.int64]]:
+def _parts(group: Group) -> dict[str, Ints]:
     return {part: getattr(group, part) for part in PARTS}
 
 

@@ -10,6 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import ArrayLike, NDArray
 
+from lyra_petsc.arrays import Ints
+
 
 class FileOrder:
     """A plan that moves rows between their owners and contiguous slabs in file order.
@@ -38,9 +40,9 @@ class FileOrder:
         self.comm = comm
         self.n_owned = len(rows)
         self.n_global = int(n_global)
-        self.starts: NDArray[np.int64] = np.arange(comm.size + 1, dtype=np.int64) * self.n_global // comm.size
+        self.starts: Ints = np.arange(comm.size + 1, dtype=np.int64) * self.n_global // comm.size
 
-        self._outgoing: NDArray[np.int64] = np.argsort(rows, kind="stable")
+        self._outgoing: Ints = np.argsort(rows, kind="stable")
         ordered = rows[self._outgoing]
         inside = len(ordered) == 0 or bool(ordered[0] >= 0 and ordered[-1] < self.n_global)
         if not comm.allreduce(inside, MPI.LAND):
@@ -50,7 +52,7 @@ class FileOrder:
         comm.Alltoall(self._to_ranks, self._from_ranks)
 
         arrived = self._exchange(ordered, self._to_ranks, self._from_ranks)
-        self._incoming: NDArray[np.int64] = arrived - self.start
+        self._incoming: Ints = arrived - self.start
         each_once = np.array_equal(np.sort(self._incoming), np.arange(self.n_slab))
         if not comm.allreduce(each_once, MPI.LAND):
             raise ValueError(f"the ranks' rows are not each of 0 … {self.n_global - 1} exactly once")
@@ -103,7 +105,7 @@ class FileOrder:
         rows[self._outgoing] = arrived
         return rows
 
-    def look_up(self, rows: NDArray[Any], numbers: NDArray[np.int64]) -> NDArray[Any]:
+    def look_up(self, rows: NDArray[Any], numbers: Ints) -> NDArray[Any]:
         """Of any file rows (n,), whatever rank owns them, what ``rows`` (n_owned, ...) hold. Collective."""
         slab = self.to_slab(rows)
         holder = np.searchsorted(self.starts, numbers, side="right") - 1

@@ -16,7 +16,9 @@ from xml.etree.ElementTree import Element, ParseError, parse
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.self_contained import check_file, check_folder, check_name
@@ -29,7 +31,6 @@ from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE
 if TYPE_CHECKING:
     from lyra_petsc.scene.schema import Scene
 
-Array = NDArray[np.float64]
 Columns: TypeAlias = dict[str, NDArray[Any]]
 
 Place: TypeAlias = tuple[str, str]
@@ -129,7 +130,7 @@ class StoredRun:
         return StoredMesh(self.folder)
 
     @property
-    def triangles(self) -> NDArray[np.int64]:
+    def triangles(self) -> Ints:
         """(F, 3) vertices of each triangle, both in the order of the mesh file."""
         return self.mesh.triangles
 
@@ -206,9 +207,25 @@ class StoredRun:
         every : int
             Take every so manieth state.
         """
-        from lyra_petsc.output.xarray_dataset import dataset
+        require("dataset", ("xarray",), "export")
+        import xarray
 
-        return dataset(self, range(0, len(self), every))
+        def variable(name: str, last: tuple[str, ...], arrays: StateArrays) -> tuple[Any, ...]:
+            on = "vertex" if name == "position" else self.field_on(name)
+            return ("state", on, *last), np.asarray(arrays[::every]), {"units": self.field_units(name)}
+
+        content = {"position": variable("position", ("axis",), self.positions)}
+        for name in self.fields:
+            last = "axis" if name in COLUMNS else "component" if name in TENSORS else ""
+            content[name] = variable(name, (last,) if last else (), self.field(name))
+        content["rest"] = (("vertex", "axis"), self.rest, {"units": "m"})
+        content["triangles"] = (("triangle", "corner"), self.triangles, {})
+        axes = {"axis": list("xyz")}
+        if tensors := [content[name][1] for name in self.fields if name in TENSORS]:
+            axes["component"] = list(COMPONENTS[tensors[0].shape[-1]])
+        time = ("state", self.times[::every], {"units": "s"})
+        whole = xarray.Dataset(content, {"time": time, **axes}, {"title": self.scene.title})
+        return whole.swap_dims(state="time")
 
     # -- tables --------------------------------------------------------------------------------------
 

@@ -9,16 +9,13 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.background import Background
+from lyra_petsc.output.agreement import reason, replace_text
 from lyra_petsc.output.checkpoint import Checkpoint, checkpoint_file, read_checkpoint
-from lyra_petsc.output.failure_files import StateInTime, remove_failure, write_failure
 from lyra_petsc.output.fields import Field, chosen
-from lyra_petsc.output.hdf5 import NewFile, read_slab, write_collective
+from lyra_petsc.output.hdf5 import Background, NewFile, read_slab, write_collective
 from lyra_petsc.output.history import (
     HISTORY_COLUMNS,
     OBSTACLE_COLUMNS,
@@ -28,7 +25,7 @@ from lyra_petsc.output.history import (
 )
 from lyra_petsc.output.mesh_file import check_same_mesh, write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.states import StateWriter
+from lyra_petsc.output.states import StateInTime, StateWriter, remove_failure, write_failure
 from lyra_petsc.output.stored import read_stored
 from lyra_petsc.output.tensors import plane_components
 from lyra_petsc.output.xdmf import group_name
@@ -36,9 +33,6 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.dump import Change, changes, dump_scene
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.simulation import SteppedScene, StepReport
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_CHANGES = 12
 """Changes of a resumed scene that are listed one by one."""

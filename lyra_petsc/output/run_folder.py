@@ -46,6 +46,11 @@ def checkpoint_files(folder: str | os.PathLike[str], comm: MPI.Comm | None = Non
     return work() if comm is None else on_root(comm, work)
 
 
+def present(name: str, folder: Path) -> list[Path]:
+    """The file of this name in a folder, if it is there."""
+    return [*folder.glob(name)]
+
+
 def _check_resumable(folder: Path) -> None:
     """Refuse a run whose files, some of which are written on, are links, or whose checkpoints are none."""
     check_folder(folder)

@@ -3,6 +3,8 @@
 A file is laid out with the places of all its states. To write one is to write its rows there, and then its
 row in the file's table; nothing of HDF5 changes, so that the file can be read at any moment. The next file
 has room for as many states as there are, within bounds: so there are few files, and little room is left over.
+
+failure.xdmf, failure.h5 and failure.txt hold the states before and in a step that failed, and why.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,10 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.background import Background
-from lyra_petsc.output.hdf5 import Attributes, NewFile, cannot_write, lay_out, write_collective
+from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text
+from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.self_contained import OutsideFolderError
 from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
@@ -125,7 +128,7 @@ class StateWriter:
         self,
         step: int,
         time: float,
-        position: NDArray[np.float64],
+        position: Array,
         vertex_fields: Fields | None = None,
         triangle_fields: Fields | None = None,
         beside: Sequence[NewFile] = (),
@@ -166,10 +169,10 @@ class StateWriter:
         if room is None or room.fields != fields or number >= room.first + len(room.places):
             room = self._room = self._lay_out(slabs, fields)
         state = WrittenState(number, int(step), float(time), room.path.name, fields)
-        row = _Row(room, number - room.first, state, check_sums(slabs.values(), self._comm))
+        written = partial(room.say_written, state, check_sums(slabs.values(), self._comm))
         datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
-        places = room.places[row.index].tolist()
-        file = NewFile(room.path, datasets, {}, lambda: self._announce(state), places, row.write)
+        places = room.places[number - room.first].tolist()
+        file = NewFile(room.path, datasets, {}, lambda: self._announce(state), places, written)
         write_collective([file, *beside], self._comm, self._background)
         self._next += 1
         return number
@@ -290,28 +293,18 @@ class _PreallocatedFile:
     path: Path
     first: int
     fields: tuple[StoredField, ...]
-    table: NDArray[np.int64]
-    places: NDArray[np.int64]
+    table: Ints
+    places: Ints
 
-
-@dataclass(frozen=True)
-class _Row:
-    """A state's row of the table in its file."""
-
-    room: _PreallocatedFile
-    index: int
-    state: WrittenState
-    sums: NDArray[np.uint64]
-
-    def write(self) -> None:
-        """Say that the state is written (rank 0)."""
-        entries = np.int64(self.state.step), np.float64(self.state.time), self.sums
+    def say_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
+        """Write a state's row of the table (rank 0)."""
+        entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
         try:
-            with open(self.room.path, "r+b", buffering=0) as file:
-                for place, entry in zip(self.room.table.tolist(), entries, strict=True):
-                    os.pwrite(file.fileno(), entry.tobytes(), place + self.index * entry.nbytes)
+            with open(self.path, "r+b", buffering=0) as file:
+                for place, entry in zip(self.table.tolist(), entries, strict=True):
+                    os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
         except OSError as error:
-            raise cannot_write(self.room.path, error) from error
+            raise cannot_write(self.path, error) from error
 
 
 def _forget(path: Path, last_step: int) -> None:
@@ -382,3 +375,90 @@ def _fields(group: Any, on: Mapping[str, str]) -> tuple[StoredField, ...]:
         for name, place in on.items()
         if name != "position"
     )
+
+
+FAILURE_DATA, FAILURE_XDMF, FAILURE_TEXT = "failure.h5", "failure.xdmf", "failure.txt"
+
+
+@dataclass(frozen=True)
+class StateInTime:
+    """Positions and fields at one time.
+
+    Attributes
+    ----------
+    time : float
+        [s], or load factor.
+    position : (n_owned, 3) float64
+        [m], finite.
+    fields : mapping of str to (n_owned, 3) float64
+        The same names on all ranks.
+    """
+
+    time: float
+    position: Array
+    fields: Mapping[str, Array]
+
+
+def write_failure(
+    folder: str | os.PathLike[str],
+    vertices: FileOrder,
+    n_triangles: int,
+    step: int,
+    states: tuple[StateInTime, StateInTime],
+    text: str,
+) -> None:
+    """Write the state before a step and the iterate at which it failed; collective.
+
+    Parameters
+    ----------
+    folder : path
+        The run's folder; holds ``mesh.h5``.
+    vertices : FileOrder
+        Order of the vertices each rank owns.
+    n_triangles : int
+        Triangles of the whole mesh.
+    step : int
+        Number of the state before.
+    states : pair of StateInTime
+        The two.
+    text : str
+        For ``failure.txt``.
+
+    Raises
+    ------
+    OutputError
+        On every rank, if something could not be written.
+    """
+    folder = Path(folder)
+    on_root(vertices.comm, lambda: replace_text(folder / FAILURE_TEXT, text))
+    datasets: dict[str, Array] = {}
+    attributes: dict[str, dict[str, int | float | str]] = {}
+    written = []
+    for number, state in enumerate(states):
+        group = group_name(number)
+        attributes[group] = {"time": state.time, "step": step + number}
+        rows = {"position": state.position, **state.fields}
+        datasets |= {f"{group}/{name}": vertices.to_slab(values) for name, values in rows.items()}
+        fields = tuple(
+            StoredField(name, "vertex", (vertices.n_global, *values.shape[1:]), values.dtype.name)
+            for name, values in state.fields.items()
+        )
+        written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
+    write_collective([NewFile(folder / FAILURE_DATA, datasets, attributes)], vertices.comm)
+    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(written)
+    on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
+
+
+def remove_failure(folder: str | os.PathLike[str]) -> None:
+    """Remove what an earlier run wrote here. Call on one rank.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be removed.
+    """
+    try:
+        for name in (FAILURE_XDMF, FAILURE_DATA, FAILURE_TEXT):
+            (Path(folder) / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: {name} cannot be removed: {reason(error)}") from error

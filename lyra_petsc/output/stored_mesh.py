@@ -6,15 +6,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, TriangleSurface
 from lyra_petsc.output.stored import open_stored, read_stored, text_of
 from lyra_petsc.output.xdmf import MESH_FILE
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class StoredMesh:

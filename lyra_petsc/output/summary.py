@@ -14,9 +14,8 @@ import numpy as np
 
 import lyra_petsc
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_text
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.output.agreement import reason, replace_text
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:

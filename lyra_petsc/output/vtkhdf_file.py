@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.errors import OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.atomic import replace_bytes
-from lyra_petsc.output.h5py_loader import import_h5py
+from lyra_petsc.arrays import Ints
+from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, replace_bytes
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
-from lyra_petsc.output.xdmf import StoredField, WrittenState, group_name
+from lyra_petsc.output.xdmf import WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
 CELLS_FILE = "cells.h5"
@@ -35,7 +34,7 @@ TRIANGLE = 5
 GROUPS = {"vertex": "PointData", "triangle": "CellData"}
 
 
-def cells(triangles: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+def cells(triangles: Ints) -> dict[str, NDArray[Any]]:
     """``Connectivity`` (3 F,), ``Offsets`` (F + 1,) and ``Types`` (F,) of triangles (F, 3)."""
     n = len(triangles)
     return {
@@ -95,7 +94,8 @@ def write_vtkhdf(
         rest = {0: (mesh_file, "mesh/rest")}
         _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
         add_offsets(root, "vertex", "rest", len(states), 0)
-        for field in _fields(states):
+        # each name once: as the newest state has it
+        for field in {field.name: field for state in states for field in state.fields}.values():
             places = {
                 i: (state.file, f"{group_name(state.number)}/{field.name}")
                 for i, state in enumerate(states)
@@ -106,11 +106,6 @@ def write_vtkhdf(
             shape = (len(states) * n, *field.shape[1:])
             _virtual(root, name, shape, np.dtype(field.dtype), places, n)
             add_offsets(root, field.on, field.name, len(states), n)
-
-
-def _fields(states: Sequence[WrittenState]) -> list[StoredField]:
-    """The fields of all states, each name once: as the newest state has it."""
-    return list({field.name: field for state in states for field in state.fields}.values())
 
 
 def describe(file: Any, times: Sequence[float], n_vertices: int, n_triangles: int) -> Any:
@@ -201,5 +196,5 @@ def _replaced(path: Path) -> Iterator[Any]:
             file.flush()
             content = bytes(file.id.get_file_image())
     except HDF5_ERRORS as error:
-        raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+        raise cannot_write(path, error) from error
     replace_bytes(path, content)

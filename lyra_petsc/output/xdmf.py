@@ -19,8 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from lyra_petsc.errors import OutputError
-from lyra_petsc.output.agreement import missing_folder, reason
+from lyra_petsc.output.agreement import cannot_write
 
 XDMF_FILE = "states.xdmf"
 MESH_FILE = "mesh.h5"
@@ -206,7 +205,7 @@ class GrowingXdmf:
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise self._refusal(error) from error
+            raise cannot_write(self.path, error) from error
         self._seam = begin + len(text)
 
     def _make(self, pieces: list[bytes], copied: int) -> None:
@@ -229,11 +228,8 @@ class GrowingXdmf:
             os.replace(part, self.path)
         except OSError as error:
             part.unlink(missing_ok=True)
-            raise self._refusal(error) from error
+            raise cannot_write(self.path, error) from error
         self._seam, self._size = seam, size
-
-    def _refusal(self, error: OSError) -> OutputError:
-        return OutputError(f"{self.path}: cannot be written: {missing_folder(self.path) or reason(error)}")
 
 
 def _pad(seam: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from typing_extensions import Self
 
 from lyra_petsc.scene.block import Block
@@ -18,13 +18,11 @@ from lyra_petsc.scene.values import (
     NonNegative,
     Number,
     Positive,
+    file_beside,
     number,
-    path_beside,
     problem,
     shown,
 )
-
-SUFFIXES = (".csv", ".txt")
 
 
 def _pair(value: Any) -> tuple[float, float]:
@@ -44,14 +42,6 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return (number(value),)
 
 
-def _table(value: Any, info: ValidationInfo) -> Any:
-    if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
-        raise problem(f"must be the path of a table, not {shown(value)}")
-    if Path(value).suffix.lower() not in SUFFIXES:
-        raise problem(f"{Path(value).name!r} must end in {', '.join(SUFFIXES)}")
-    return path_beside(value, info)
-
-
 def _known(value: Any) -> Any:
     if not isinstance(value, dict) or not value:
         raise problem(f"must be a block of keys of the scene, not {shown(value)}")
@@ -64,7 +54,9 @@ def _some(value: Any) -> Any:
     return list(value)
 
 
-Table = Annotated[Path, BeforeValidator(_table), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})]
+Table = Annotated[
+    Path, file_beside("table", ".csv", ".txt"), JsonSchema({"type": "string", "pattern": r"\.(csv|txt)$"})
+]
 Direction = Literal["x", "y", "z"]
 _PAIR = {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2}
 _AXES = {"type": "array", "items": {"enum": ["x", "y", "z"]}, "minItems": 1, "uniqueItems": True}

@@ -14,8 +14,6 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import parse_json, parse_yaml, read_text
 from lyra_petsc.scene.values import shown
 
-__all__ = ["dump_scene", "load_scene"]
-
 # A JSON file with one of these is a scene of ours, not one of the original program.
 _OUR_KEYS = {"mesh", "material", "time"}
 
@@ -175,3 +173,10 @@ def _check_mesh_file(file: Path, key: str, scene: Path | None) -> None:
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
     raise InputError(f"{what}: {file}", file=scene, key=key)
+
+
+def default_scene() -> Path:
+    """The scene of a run without one: in the wheel beside the package's modules, else in the checkout."""
+    package = Path(__file__).resolve().parent.parent
+    inside = package / "configs" / "flag.yaml"
+    return inside if inside.exists() else package.parent / "configs" / "flag.yaml"

@@ -59,6 +59,7 @@ from lyra_petsc.scene.values import (
     Until,
     Vec3,
     Vector,
+    file_beside,
     number,
     path_beside,
     problem,
@@ -128,16 +129,7 @@ def _file(*endings: str) -> dict[str, Any]:
     return {"type": "string", "pattern": rf"\.({'|'.join(any_case)})$"}
 
 
-def _beside_scene(value: Any, info: ValidationInfo) -> Any:
-    if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
-        raise problem(f"must be the path of a mesh file, not {shown(value)}")
-    path = Path(value)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise problem(f"{path.name!r} must end in {', '.join(MESH_SUFFIXES)}")
-    return path_beside(value, info)
-
-
-MeshPath = Annotated[Path, BeforeValidator(_beside_scene), JsonSchema(_file("geo", "msh", "obj"))]
+MeshPath = Annotated[Path, file_beside("mesh file", *MESH_SUFFIXES), JsonSchema(_file("geo", "msh", "obj"))]
 
 
 class MeshSource(Block):
@@ -161,15 +153,13 @@ class MeshSource(Block):
 
     rules = (
         exactly_one("file", "grid"),
-        Rule(
-            when(given("size"), given(file=_file("geo"))),
-            "is for .geo files only (others come with their elements)",
-            "size",
-        ),
-        Rule(
-            when(given("algorithm"), given(file=_file("geo"))),
-            "is for .geo files only (others come with their elements)",
-            "algorithm",
+        *(
+            Rule(
+                when(given(key), given(file=_file("geo"))),
+                "is for .geo files only (others come with their elements)",
+                key,
+            )
+            for key in ("size", "algorithm")
         ),
     )
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from lyra_petsc.scene.rules import Condition, holds
@@ -67,6 +67,19 @@ def path_beside(value: Any, info: ValidationInfo) -> Path:
     path = Path(value)
     # normalised by name only: a symbolic link may be what the user wants to see
     return Path(directory, path) if path.is_absolute() else (Path(directory) / path).absolute()
+
+
+def file_beside(what: str, *endings: str) -> BeforeValidator:
+    """Checks the path of a ``what`` with one of these endings; see `path_beside`."""
+
+    def check(value: Any, info: ValidationInfo) -> Path:
+        if not isinstance(value, (str, Path)) or not str(value).strip() or "\0" in str(value):
+            raise problem(f"must be the path of a {what}, not {shown(value)}")
+        if Path(value).suffix.lower() not in endings:
+            raise problem(f"{Path(value).name!r} must end in {', '.join(endings)}")
+        return path_beside(value, info)
+
+    return BeforeValidator(check)
 
 
 def number(value: Any) -> float:

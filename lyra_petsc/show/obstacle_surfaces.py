@@ -7,16 +7,32 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import TriangleSurface
-from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Container, Solid, axis_of, box_corners
+from lyra_petsc.mesh.obstacles import BOX_TRIANGLES, Container, Solid, axis_of, box_corners, made
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_obstacles import run_obstacles
+from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.scene.schema import Obstacle
+from lyra_petsc.terms.motion import Motion
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+
+def run_obstacles(run: StoredRun) -> list[Solid | Container]:
+    """The obstacles of a run, in the order of its scene.
+
+    Raises
+    ------
+    InputError
+        If the run does not hold a mesh that its scene names, or is damaged.
+    """
+    obstacles = run.scene.obstacles or {}
+    meshes = {name for name, obstacle in obstacles.items() if obstacle.mesh is not None}
+    stored = run.mesh.obstacles if meshes else {}
+    if missing := meshes - stored.keys():
+        raise InputError(f"does not hold the mesh of obstacle {min(missing)!r}", file=run.folder / MESH_FILE)
+    return made(run.scene, stored, Motion)
+
 
 AROUND = 48
 """Points of a circle of a sphere or capsule."""

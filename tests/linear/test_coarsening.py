@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from lyra_petsc.linear.coarsening import Coarse, coarsen
-from lyra_petsc.mesh.build import build_mesh
-from lyra_petsc.mesh.grids import grid_sheet
+from lyra_petsc.mesh.build import build_mesh, grid_sheet
 from lyra_petsc.mesh.partitioner import locality_order, vertex_graph
 from lyra_petsc.scene.schema import Grid, MeshSource
 

@@ -8,8 +8,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from lyra_petsc.mesh.crossings import have_common_vertex, mutual_crossings, self_crossings
-from lyra_petsc.mesh.orient3d import UNDECIDED, rational_side, side
+from lyra_petsc.mesh.crossings import (
+    UNDECIDED,
+    have_common_vertex,
+    mutual_crossings,
+    rational_side,
+    self_crossings,
+    side,
+)
 
 TWO = np.array([[0, 1, 2], [3, 4, 5]])
 FLOOR = [[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]

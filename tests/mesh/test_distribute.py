@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.mesh.build import grid_sheet
 from lyra_petsc.mesh.distribute import Part, Whole, distribute, split_elements
 from lyra_petsc.mesh.elements import Elements
-from lyra_petsc.mesh.grids import grid_sheet
 from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, vertex_graph
 from lyra_petsc.mesh.points import Numbering, Points
 from lyra_petsc.mesh.topology import hinges

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from lyra_petsc.mesh.overlaps import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
+from lyra_petsc.mesh.start_crossings import Overlaps, beyond_planes, in_ball, in_box, out_of_ball
 from lyra_petsc.mesh.topology import unique_edges
 
 pytestmark = pytest.mark.quick

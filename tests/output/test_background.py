@@ -10,8 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from lyra_petsc.errors import OutputError
-from lyra_petsc.output.background import Background
-from lyra_petsc.output.hdf5 import NewFile, write_collective
+from lyra_petsc.output.hdf5 import Background, NewFile, write_collective
 
 pytestmark = pytest.mark.parallel(3)
 

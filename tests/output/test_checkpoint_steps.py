@@ -10,8 +10,8 @@ from mpi4py import MPI
 from physics import CLOTH, grid, scene_of
 
 from lyra_petsc.output import recorder as module
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.recorder import Recorder
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene
 from lyra_petsc.stepping.simulation import SteppedScene

@@ -11,10 +11,10 @@ from written_run import REST, TRIANGLES, position, written
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.checkpoint import CHECKPOINT, PREVIOUS, checkpoint_file, read_checkpoint
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.hdf5 import write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.read_run import StoredRun
+from lyra_petsc.output.self_contained import import_h5py
 
 pytestmark = pytest.mark.quick
 

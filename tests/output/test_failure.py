@@ -11,17 +11,17 @@ from test_states import announced, on_first
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.output.failure_files import (
-    DATA_FILE,
-    TEXT_FILE,
-    XDMF_FILE,
+from lyra_petsc.output.mesh_file import write_mesh
+from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.run_folder import RESULT
+from lyra_petsc.output.states import (
+    FAILURE_DATA,
+    FAILURE_TEXT,
+    FAILURE_XDMF,
     StateInTime,
     remove_failure,
     write_failure,
 )
-from lyra_petsc.output.mesh_file import write_mesh
-from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.run_folder import RESULT
 
 pytestmark = pytest.mark.parallel(3)
 
@@ -42,7 +42,7 @@ def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: P
     write(comm, shared_tmp)
 
     def check() -> None:
-        before, failing = announced(shared_tmp, XDMF_FILE)
+        before, failing = announced(shared_tmp, FAILURE_XDMF)
         for number, (time, seen) in enumerate((before, failing)):
             assert time == 0.25 + 0.125 * number
             assert np.array_equal(seen.points, REST + number)
@@ -50,7 +50,7 @@ def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: P
             assert np.array_equal(seen.point_data["velocity"], number + REST)
         assert "residual" not in before[1].point_data
         assert np.array_equal(failing[1].point_data["residual"], 2 * REST)
-        assert (shared_tmp / TEXT_FILE).read_text() == "why\n"
+        assert (shared_tmp / FAILURE_TEXT).read_text() == "why\n"
         assert not list(shared_tmp.glob("*.part"))
 
     on_first(comm, check)
@@ -58,7 +58,7 @@ def test_both_moments_can_be_read_with_their_times(comm: MPI.Comm, shared_tmp: P
 
 def test_a_new_run_removes_them(comm: MPI.Comm, shared_tmp: Path) -> None:
     write(comm, shared_tmp)
-    assert all(RESULT.fullmatch(name) for name in (XDMF_FILE, DATA_FILE, TEXT_FILE))
+    assert all(RESULT.fullmatch(name) for name in (FAILURE_XDMF, FAILURE_DATA, FAILURE_TEXT))
 
     def check() -> None:
         assert len(list(shared_tmp.glob("failure*"))) == 3

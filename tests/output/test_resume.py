@@ -22,9 +22,9 @@ from physics import CLOTH, direct_solver, grid, scene_of
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
 from lyra_petsc.errors import Interrupted
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import stored_states
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ import pytest
 from lyra_petsc.errors import OutputError
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output import hdf5, xdmf
-from lyra_petsc.output.h5py_loader import import_h5py
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
+from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import StateWriter, stored_states
 from lyra_petsc.output.xdmf import XDMF_FILE
 

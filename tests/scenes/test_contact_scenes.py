@@ -11,8 +11,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
+from lyra_petsc.cli.check_run import RunCrossings
 from lyra_petsc.output.read_run import StoredRun
-from lyra_petsc.output.run_crossings import RunCrossings
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.scene.load import load_scene
 

@@ -16,7 +16,7 @@ from physics import CLOTH, end_on_one_rank, gathered, grid, obj_file, scene_of
 from lyra_petsc.errors import SolverError
 from lyra_petsc.mesh.crossings import mutual_crossings, self_crossings
 from lyra_petsc.mesh.obstacles import Container, Solid
-from lyra_petsc.mesh.overlaps import beyond_planes, in_ball, out_of_ball
+from lyra_petsc.mesh.start_crossings import beyond_planes, in_ball, out_of_ball
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier

@@ -12,7 +12,7 @@ from typing import Any
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
 from lyra_petsc.experiments.results import Line, View
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
 
@@ -153,11 +153,11 @@ class Fabric(View[FabricOutcome]):
             yield common
 
     def told(self, outcome: FabricOutcome) -> dict[str, Any]:
-        numbers = [
-            {key: None if value != value else value for key, value in vars(number).items()}
-            for number in outcome.record.numbers
-        ]
-        return {"numbers": numbers, "passed": outcome.passed, "wall_seconds": outcome.seconds}
+        return {
+            "numbers": [vars(number) for number in outcome.record.numbers],
+            "passed": outcome.passed,
+            "wall_seconds": outcome.seconds,
+        }
 
     def page(self, report: Report, outcomes: Sequence[FabricOutcome], summary: str, *, drawn: bool) -> None:
         self._outcomes = outcomes

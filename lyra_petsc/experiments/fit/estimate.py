@@ -16,15 +16,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.case import StoredArray
 from lyra_petsc.linear.petsc_options import culprits, is_set
 from lyra_petsc.linear.reasons import last_words
-
-Array = NDArray[np.float64]
 
 QUANTILE = 1.959963984540054
 """Half the width of a 95 % interval over the standard deviation."""
@@ -86,25 +84,18 @@ class Trial:
         return 0.5 * float(self.residuals @ self.residuals)
 
 
-@dataclass
-class Estimate:
+@dataclass(frozen=True)
+class Estimate(Unknown):
     """A number found.
 
     Attributes
     ----------
-    key : str
-    start, low, high : float
-        Where the search began, and its bounds.
     value : float
     deviation : float
         Standard deviation; infinite where the data do not tell.
     at_bound : bool
     """
 
-    key: str
-    start: float
-    low: float
-    high: float
     value: float
     deviation: float
     at_bound: bool = False
@@ -302,10 +293,10 @@ def _step(trial: Trial, low: Array, high: Array) -> float:
     return float(np.linalg.norm(jacobian @ step)) / math.sqrt(free.sum())
 
 
-def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> NDArray[np.bool_]:
+def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
     """Which numbers lie at a bound that the cost drives them against."""
     slack = 1e-9 * (high - low)
-    held: NDArray[np.bool_] = ((numbers <= low + slack) & (gradient > 0.0)) | (
+    held: Mask = ((numbers <= low + slack) & (gradient > 0.0)) | (
         (numbers >= high - slack) & (gradient < 0.0)
     )
     return held

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,8 @@ MOST_ROWS = 60
 class FitOutcome(Outcome[Case]):
     """A fit that has ended."""
 
-    fitted: Fitted | None = None
+    _: KW_ONLY
+    fitted: Fitted
 
 
 def outcome_of(fitted: Fitted) -> FitOutcome:
@@ -55,7 +56,6 @@ class Fit(View[FitOutcome]):
         self.ready = True
 
     def rows(self, outcome: FitOutcome) -> Iterable[Mapping[str, Any]]:
-        assert outcome.fitted is not None
         for each in outcome.fitted.conclusion.estimates:
             low, high = each.interval
             numbers = each.key, each.start, each.low, each.high, each.value, each.deviation, low, high
@@ -63,7 +63,6 @@ class Fit(View[FitOutcome]):
 
     def summary(self, outcomes: Sequence[FitOutcome]) -> list[Sequence[str]]:
         fitted = outcomes[0].fitted
-        assert fitted is not None
         rows: list[Sequence[str]] = [("parameter", "start", "found", "95 % interval")]
         for each in fitted.conclusion.estimates:
             rows.append((each.key, f"{each.start:.5g}", f"{each.value:.5g}", _deviation(each)))
@@ -71,45 +70,25 @@ class Fit(View[FitOutcome]):
 
     def told(self, outcome: FitOutcome) -> dict[str, Any]:
         fitted = outcome.fitted
-        assert fitted is not None
         conclusion = fitted.conclusion
-
-        def finite(value: Any) -> Any:
-            return None if isinstance(value, float) and not math.isfinite(value) else value
-
-        def numbers(values: Any) -> Any:
-            return [finite(value) for value in np.ravel(values).tolist()]
 
         times = [reading.time for reading in fitted.readings for _ in reading.parts]
         keys = [unknown.key for unknown in fitted.unknowns]
+        names = ("name", "time", "measured", "uncertainty", "before", "after", "sensitivity")
         return {
-            "parameters": [
-                {
-                    name: None if isinstance(value, float) and not math.isfinite(value) else value
-                    for name, value in asdict(estimate).items()
-                }
-                for estimate in conclusion.estimates
-            ],
-            "misfit": None if math.isnan(conclusion.misfit) else conclusion.misfit,
-            "correlation": [numbers(row) for row in conclusion.correlation],
-            "singular_values": numbers(conclusion.singular_values),
-            "directions": [numbers(row) for row in conclusion.directions],
+            "parameters": [asdict(estimate) for estimate in conclusion.estimates],
+            "misfit": conclusion.misfit,
+            "correlation": conclusion.correlation,
+            "singular_values": conclusion.singular_values,
+            "directions": conclusion.directions,
             "words": conclusion.words,
             "search": fitted.words,
             "evaluations": len(fitted.trials),
             "simulations": fitted.runs,
             "seconds": fitted.seconds,
             "measurements": [
-                {
-                    "name": label,
-                    "time": time,
-                    "measured": float(measured),
-                    "uncertainty": float(sigma),
-                    "before": float(before),
-                    "after": float(after),
-                    "sensitivity": dict(zip(keys, map(float, row), strict=True)),
-                }
-                for label, time, measured, sigma, before, after, row in zip(
+                dict(zip(names, [*numbers, dict(zip(keys, row, strict=True))], strict=True))
+                for *numbers, row in zip(
                     fitted.labels, times, fitted.measured, fitted.uncertainty, fitted.before, fitted.after,
                     fitted.sensitivity, strict=True,
                 )
@@ -118,7 +97,6 @@ class Fit(View[FitOutcome]):
 
     def page(self, report: Report, outcomes: Sequence[FitOutcome], summary: str, *, drawn: bool) -> None:
         fitted = outcomes[0].fitted
-        assert fitted is not None
         conclusion = fitted.conclusion
         report.heading("Numbers")
         report.table(
@@ -176,7 +154,6 @@ class Fit(View[FitOutcome]):
     def terminal(self, outcome: FitOutcome) -> list[str]:
         """What the terminal shows at the end."""
         fitted = outcome.fitted
-        assert fitted is not None
         table = self.summary([outcome])
         return [*aligned(table, len(table[0])), *fitted.conclusion.words, fitted.words]
 

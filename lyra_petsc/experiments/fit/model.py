@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import simulated
 from lyra_petsc.experiments.case import Watch
@@ -25,8 +25,6 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.registry import active
-
-Array = NDArray[np.float64]
 
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
 """Blocks of a scene whose numbers can be found."""

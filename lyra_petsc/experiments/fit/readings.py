@@ -14,17 +14,14 @@ from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.scene.fit_block import DrapeCoefficient, Measurement, Overhang, Quantity
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.scene.text import read_text
 from lyra_petsc.stepping.energy_balance import Ledger
 from lyra_petsc.stepping.problem import Problem
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 AXES = ("x", "y", "z")
 LARGEST_TABLE = 2**26

@@ -31,8 +31,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.case import StoredArray, Verdict
 from lyra_petsc.show.report.document import short
 from lyra_petsc.stepping.energy_guard import LARGEST_SUM
@@ -45,8 +45,6 @@ from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.stretch import SOFTENS_BELOW
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-Array = NDArray[np.float64]
 
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
@@ -272,7 +270,7 @@ class Accountant:
         slowed = self._damping(planes, v1)[:n]
         energy_now, energy_then = energy(self._shell, x1), energy({**self._shell, **self._turned}, x0)
         turned = energy_then - self._energy
-        mass = system.mass[:, None]
+        mass, size_of_g = system.mass[:, None], float(np.linalg.norm(self._simulation.scene.gravity or 0.0))
         (kinetic0, kinetic1, elastic, turn, fallen0, fallen1, numerical, viscous, inner, outer,
          free_way, way, energy_noise, forces, powers, heights) = system.points.summed(
             0.5 * float(np.sum(mass * v0[:n] ** 2)),
@@ -290,7 +288,7 @@ class Accountant:
             self._energy_roundoff(x1) + self._energy_roundoff(x0),
             float(sum(np.abs(part).sum() for part in parts.values())),
             float(sum(np.abs(part * moved).sum() for part in parts.values())),
-            float(np.abs(mass * np.abs(system.x[:n])).sum()) * self._gravity_size(),
+            float(np.abs(mass * np.abs(system.x[:n])).sum()) * size_of_g,
         ).tolist()  # fmt: skip
         reach = largest(comm, x1)
         left = self._left(parts, reach, dt)
@@ -379,9 +377,6 @@ class Accountant:
             if load.registration.energy:
                 load.add_force(self._x, report.time - report.dt, report.time, out)
         return out[: self._system.points.n_owned]
-
-    def _gravity_size(self) -> float:
-        return float(np.linalg.norm(self._simulation.scene.gravity or (0.0, 0.0, 0.0)))
 
     def _energy_roundoff(self, x: Array) -> float:
         """Sum [J] over this rank's elements whose relative round-off their energies carry.

@@ -14,14 +14,14 @@ from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Case, Verdict
-from lyra_petsc.scene.load import dump_scene, load_scene
+from lyra_petsc.scene.dump import dump_scene
+from lyra_petsc.scene.load import load_scene
 from lyra_petsc.scene.materials.library import resolve
 from lyra_petsc.scene.messages import checked
 from lyra_petsc.scene.overrides import apply_overrides
@@ -31,7 +31,6 @@ from lyra_petsc.scene.text import parse_yaml
 if TYPE_CHECKING:
     from lyra_petsc.experiments.stress.step_balance import Record
 
-Array = NDArray[np.float64]
 Content = dict[str, Any]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Trial, problem_of
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict, Watch, read_record, save_record
@@ -38,8 +37,6 @@ from lyra_petsc.experiments.stress.stress_scenes import (
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.show.report.document import PLOTS, Report, seconds, short
 from lyra_petsc.show.report.plots import Series, over_time, surface
-
-Array = NDArray[np.float64]
 
 LONGEST = {Scope.QUICK: 20.0, Scope.USUAL: 60.0, Scope.FULL: 600.0}
 """Wall seconds [s], but for those in which kernels are compiled, after which a case is ended between two
@@ -263,13 +260,10 @@ def launched(launcher: Launcher, case: StressCase, asked: Sequence[str], watch: 
     InputError
         If the launched program refuses what it was asked for.
     """
-    with tempfile.TemporaryDirectory(prefix="lyra-stress-") as folder:
-        code, words = launcher([*asked, "--only", case.name, "--job", folder], watch)
-        outcome = restore(Path(folder), case)
+    words = [*asked, "--only", case.name]
+    outcome, told = launcher.restored(words, watch, lambda folder: restore(folder, case))
     if outcome is None:
-        if code == InputError.exit_code:
-            raise InputError(words)
-        record = Record(case.steps, stopped=words)
+        record = Record(case.steps, stopped=told)
         outcome = StressOutcome(case, of_physics(record), record=record)
     return outcome
 

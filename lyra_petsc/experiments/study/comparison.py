@@ -19,6 +19,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
@@ -30,9 +31,6 @@ from lyra_petsc.output.states import stored_states
 from lyra_petsc.output.stored import open_stored
 from lyra_petsc.output.stored_mesh import StoredMesh
 from lyra_petsc.parallel import on_root
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SAME_TIME = 1e-6
 """Fraction of the time between samples by which a state may miss a sample time."""

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
@@ -23,7 +24,7 @@ from lyra_petsc.experiments.case import Launcher, read_record, save_record
 from lyra_petsc.experiments.study.plan import REQUEST_FILE, scene_of
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.recorder import Recorder
-from lyra_petsc.output.run_folder import FolderKind, checkpoint_files
+from lyra_petsc.output.run_folder import FolderKind, checkpoint_files, present
 from lyra_petsc.parallel import on_root
 from lyra_petsc.phases import Phases
 from lyra_petsc.scene.schema import Scene
@@ -167,12 +168,14 @@ RESULT = re.compile(
 """What a study writes beside its cases."""
 
 
-def _requests(folder: Path) -> list[Path]:
-    return [*folder.glob(REQUEST_FILE)]
-
-
 STUDY = FolderKind(
-    "study", Path("studies"), "study.lock", RESULT, _requests, "no study to resume", folders=(CASES,)
+    "study",
+    Path("studies"),
+    "study.lock",
+    RESULT,
+    partial(present, REQUEST_FILE),
+    "no study to resume",
+    folders=(CASES,),
 )
 
 
@@ -283,7 +286,8 @@ def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result,
             result.linear_iterations = sum(report.linear_iterations for report in reports)
             result.shortest, result.longest = min(lengths, default=0.0), max(lengths, default=0.0)
             result.end, result.linear_solver = simulation.time, simulation.stepper.preset
-            on_root(comm, lambda: _forget_checkpoints(folder))
+            for path in checkpoint_files(folder) if comm.rank == 0 else ():
+                path.unlink(missing_ok=True)
 
         def slowest(seconds: float) -> float:
             return float(comm.allreduce(seconds, MPI.MAX))
@@ -291,11 +295,6 @@ def _repeat(comm: MPI.Comm, scene: Scene, job: Job, repeat: int, result: Result,
         # phases are entered together, so that all ranks have the same
         by_phase = {name: slowest(seconds) for name, seconds in phases.seconds().items()}
         result.timings.append(Timing(slowest(set_up), slowest(run), by_phase))
-
-
-def _forget_checkpoints(folder: Path) -> None:
-    for path in checkpoint_files(folder):
-        path.unlink(missing_ok=True)
 
 
 PROGRESS_FILE = "progress"

@@ -398,13 +398,17 @@ def _references(report: Report, known: Mapping[Physics, Reference]) -> None:
         if one.kind == "finer" and one.own:
             report.table(
                 ["quantity", "own error", "observed order", "converges"],
-                [[name, short(own.error), _order(own.order), own.trusted] for name, own in one.own.items()],
+                [
+                    [
+                        name,
+                        short(own.error),
+                        f"{own.order:.2f}" if math.isfinite(own.order) else "",
+                        own.trusted,
+                    ]
+                    for name, own in one.own.items()
+                ],
                 caption="The reference's own error, estimated from coarser runs (Richardson)",
             )
-
-
-def _order(value: float) -> str:
-    return f"{value:.2f}" if math.isfinite(value) else ""
 
 
 # -- diagrams ------------------------------------------------------------------------------------------

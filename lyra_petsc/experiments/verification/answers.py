@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.experiments.bench import Bench, problem_of
 from lyra_petsc.experiments.case import Case, Outcome, Verdict
@@ -241,7 +241,7 @@ def isotropic(stiffness: float, poisson: float = 0.0) -> dict[str, float]:
     return {"c11": stiffness, "c22": stiffness, "c12": poisson * stiffness, "c33": shear}
 
 
-def farthest(values: NDArray[np.float64], exact: float) -> float:
+def farthest(values: Array, exact: float) -> float:
     """The one of the values that differs most from the exact one."""
     return float(values[np.argmax(np.abs(values - exact))])
 

@@ -34,9 +34,8 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 NODES = 160
 """Collocation points: 1e-11 for weights up to 1e4 B/L³, whose boundary layer is 0.01 L wide."""

@@ -8,13 +8,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.text import read_text
 from lyra_petsc.scene.values import cut
 
-Array = NDArray[np.float64]
 Points = tuple[tuple[float, float], ...]
 Place = tuple[str, float, float]
 """Where a point stands, in words; strain, force [N/m]."""

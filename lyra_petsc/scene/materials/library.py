@@ -240,7 +240,6 @@ def resolve(
         elif material.young is None:  # what is left is by curves, see below
             shell = _bent(ShellMaterial(material.density, 1.0, 0.0, 1.0, 1.0), material.bending)
         else:
-            assert material.young is not None
             assert material.poisson is not None
             assert material.thickness is not None
             sheet = IsotropicSheet(material.young, material.poisson, material.thickness, material.density)

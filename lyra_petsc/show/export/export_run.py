@@ -9,7 +9,6 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 
 from lyra_petsc.errors import InputError, OutputError, nearest
@@ -17,7 +16,7 @@ from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import check_creatable
-from lyra_petsc.show.export.exported_states import choose
+from lyra_petsc.show.export import formats
 
 OURS = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
 """Files that an export writes: --force removes no folder that holds others."""
@@ -25,12 +24,10 @@ OURS = re.compile(r".+(_\d{4,}\.(obj|ply)|\.(glb|usdc|npz|vtkhdf))|times\.csv")
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format.
+    """A format, which ``formats.write_<name>`` writes.
 
     Attributes
     ----------
-    module : str
-        The module of this package whose function ``write_<name>`` writes it.
     packages : tuple of str
         What it needs of the extra ``export``.
     fields : bool
@@ -39,19 +36,18 @@ class ExportFormat:
         Whether each state has a file, which does not hold its time.
     """
 
-    module: str
     packages: tuple[str, ...] = ()
     fields: bool = True
     sequence: bool = False
 
 
 FORMATS = {
-    "obj": ExportFormat("obj_and_ply", fields=False, sequence=True),
-    "ply": ExportFormat("obj_and_ply", ("meshio",), sequence=True),
-    "gltf": ExportFormat("gltf", ("pygltflib",), fields=False),
-    "usd": ExportFormat("usd", ("pxr",)),
-    "vtkhdf": ExportFormat("npz_and_vtkhdf"),
-    "npz": ExportFormat("npz_and_vtkhdf"),
+    "obj": ExportFormat(fields=False, sequence=True),
+    "ply": ExportFormat(("meshio",), sequence=True),
+    "gltf": ExportFormat(("pygltflib",), fields=False),
+    "usd": ExportFormat(("pxr",)),
+    "vtkhdf": ExportFormat(),
+    "npz": ExportFormat(),
 }
 """Formats by the names that ``--to`` takes."""
 
@@ -118,13 +114,12 @@ def export_run(
     found = StoredRun(run)
     folder = out if out is not None else found.folder / to
     check_folder(folder, force=force)
-    states = replace(choose(found, times, every), displacement=displacement)
+    states = replace(formats.choose(found, times, every), displacement=displacement)
     # without characters that Windows or a shell treats specially; letters of any script stay
     name = re.sub(r"[^\w.+-]", "_", found.name).strip(".") or "run"
 
     def work(part: Path) -> None:
-        module = import_module(f"lyra_petsc.show.export.{FORMATS[to].module}")
-        getattr(module, f"write_{to}")(states, part, name)
+        getattr(formats, f"write_{to}")(states, part, name)
         if FORMATS[to].sequence and len(states) > 1:
             with open(part / "times.csv", "w", encoding="utf-8", newline="") as file:
                 table = csv.writer(file, lineterminator="\n")

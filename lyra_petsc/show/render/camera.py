@@ -7,11 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.scene.schema import Camera, Scene, parallel
-
-Array = NDArray[np.float64]
 
 MARGIN = 0.86
 """Fraction of the picture's height and width that the motion fills."""
@@ -59,7 +57,7 @@ def upwards(scene: Scene) -> Array:
     return _unit(up) if up.any() else np.array([0.0, 0.0, 1.0])
 
 
-def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: NDArray[np.int64]) -> Array:
+def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: Ints) -> Array:
     """Unit vector from the sheet to the camera.
 
     Parameters

@@ -6,13 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.tensors import TENSORS, plane_components
-
-Array = NDArray[np.float64]
 
 COVERED = 98.0
 """Percentage of a state's values below the upper end of its colours, and above the lower."""

@@ -13,6 +13,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.camera import Fit, upwards
@@ -24,7 +25,6 @@ from lyra_petsc.show.render.scene_drawing import Bounds, SceneDrawing, near_poin
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 

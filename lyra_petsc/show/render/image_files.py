@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_bytes
+from lyra_petsc.output.agreement import reason, replace_bytes
 
 Image = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""

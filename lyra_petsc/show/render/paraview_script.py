@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from string import Template
 
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.camera import upwards
 from lyra_petsc.show.render.render_plan import run_line_of_sight

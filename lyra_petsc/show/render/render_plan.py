@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.scene.load import load_scene
@@ -20,8 +21,6 @@ from lyra_petsc.show.render.colour_quantities import ColourRange, quantity
 from lyra_petsc.show.render.image_files import TILES, check_film, colors_of, read_texture
 from lyra_petsc.show.render.opengl import check_opengl
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
-
-Array = NDArray[np.float64]
 
 PACKAGES = ("pyvista", "vtkmodules", "PIL", "imageio_ffmpeg")
 """What pictures need of the extra ``view``."""
@@ -307,7 +306,7 @@ def _natural_rate(times: Array, speed: float, fastest: float) -> float:
     return float(f"{rate:.6g}")
 
 
-def nearest_states(times: Array, at: Array) -> NDArray[np.int64]:
+def nearest_states(times: Array, at: Array) -> Ints:
     """Numbers of the states nearest to times ``at`` [s]; of two as near, the earlier."""
     if len(times) == 1:
         return np.zeros(len(at), dtype=np.int64)

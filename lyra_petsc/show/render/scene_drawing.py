@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.render.camera import PerspectiveCamera, horizon
 from lyra_petsc.show.render.colour_quantities import ColourQuantity, material_coordinates
 from lyra_petsc.show.render.opengl import import_pyvista
@@ -19,7 +20,6 @@ from lyra_petsc.show.render.sheet_geometry import HeldVertices, split_at_seams, 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SKY, HORIZON = "#d9e2ec", "#ecebe8"
@@ -296,7 +296,7 @@ class Ground:
         Unit vector towards the light.
     """
 
-    def __init__(self, bounds: Bounds, triangles: NDArray[np.int64], n_vertices: int, light: Array) -> None:
+    def __init__(self, bounds: Bounds, triangles: Ints, n_vertices: int, light: Array) -> None:
         self._bounds = bounds
         self._height = bounds.low[2] - FLOOR_GAP * bounds.size
         towards = bounds.axes @ light

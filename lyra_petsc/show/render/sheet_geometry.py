@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.mesh.topology import unique_edges
@@ -12,11 +12,8 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.terms.motion import Window
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
-
-def split_at_seams(triangles: Indices, corner_uv: Array) -> tuple[Indices, Indices, Array]:
+def split_at_seams(triangles: Ints, corner_uv: Array) -> tuple[Ints, Ints, Array]:
     """Give each vertex one copy for every texture coordinate that it has.
 
     Parameters
@@ -39,7 +36,7 @@ def split_at_seams(triangles: Indices, corner_uv: Array) -> tuple[Indices, Indic
     return copies[:, 0].astype(np.int64), corners.reshape(triangles.shape).astype(np.int64), copies[:, 1:]
 
 
-def vertex_normals(x: Array, triangles: Indices) -> Array:
+def vertex_normals(x: Array, triangles: Ints) -> Array:
     """(V, 3) unit normals of vertices at ``x`` (V, 3): the mean of their triangles', weighted by area.
 
     Zero where the triangles have no area.
@@ -70,7 +67,7 @@ class HeldVertices:
         ]
         self._edges = unique_edges(mesh.triangles)
 
-    def at(self, time: float) -> tuple[Indices, Indices]:
+    def at(self, time: float) -> tuple[Ints, Ints]:
         """Vertices (n,) held at a time [s], and the edges (k, 2) between them."""
         held = np.zeros(self._n_vertices, dtype=bool)
         for window, vertices in self._handles:

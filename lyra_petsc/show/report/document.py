@@ -25,8 +25,7 @@ from typing import Any
 
 from lyra_petsc.errors import OutputError
 from lyra_petsc.extras import missing, remedy
-from lyra_petsc.output.agreement import reason
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import reason, replace_text
 
 
 def short(value: float, digits: int = 3) -> str:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.report.document import Drawing, short
 
 COLOURS = ("#0b62a4", "#d1495b", "#2a9d5c", "#e08e0b", "#7b4fa6", "#14858f", "#8c5a3c", "#5b6470")
@@ -251,8 +251,6 @@ def drawn(figure: Any, name: str, caption: str) -> Drawing:
     return Drawing(name, caption, png, svg.getvalue())
 
 
-Array = NDArray[np.float64]
-
 MOST_TRIANGLES = 20_000
 """Drawn of a surface; of a larger one every k-th is."""
 
@@ -268,7 +266,7 @@ def over_time(curves: Sequence[Series], *, name: str, caption: str, y_label: str
     return drawn(figure, name, caption)
 
 
-def surface(x: Array, triangles: NDArray[np.int64], *, name: str, caption: str) -> Drawing:
+def surface(x: Array, triangles: Ints, *, name: str, caption: str) -> Drawing:
     """A triangle surface (V, 3) [m] seen obliquely, lit from the side."""
     every = -(-len(triangles) // MOST_TRIANGLES)
     figure = empty_figure(HEIGHT)

@@ -12,19 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.extras import missing
-from lyra_petsc.output.atomic import replace_text
+from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.output.history import HISTORY_COLUMNS
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import in_use
 from lyra_petsc.show.render.render_plan import PACKAGES, RenderOptions, make_plan
 from lyra_petsc.show.report.document import Drawing, Report, percent, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure, surface
-
-Array = NDArray[np.float64]
 
 ENERGIES = {
     "kinetic_energy": "kinetic",
@@ -151,7 +149,7 @@ def energies(facts: Facts) -> Drawing:
             _line(axes, facts.columns["time"], values, number, name)
     if axes.lines:
         axes.legend(fontsize=8)
-    return drawn(figure, "energies", f"Energies over {_abscissa(facts)}")
+    return drawn(figure, "energies", f"Energies over {'load factor' if facts.static else 'time'}")
 
 
 def balance(facts: Facts) -> Drawing:
@@ -201,10 +199,6 @@ def phases(wall: Mapping[str, float]) -> Drawing:
     axes.set_xlabel("wall time [s]")
     axes.legend(fontsize=8, ncols=len(wall), loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
     return drawn(figure, "phases", "Wall time by phase")
-
-
-def _abscissa(facts: Facts) -> str:
-    return "load factor" if facts.static else "time"
 
 
 def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]:

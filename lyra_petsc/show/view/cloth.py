@@ -12,6 +12,7 @@ from vtkmodules.vtkCommonCore import vtkLogger, vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.show.render.camera import PerspectiveCamera
 from lyra_petsc.show.render.sheet_geometry import vertex_normals
 from lyra_petsc.show.view.page_content import Colours
@@ -19,7 +20,6 @@ from lyra_petsc.show.view.page_content import Colours
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-Array = NDArray[np.float64]
 
 BACKGROUND = (0.955, 0.96, 0.97)
 PLAIN = (0.77, 0.34, 0.28)
@@ -40,25 +40,20 @@ class Cloth:
     window : vtkRenderWindow
     """
 
-    def __init__(self, triangles: NDArray[np.int64]) -> None:
+    def __init__(self, triangles: Ints) -> None:
         vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it would complain of a missing display
         self._data = vtkPolyData()
         self.set_mesh(triangles)
-        self._mapper = vtkPolyDataMapper()
-        self._mapper.SetInputData(self._data)
+        self._renderer = vtkRenderer()
+        self._renderer.SetBackground(*BACKGROUND)
+        actor, self._mapper = self._actor(self._data, PLAIN)
         self._mapper.SetColorModeToDirectScalars()
-        actor = vtkActor()
-        actor.SetMapper(self._mapper)
         self._look = actor.GetProperty()
-        self._look.SetColor(*PLAIN)
         self._look.SetEdgeColor(*EDGES)
         self._look.SetAmbient(0.4)
         self._look.SetDiffuse(0.65)
         self._look.SetSpecular(0.08)
         self._look.SetSpecularPower(20.0)
-        self._renderer = vtkRenderer()
-        self._renderer.SetBackground(*BACKGROUND)
-        self._renderer.AddActor(actor)
         self._held, self._wind, self._mark = (self._add(color) for color in (HELD, WIND, MARK))
         self._obstacles: list[tuple[ObstacleSurface, vtkPolyData, vtkActor]] = []
         self.window = vtkRenderWindow()
@@ -66,17 +61,24 @@ class Cloth:
 
     def _add(self, color: tuple[float, float, float]) -> vtkPolyData:
         """Points and lines of one colour; empty."""
-        data, mapper, actor = vtkPolyData(), vtkPolyDataMapper(), vtkActor()
+        data = vtkPolyData()
         data.SetPoints(vtkPoints())
-        mapper.SetInputData(data)
-        actor.SetMapper(mapper)
-        look = actor.GetProperty()
-        look.SetColor(*color)
+        look = self._actor(data, color)[0].GetProperty()
         look.SetLighting(False)
         look.SetPointSize(9.0)
         look.SetLineWidth(4.0)
-        self._renderer.AddActor(actor)
         return data
+
+    def _actor(
+        self, data: vtkPolyData, color: tuple[float, float, float]
+    ) -> tuple[vtkActor, vtkPolyDataMapper]:
+        """What draws data in one colour."""
+        mapper, actor = vtkPolyDataMapper(), vtkActor()
+        mapper.SetInputData(data)
+        actor.SetMapper(mapper)
+        actor.GetProperty().SetColor(*color)
+        self._renderer.AddActor(actor)
+        return actor, mapper
 
     def set_obstacles(self, obstacles: list[ObstacleSurface]) -> None:
         """Replace the obstacles; they have no positions until `show_obstacles`."""
@@ -84,17 +86,14 @@ class Cloth:
             self._renderer.RemoveActor(actor)
         self._obstacles = []
         for obstacle in obstacles:
-            data, mapper, actor = vtkPolyData(), vtkPolyDataMapper(), vtkActor()
+            data = vtkPolyData()
             data.SetPoints(vtkPoints())
             data.SetPolys(_triangles(obstacle.triangles))
-            mapper.SetInputData(data)
-            actor.SetMapper(mapper)
+            actor, _ = self._actor(data, OBSTACLE)
             look = actor.GetProperty()
-            look.SetColor(*OBSTACLE)
             look.SetOpacity(obstacle.opacity)
             if not obstacle.round:
                 look.SetInterpolationToFlat()
-            self._renderer.AddActor(actor)
             self._obstacles.append((obstacle, data, actor))
 
     def show_obstacles(self, time: float) -> None:
@@ -103,15 +102,10 @@ class Cloth:
             if obstacle.still and data.GetNumberOfPoints():
                 continue
             x = obstacle.positions(time)
-            data.GetPoints().SetData(_as_vtk(x.astype(np.float32)))
-            data.GetPoints().Modified()
-            if obstacle.round:
-                normals = _as_vtk(vertex_normals(x, obstacle.triangles).astype(np.float32))
-                normals.SetName("Normals")
-                data.GetPointData().SetNormals(normals)
+            _move(data, x, vertex_normals(x, obstacle.triangles) if obstacle.round else None)
             data.Modified()
 
-    def show_held(self, positions: Array, edges: NDArray[np.int64]) -> None:
+    def show_held(self, positions: Array, edges: Ints) -> None:
         """Show held vertices (n, 3) [m] and the edges (k, 2) between them; none to hide them."""
         _put(self._held, positions, edges)
 
@@ -136,7 +130,7 @@ class Cloth:
         ends = self._positions[vertex] + np.array([pin, -pin])
         _put(self._mark, ends, np.array([[0, 1]]))
 
-    def set_mesh(self, triangles: NDArray[np.int64]) -> None:
+    def set_mesh(self, triangles: Ints) -> None:
         """Replace the triangles; the vertices have no positions until the next `show`."""
         self._triangles = triangles
         self._data.Initialize()
@@ -156,12 +150,8 @@ class Cloth:
         """
         # new arrays each time: a page may still fetch those of the previous state
         data, vertices, cells = self._data, self._data.GetPointData(), self._data.GetCellData()
-        data.GetPoints().SetData(_as_vtk(positions.astype(np.float32)))
-        data.GetPoints().Modified()
         self._positions, self._normals = positions, vertex_normals(positions, self._triangles)
-        normals = _as_vtk(self._normals.astype(np.float32))
-        normals.SetName("Normals")
-        vertices.SetNormals(normals)
+        _move(data, positions, self._normals)
         vertices.SetScalars(None)
         cells.SetScalars(None)
         self._mapper.SetScalarVisibility(colours is not None)
@@ -189,16 +179,25 @@ class Cloth:
         camera.SetViewAngle(view.angle)
 
 
-def _triangles(corners: NDArray[np.int64]) -> vtkCellArray:
+def _triangles(corners: Ints) -> vtkCellArray:
     cells = vtkCellArray()
     cells.SetData(3, _as_vtk(corners.ravel()))
     return cells
 
 
-def _put(data: vtkPolyData, places: Array, edges: NDArray[np.int64], *, points: bool = True) -> None:
-    """Replace the points and lines of a mesh."""
-    data.GetPoints().SetData(_as_vtk(places.astype(np.float32).reshape(-1, 3)))
+def _move(data: vtkPolyData, x: Array, normals: Array | None = None) -> None:
+    """Replace the points (n, 3) [m] of a mesh, and the normals at them."""
+    data.GetPoints().SetData(_as_vtk(x.astype(np.float32)))
     data.GetPoints().Modified()
+    if normals is not None:
+        array = _as_vtk(normals.astype(np.float32))
+        array.SetName("Normals")
+        data.GetPointData().SetNormals(array)
+
+
+def _put(data: vtkPolyData, places: Array, edges: Ints, *, points: bool = True) -> None:
+    """Replace the points and lines of a mesh."""
+    _move(data, places.reshape(-1, 3))
     single = np.arange(len(places) if points else 0, dtype=np.int64)
     for size, cells, put in ((1, single, data.SetVerts), (2, edges.astype(np.int64), data.SetLines)):
         made = vtkCellArray()

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from trame.app import get_server
 from trame.ui.vuetify3 import VAppLayout
 from trame.widgets import client, html, plotly, vtk
 from trame.widgets import vuetify3 as v
 from trame_vtk.modules.vtk.serializers import SynchronizationContext
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, LyraError
 from lyra_petsc.output.read_run import StoredRun, read_history
 from lyra_petsc.output.run_folder import in_use
@@ -27,13 +27,12 @@ from lyra_petsc.show.render.render_plan import scene_shown
 from lyra_petsc.show.render.scene_drawing import Bounds, near_points, wind_arrows
 from lyra_petsc.show.render.sheet_geometry import HeldVertices
 from lyra_petsc.show.view import page_content as content
-from lyra_petsc.show.view.access import Access
 from lyra_petsc.show.view.cloth import Cloth
+from lyra_petsc.show.view.server import Access
 
 if TYPE_CHECKING:
     from lyra_petsc.show.obstacle_surfaces import ObstacleSurface
 
-Array = NDArray[np.float64]
 
 STYLE, SCRIPT = (Path(__file__).with_name(name) for name in ("style.css", "keys.js"))
 MOVED = 5.0
@@ -58,6 +57,9 @@ LATE = 5.0
 
 MARK_SECONDS = 0.25
 """Seconds between two moves of the plots' time marks while it plays."""
+
+COMPACT: dict[str, Any] = {"density": "compact", "hide_details": True}
+"""Looks of a control."""
 
 PLAIN = "none"
 """Choice of a quantity: the cloth in one colour."""
@@ -150,10 +152,9 @@ class Page:
         self._look_at_all()
         self._view = _lay_out(self)
         state.change("frame")(self._frame_changed)
-        state.change("quantity")(self._quantity_changed)
         state.change("speed")(self._speed_changed)
         state.change("edges")(self._edges_changed)
-        state.change("range", "map")(self._colours_changed)
+        state.change("quantity", "range", "map")(self._colours_changed)
         state.change("around")(self._around_changed)
         state.change("size")(self._size_changed)
 
@@ -229,14 +230,9 @@ class Page:
         if isinstance(speed, int | float) and 0 < speed < math.inf:
             self._player.set_speed(float(speed))
 
-    def _quantity_changed(self, quantity: Any, **_: Any) -> None:
-        self._choose(quantity)
-        self._again()
-
     def _edges_changed(self, edges: Any, **_: Any) -> None:
         self.cloth.show_edges(bool(edges))
-        self._choose(self._state.quantity)  # where triangles are seen, each has its own value
-        self._again()
+        self._colours_changed()  # where triangles are seen, each has its own value
 
     def _colours_changed(self, **_: Any) -> None:
         self._choose(self._state.quantity)
@@ -569,8 +565,7 @@ def _bottom(page: Page) -> None:
             step=1,
             disabled=("last < 1",),
             id="frame",
-            hide_details=True,
-            density="compact",
+            **COMPACT,
             style="flex: 1 1 200px; min-width: 120px",
         )
         html.Div("{{ clock }}", classes="clock", id="clock")
@@ -583,9 +578,8 @@ def _choice(name: str, items: str, label: str, classes: str) -> None:
         label=label,
         id=name,
         classes=classes,
-        density="compact",
-        hide_details=True,
         variant="outlined",
+        **COMPACT,
     )
 
 
@@ -608,8 +602,7 @@ def _colours() -> None:
             title=("range_error || 'two values, or percentiles of the whole run; empty: automatic'",),
             error=("!!range_error",),
             classes="setting",
-            density="compact",
-            hide_details=True,
             variant="outlined",
+            **COMPACT,
         )
         _choice("map", "maps", "map", "setting")

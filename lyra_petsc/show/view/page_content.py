@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.show.render.colour_quantities import DERIVED, ColourQuantity, ColourRange, quantity
 
@@ -165,7 +166,7 @@ class Probe:
         self._run, self.vertex = run, vertex
         self._quantities = {name: quantity(run, name).on_vertices(run) for name in names(run)}
 
-    def values(self, state: int, place: NDArray[np.float64], only: str = "") -> list[dict[str, str]]:
+    def values(self, state: int, place: Array, only: str = "") -> list[dict[str, str]]:
         """Names and values with units in a state; ``place`` (3,) [m]; of one quantity alone if ``only``."""
         numbers = ", ".join(f"{x:.5g}" for x in place)
         found = [{"name": f"vertex {self.vertex}", "value": f"({numbers}) m"}]
@@ -293,7 +294,7 @@ def at_time(figure: Mapping[str, Any], time: float) -> dict[str, Any]:
     return {"data": figure["data"], "layout": {**figure["layout"], "shapes": [mark]}}
 
 
-def _rows(count: int) -> NDArray[np.int64]:
+def _rows(count: int) -> Ints:
     """Numbers of the rows to draw, ascending, with the last one."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(np.int64))
 

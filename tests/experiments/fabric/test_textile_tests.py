@@ -12,7 +12,7 @@ from mpi4py import MPI
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.drape import DISC, disc_of, drape_coefficient, folds, shadow
-from lyra_petsc.experiments.fabric import strips
+from lyra_petsc.experiments.fabric import textile_tests
 from lyra_petsc.experiments.fabric.records import FabricCase, outcome_of, restore, save
 from lyra_petsc.experiments.fabric.specimens import Fabric, fabric_of
 from lyra_petsc.experiments.fabric.textile_tests import TESTS, cases_of
@@ -34,14 +34,14 @@ def fewer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells and load steps that suffice to read the numbers of materials that are known."""
     fewer = {"CELLS": 30, "PULLS": 12, "SHEARED": 6.0, "SHEARS": 12, "TURNS": 5}
     for name, value in fewer.items():
-        monkeypatch.setattr(strips, name, value)
+        monkeypatch.setattr(textile_tests, name, value)
 
 
 @pytest.mark.parallel
 def test_the_cantilever_gives_b_back(comm: MPI.Comm) -> None:
     bias = Fabric("fabric", FABRIC.block | {"warp_degrees": 30.0})  # where it lies in the scene
     with Bench(comm) as bench:
-        record = strips.cantilever(bench, bias, 90.0)
+        record = textile_tests.cantilever(bench, bias, 90.0)
     assert record.verdicts["B"].passed, record.verdicts
     found = {number.quantity: number.value for number in record.numbers}
     assert found["B"] == pytest.approx(5.0, rel=5e-3)  # µN·m, of the weft
@@ -51,7 +51,7 @@ def test_the_cantilever_gives_b_back(comm: MPI.Comm) -> None:
 def test_bending_reads_b_and_the_loop() -> None:
     rubbing = Fabric("fabric", FABRIC.block | {"friction_moment": [3e-4, 1e-4]})
     with Bench(MPI.COMM_SELF) as bench:
-        record = strips.bending(bench, rubbing, 0.0)
+        record = textile_tests.bending(bench, rubbing, 0.0)
     assert set(record.verdicts) == {"B", "2HB at 0.5 cm⁻¹", "2HB at 1.5 cm⁻¹"}
     assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
     assert record.numbers[0].value == pytest.approx(1e-5 / 9.80665e-5, rel=0.01)
@@ -61,7 +61,7 @@ def test_bending_reads_b_and_the_loop() -> None:
 def test_shear_and_tension() -> None:
     rubbing = Fabric("fabric", FABRIC.block | {"friction_force": 0.7})
     with Bench(MPI.COMM_SELF) as bench:
-        sheared, pulled = strips.shear(bench, rubbing, 0.0), strips.tensile(bench, FABRIC, 90.0)
+        sheared, pulled = textile_tests.shear(bench, rubbing, 0.0), textile_tests.tensile(bench, FABRIC, 90.0)
     assert set(sheared.verdicts) == {"G", "2HG", "2HG5"}
     assert all(verdict.passed for verdict in sheared.verdicts.values()), sheared.verdicts
     assert sheared.numbers[0].value == pytest.approx(np.radians(30.0) / 0.980665, rel=5e-3)
@@ -77,7 +77,7 @@ def test_tension_gives_a_curve_back() -> None:
     law = {"warp": [[0.1, 50.0]], "weft": curve, "shear": [[0.1, 5.0]]}
     soft = Fabric("soft", {"density": 0.2, "bending": 1e-5, "bending_model": "midedge", "law": law})
     with Bench(MPI.COMM_SELF) as bench:
-        found = strips.tensile(bench, soft, 90.0)
+        found = textile_tests.tensile(bench, soft, 90.0)
     assert found.curves[0].y[-1] >= 500.0
     points = tuple((0.0 + x, 0.0 + y) for x, y in [(0.0, 0.0), *curve])
     forces = [force_at(points, x / 100.0) / 0.980665 for x in found.curves[0].x]
@@ -88,10 +88,10 @@ def test_tension_gives_a_curve_back() -> None:
 def test_shorter_steps_do_not_shift_the_curve(monkeypatch: pytest.MonkeyPatch) -> None:
     """As where steps fail and are taken again."""
     with Bench(MPI.COMM_SELF) as bench:
-        exact = strips.tensile(bench, FABRIC, 0.0)
-        steps, path = bench.steps, strips._path
-        monkeypatch.setattr(strips, "_path", lambda values: path([0.0] * (2 * len(values) + 5)))
-        again = strips.tensile(bench, FABRIC, 0.0)
+        exact = textile_tests.tensile(bench, FABRIC, 0.0)
+        steps, path = bench.steps, textile_tests._path
+        monkeypatch.setattr(textile_tests, "_path", lambda values: path([0.0] * (2 * len(values) + 5)))
+        again = textile_tests.tensile(bench, FABRIC, 0.0)
         assert bench.steps > 3 * steps
     assert again.curves[0].x == exact.curves[0].x
     assert again.curves[0].y == pytest.approx(exact.curves[0].y, rel=1e-6)
@@ -102,7 +102,7 @@ def test_a_stiff_membrane_does_not_lock(test: str) -> None:
     """Triangles that cross the lines of bending would make B a quarter too large."""
     metal = Fabric("metal", {"young": 7e9, "poisson": 0.3, "thickness": 1e-4, "density": 0.27})
     with Bench(MPI.COMM_SELF) as bench:
-        record = getattr(strips, test)(
+        record = getattr(textile_tests, test)(
             bench, Fabric("metal", metal.block | {"bending_model": "midedge"}), 0.0
         )
     assert record.verdicts
@@ -110,11 +110,11 @@ def test_a_stiff_membrane_does_not_lock(test: str) -> None:
 
 
 def test_a_loop_without_weight_and_one_that_hangs() -> None:
-    assert strips.loop_height(100.0, 1.0) == pytest.approx(0.13386, abs=1e-4)
+    assert textile_tests.loop_height(100.0, 1.0) == pytest.approx(0.13386, abs=1e-4)
     # Peirce's formula is an approximation
-    assert strips.loop_length(strips.loop_height(1.0, 6.0), 6.0) == pytest.approx(1.0, rel=0.05)
+    assert textile_tests.loop_length(textile_tests.loop_height(1.0, 6.0), 6.0) == pytest.approx(1.0, rel=0.05)
     with Bench(MPI.COMM_SELF) as bench:
-        record = strips.loop(bench, FABRIC, 0.0)
+        record = textile_tests.loop(bench, FABRIC, 0.0)
     assert len(record.verdicts) == 3
     assert all(verdict.passed for verdict in record.verdicts.values()), record.verdicts
 
@@ -136,7 +136,7 @@ def test_folds_and_coefficient_of_a_shadow_that_is_known(count: int) -> None:
 def test_a_record_outlives_its_process(tmp_path: Path) -> None:
     case = FabricCase("loop-warp", "title", "loop", 0.0)
     with Bench(MPI.COMM_SELF) as bench:
-        outcome = outcome_of(case, strips.tensile(bench, FABRIC, 0.0))
+        outcome = outcome_of(case, textile_tests.tensile(bench, FABRIC, 0.0))
     save(outcome, tmp_path)
     found = restore(tmp_path, case)
     assert found is not None

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.stress.cases import FAMILIES, chain, rigid_plate, selected, shapes_and_handles
+from lyra_petsc.experiments.stress.cases import FAMILIES, limits, selected, sheets
 from lyra_petsc.experiments.stress.stress_scenes import (
     NotApplicable,
     Scope,
@@ -152,7 +152,7 @@ def flat(n: int = 40) -> np.ndarray:
 
 def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
     x = flat()
-    y = shapes_and_handles._crumpled(x, 0.025)
+    y = sheets._crumpled(x, 0.025)
     assert np.ptp(y, axis=0).max() < 0.4
     assert np.ptp(y, axis=0).min() > 0.05
     # folds only ever shorten a way
@@ -165,42 +165,42 @@ def test_a_crumpled_sheet_is_small_and_not_stretched() -> None:
 
 
 def test_a_folded_sheet_lies_on_itself_with_its_crease_on_vertices() -> None:
-    y = shapes_and_handles._folded(flat(), 0.025).reshape(41, 41, 3)
+    y = sheets._folded(flat(), 0.025).reshape(41, 41, 3)
     np.testing.assert_allclose(y[:, 20, 0], 0.5)
     np.testing.assert_allclose(y[:, :20], y[:, :20:-1], atol=1e-15)
     np.testing.assert_allclose(np.linalg.norm(np.diff(y, axis=1), axis=2), 0.025)
 
 
 def test_a_fold_spares_an_odd_number_of_cells() -> None:
-    y = shapes_and_handles._folded(flat(15), 1 / 15).reshape(16, 16, 3)
+    y = sheets._folded(flat(15), 1 / 15).reshape(16, 16, 3)
     assert np.linalg.norm(np.diff(y, axis=1), axis=2).min() == pytest.approx(1 / 15)
 
 
 def test_noise_has_its_size_and_is_always_the_same() -> None:
     x = flat()
-    shift = shapes_and_handles._noisy(x, 0.025) - x
+    shift = sheets._noisy(x, 0.025) - x
     assert shift.std() == pytest.approx(0.3 * 0.025, rel=0.05)
-    np.testing.assert_array_equal(shapes_and_handles._noisy(x, 0.025), x + shift)
+    np.testing.assert_array_equal(sheets._noisy(x, 0.025), x + shift)
 
 
 def test_a_mirrored_shell_keeps_its_rim() -> None:
     x = np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.3]])
-    np.testing.assert_allclose(shapes_and_handles._mirrored(x, 1.0)[:, 2], [0.1, -0.1])
+    np.testing.assert_allclose(sheets._mirrored(x, 1.0)[:, 2], [0.1, -0.1])
 
 
 # -- known answers -------------------------------------------------------------------------------------
 
 
 def test_the_rigid_plates_time() -> None:
-    assert pytest.approx(0.4836, abs=5e-5) == rigid_plate.QUARTER
+    assert pytest.approx(0.4836, abs=5e-5) == limits.QUARTER
 
 
 def test_the_first_vertical_is_interpolated() -> None:
     angle = np.array([0.0, 0.4, 1.2, 1.7, 2.0])
     places = [(math.cos(a), -math.sin(a)) for a in angle]
-    found = rigid_plate.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], places)
+    found = limits.first_vertical([0.0, 0.1, 0.2, 0.3, 0.4], places)
     assert found == pytest.approx(0.2 + 0.1 * (math.pi / 2 - 1.2) / 0.5)
-    assert math.isnan(rigid_plate.first_vertical([0.0, 0.1, 0.2], places[:3]))
+    assert math.isnan(limits.first_vertical([0.0, 0.1, 0.2], places[:3]))
 
 
 def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
@@ -208,8 +208,8 @@ def test_the_chain_keeps_its_links_and_steps_to_the_nearest() -> None:
     x = np.column_stack([np.cumsum(np.cos(angle)), np.cumsum(np.sin(angle))])
     v = np.zeros_like(x)
     for _ in range(5):
-        aim = x + 0.05 * v + 0.05**2 * np.array([0.0, -chain.G])
-        before, (x, v) = x, chain.inextensible(x, v, 0.05, 1.0)
+        aim = x + 0.05 * v + 0.05**2 * np.array([0.0, -limits.G])
+        before, (x, v) = x, limits.inextensible(x, v, 0.05, 1.0)
     links = np.diff(x, axis=0)
     np.testing.assert_allclose(np.linalg.norm(links, axis=1), 1.0, rtol=1e-13)
     np.testing.assert_allclose(x[[0, -1]], before[[0, -1]])

@@ -14,7 +14,7 @@ from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rec
 from lyra_petsc.experiments.verification.answers import data
 from lyra_petsc.experiments.verification.cases.hanging import middle
 from lyra_petsc.experiments.verification.cases.motions import level_fall
-from lyra_petsc.experiments.verification.strips import arc
+from lyra_petsc.experiments.verification.flat_plates import arc
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -12,8 +12,13 @@ from physics import reference
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.verification.answers import run_case
 from lyra_petsc.experiments.verification.cases import hinges
-from lyra_petsc.experiments.verification.cases.hinges import expected
-from lyra_petsc.experiments.verification.flat_sheet import hinge_blocks, stiffness, strip_stiffness
+from lyra_petsc.experiments.verification.cases.hinges import (
+    expected,
+    hinge_blocks,
+    stiffness,
+    strip_stiffness,
+)
+from lyra_petsc.experiments.verification.flat_plates import strip
 from lyra_petsc.experiments.verification.rods import (
     cantilever,
     column_shape,
@@ -22,7 +27,6 @@ from lyra_petsc.experiments.verification.rods import (
     overhang_weight,
     tall_cantilever,
 )
-from lyra_petsc.experiments.verification.strips import strip
 
 PUBLISHED = reference("cantilevers")
 

@@ -9,7 +9,7 @@ import pytest
 from written_run import met, position, written
 
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.show.export import obj_and_ply
+from lyra_petsc.show.export import formats
 from lyra_petsc.show.export.export_run import FORMATS, ExportFormat, export_run
 
 
@@ -65,7 +65,7 @@ def test_mistakes_write_nothing(tmp_path, asked, words):
 
 
 def test_a_missing_extra_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setitem(FORMATS, "usd", ExportFormat("usd", ("no_such_package",)))
+    monkeypatch.setitem(FORMATS, "usd", ExportFormat(("no_such_package",)))
     with pytest.raises(InputError, match=r"no_such_package is not installed; .*lyra-petsc\[export\]'"):
         export_run(written(tmp_path / "run"), "usd")
 
@@ -93,13 +93,13 @@ def test_a_failure_leaves_what_stood_there(tmp_path, monkeypatch):
     run, out = written(tmp_path / "run"), tmp_path / "out"
     export_run(run, "obj", out)
 
-    write_obj = obj_and_ply.write_obj
+    write_obj = formats.write_obj
 
     def fails(states, folder, name):
         write_obj(states, folder, name)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(obj_and_ply, "write_obj", fails)
+    monkeypatch.setattr(formats, "write_obj", fails)
     with pytest.raises(OutputError, match=r"out: cannot be written: No space left on device"):
         export_run(run, "obj", out, force=True, every=2)
     assert states(out) == [0, 1, 2]

@@ -8,7 +8,7 @@ import pytest
 from launch import PATIENCE, finish
 from written_run import written
 
-from lyra_petsc.show.view.access import Access, is_loopback
+from lyra_petsc.show.view.server import Access, is_loopback
 
 SOCKET = {
     "Upgrade": "websocket",

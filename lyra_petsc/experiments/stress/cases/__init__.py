@@ -5,33 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lyra_petsc.errors import InputError, nearest
-from lyra_petsc.experiments.case import Registry
+from lyra_petsc.experiments.case import Registry, in_modules
 from lyra_petsc.experiments.stress.stress_scenes import CaseFamily, Scope, StressCase
 
 FAMILIES: Registry[CaseFamily] = Registry(
     "lyra_petsc.experiments.stress.cases",
-    {
-        "stiff-steps": "scaled",
-        "membrane": "scaled",
-        "bending": "scaled",
-        "time-step": "scaled",
-        "density": "scaled",
-        "anisotropy": "scaled",
-        "damping": "scaled",
-        "wind": "scaled",
-        "gravity": "scaled",
-        "handles": "shapes_and_handles",
-        "start": "shapes_and_handles",
-        "elements": "shapes_and_handles",
-        "free": "shapes_and_handles",
-        "compression": "shapes_and_handles",
-        "contact": "contact",
-        "directors": "directors",
-        "rigid-plate": "rigid_plate",
-        "chain": "chain",
-        "paper": "paper",
-        "products": "scaled",
-    },
+    in_modules(
+        ("sheets", "stiff-steps membrane bending time-step density anisotropy damping wind gravity"),
+        ("sheets", "handles start elements free compression"),
+        ("contact", "contact"),
+        ("sheets", "directors"),
+        ("limits", "rigid-plate chain paper"),
+        ("sheets", "products"),
+    ),
 )
 
 

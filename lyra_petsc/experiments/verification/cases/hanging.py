@@ -20,7 +20,7 @@ from lyra_petsc.experiments.verification.answers import (
     isotropic,
     scene,
 )
-from lyra_petsc.experiments.verification.strips import LENGTH, WIDTH, G, hung
+from lyra_petsc.experiments.verification.flat_plates import LENGTH, WIDTH, G, hung
 
 ALONG = "cells along the strip"
 

@@ -1,4 +1,8 @@
-"""Plates that bend by one unknown on every edge: they converge to Kirchhoff's on every kind of mesh."""
+"""Plates and strips that bend by one unknown on every edge: they converge to Kirchhoff's on every kind of
+mesh.
+
+Their deflections, curvatures and small vibrations.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,24 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import SIDES
 from lyra_petsc.experiments.verification.answers import (
+    ASSEMBLED,
     STATIC,
     Converges,
     Exact,
     Measured,
+    at_finest,
     case,
     data,
     farthest,
     scene,
 )
-from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, plate_material
+from lyra_petsc.experiments.verification.flat_plates import KINDS, flat_mesh, lowest_modes, plate_material
 from lyra_petsc.terms.midedge import MidEdge
-
-Array = NDArray[np.float64]
 
 EXACT = data("linear_plate")
 AT_ONCE = STATIC | {"step": 1.0}
@@ -124,3 +128,40 @@ def _curvatures(bench: Bench, trial: Trial) -> Array:
     term, x = trial.simulation.problem.terms["midedge"], trial.simulation.problem.system.x
     assert isinstance(term, MidEdge)
     return np.concatenate(bench.comm.allgather(term.curvatures(x, term.frames)[: term.n_owned]))
+
+
+VIBRATIONS = data("plate_vibrations")
+
+CLAMPED = {"CCCC": SIDES, "CFFF": ("left",), "FFFF": ()}
+
+SHAPES = {"square": (1.0, 1), "strip": (0.2, 2)}
+"""Height of plates of length 1 m, and how many times n cells they have along that."""
+
+SHIFT = 400.0
+"""1/s², of the order of the lowest square: what frees a free plate of its three rigid motions."""
+
+
+@case(
+    "Vibrating plates and strips (C clamped, F free edges), bending_model: midedge: the first three "
+    "frequencies of the assembled K and M, without those of rigid motions",
+    source=VIBRATIONS["source"],
+    resolutions=(20, 40, 80),
+    claim=at_finest(5e-3),
+    quick=1,
+    counts="cells along the square, twice as many along the strip",
+)
+def plate_vibration(bench: Bench, n: float) -> Iterator[Measured]:
+    for shape, (height, finer) in SHAPES.items():
+        for words, exact in VIBRATIONS[shape].items():
+            edges, poisson = words.split()
+            for kind in KINDS:
+                mesh = flat_mesh(bench, kind, round(finer * n), round(finer * n * height), 1.0, height)
+                clamped = [{"group": side, "clamp": True} for side in CLAMPED[edges]]
+                held = [{"group": "sheet", "axes": ["x", "y"]}, *clamped]
+                material = plate_material(1.0, poisson=float(poisson))
+                rigid = 0 if clamped else 3
+                with bench.simulation(scene(mesh, material, ASSEMBLED, handles=held)) as trial:
+                    found, _ = lowest_modes(trial, rigid + len(exact), shift=SHIFT if rigid else 0.0)
+                for number, (omega, wanted) in enumerate(zip(found[rigid:], exact, strict=True), 1):
+                    name = f"λ{number}, {shape}, {edges}, ν = {poisson}, {kind}"
+                    yield Measured(name, float(omega), float(wanted))

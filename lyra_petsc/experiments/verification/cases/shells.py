@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import (
@@ -22,8 +22,6 @@ from lyra_petsc.experiments.verification.answers import (
     scene,
 )
 from lyra_petsc.experiments.verification.rods import cantilever
-
-Array = NDArray[np.float64]
 
 TABLES = data("shells")
 LINEAR = TABLES["linear"]

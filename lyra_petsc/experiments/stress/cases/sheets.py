@@ -1,0 +1,459 @@
+"""The base scene, changed: stiffnesses, density, damping, Δt, wind and weight, one by one and all at once.
+
+And sheets with bad elements, with shapes that no sheet starts from, with nothing held, with violent handles;
+and those that bend by directors on edges: stiff, at large steps, folded, twisted, crushed, crumpled.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.case import Verdict
+from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.stress.step_balance import Record
+from lyra_petsc.experiments.stress.stress_scenes import (
+    CELLS,
+    FULL,
+    QUICK,
+    STEP,
+    USUAL,
+    Content,
+    Scope,
+    Setting,
+    StressCase,
+    anisotropic,
+    as_it_is,
+    blow,
+    by_directors,
+    changed,
+    damp,
+    family,
+    move,
+    release,
+    scale,
+    sheet,
+    weigh,
+)
+from lyra_petsc.experiments.verification.answers import grid
+from lyra_petsc.terms.stretch import SOFTENS_BELOW
+
+
+def _times(what: str, parameter: str, levels: Mapping[str, Scope]) -> Iterator[StressCase]:
+    """A case for each factor of a parameter of `scale`."""
+    for factor, level in levels.items():
+        scene = changed(scale, **{parameter: float(factor)})
+        yield StressCase(f"{what}-{factor}", f"{what} × {factor}", scene, level=level)
+
+
+# the goal: stiff sheets at steps of milliseconds and tens of milliseconds, solved in few iterations
+stiff_steps = family(
+    "stiff-steps",
+    "membrane stiffness and Δt together, with bounds on iterations and wall time",
+    *(
+        StressCase(
+            f"stiff-{factor}-{ms}ms", f"membrane × {factor}, Δt {ms} ms",
+            changed(scale, stretching=float(factor)), step=1e-3 * ms, level=QUICK, swift=True,
+        )
+        for factor in ("1e3", "1e6")
+        for ms in (5, 40)
+    ),
+)  # fmt: skip
+
+membrane = family(
+    "membrane",
+    "membrane stiffness × 1e-3 to 1e9",
+    *_times("membrane", "stretching", {"1e-3": QUICK, "1": USUAL, "1e3": USUAL, "1e6": USUAL, "1e9": QUICK}),
+)
+
+bending = family(
+    "bending",
+    "bending stiffness × 0 to 1e6",
+    *_times("bending", "bending", {"0": QUICK, "1": FULL, "1e3": USUAL, "1e6": QUICK}),
+)
+
+time_step = family(
+    "time-step",
+    "Δt from 1e-5 s to 1 s",
+    *(
+        StressCase(f"step-{step}", f"Δt {step} s", as_it_is, steps=steps, step=float(step), level=level)
+        for step, steps, level in (
+            ("1e-5", 30, QUICK),
+            ("1e-4", 30, USUAL),
+            ("1e-3", 30, USUAL),
+            ("1e-2", 20, USUAL),
+            ("1e-1", 10, USUAL),
+            ("1", 5, QUICK),
+        )
+    ),
+)
+
+density = family(
+    "density",
+    "density × 1e-3 to 1e3",
+    *_times(
+        "density",
+        "density",
+        {"1e-3": QUICK, "1e-2": FULL, "1e-1": FULL, "1e1": FULL, "1e2": FULL, "1e3": USUAL},
+    ),
+)
+
+anisotropy = family(
+    "anisotropy",
+    "c11/c22 = 1e4, their mean staying",
+    StressCase("stiff-warp", "c11/c22 = 1e4", changed(anisotropic, ratio=1e4), level=QUICK),
+    StressCase("stiff-weft", "c11/c22 = 1e-4", changed(anisotropic, ratio=1e-4)),
+)
+
+damping = family(
+    "damping",
+    "γ 0 and 10 s",
+    StressCase("damping-0", "no damping", changed(damp, seconds=0.0)),
+    StressCase("damping-10s", "damping γ = 10 s", changed(damp, seconds=10.0), level=QUICK),
+)
+
+
+def _product(setting: Setting, bench: Bench, **factors: float) -> Content:
+    """Without a scene of the user, of a coarser sheet."""
+    content = setting.content()
+    if not setting.given:
+        content |= {key: sheet(CELLS[QUICK])[key] for key in ("mesh", "handles")}
+    return scale(content, **factors)
+
+
+products = family(
+    "products",
+    "stiffness × Δt × bending × density",
+    *(
+        StressCase(
+            f"all-{stretching}-{step}-{bending}-{density}",
+            f"membrane × {stretching}, Δt {step} s, bending × {bending}, density × {density}",
+            partial(_product, stretching=float(stretching), bending=float(bending), density=float(density)),
+            steps=5,
+            step=float(step),
+            level=FULL,
+        )
+        for stretching, step, bending, density in itertools.product(
+            ("1", "1e3", "1e6", "1e9"),
+            ("1e-4", "5e-3", "4e-2", "1"),
+            ("0", "1", "1e3", "1e6"),
+            ("1e-3", "1", "1e3"),
+        )
+    ),
+)
+
+
+wind = family(
+    "wind",
+    "wind of 50 and 200 m/s",
+    StressCase("wind-50", "wind 50 m/s", changed(blow, speed=50.0)),
+    StressCase("wind-200", "wind 200 m/s", changed(blow, speed=200.0), level=QUICK),
+)
+
+gravity = family(
+    "gravity",
+    "gravity × 1000",
+    StressCase("gravity-1000", "gravity × 1000", changed(weigh, factor=1000.0), level=QUICK),
+)
+
+
+NOISE = 0.3
+"""Standard deviation of each coordinate over the mean edge length."""
+
+FOLDS = 12
+RISE = 0.15
+"""Of the dome, m."""
+
+
+def _noisy(x: Array, spacing: float) -> Array:
+    return np.asarray(x + NOISE * spacing * np.random.default_rng(1).standard_normal(x.shape))
+
+
+def _crumpled(x: Array, spacing: float) -> Array:
+    """Folded repeatedly along random planes near the middle of the shape that previous folds have left."""
+    random = np.random.default_rng(2)
+    y = x - x.mean(axis=0)
+    for _ in range(FOLDS):
+        normal = random.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        height = y @ normal
+        height -= height.mean() + 0.1 * np.ptp(height) * random.uniform(-1.0, 1.0)
+        y = y - 2.0 * np.maximum(height, 0.0)[:, None] * normal
+    return np.asarray(y + x.mean(axis=0))
+
+
+def _folded(x: Array, spacing: float) -> Array:
+    """Flat on itself: what is beyond the vertex nearest to the middle of the longest side, mirrored there."""
+    axis = int(np.argmax(np.ptp(x, axis=0)))
+    middle = 0.5 * (x[:, axis].min() + x[:, axis].max())
+    # through a vertex: cells cut in their middle would lose all their area
+    crease = x[np.argmin(np.abs(x[:, axis] - middle)), axis]
+    y = x.copy()
+    y[:, axis] = crease - np.abs(x[:, axis] - crease)
+    return y
+
+
+def _mirrored(x: Array, spacing: float) -> Array:
+    """Turned inside out, where a curved shell is not at rest."""
+    y = x.copy()
+    y[:, 2] = 2.0 * x[:, 2].min() - x[:, 2]
+    return y
+
+
+def _dome(setting: Setting, bench: Bench) -> Content:
+    """A shell held at its rim; of a given scene its own sheet, without handles."""
+    content = setting.content()
+    if setting.given:
+        return release(content)
+    n = CELLS[setting.level]
+    vertices, triangles = rectangle(n, n, 1.0, 1.0)
+    u, v = 2.0 * vertices[:, 0] - 1.0, 2.0 * vertices[:, 1] - 1.0
+    vertices[:, 2] = RISE * (1.0 - u**2) * (1.0 - v**2)
+    rim = np.flatnonzero(np.maximum(np.abs(u), np.abs(v)) > 1.0 - 1e-9)
+    return content | {"mesh": bench.mesh(vertices, triangles), "handles": [{"nodes": rim.tolist()}]}
+
+
+start = family(
+    "start",
+    "start shapes: noise, a crumpled ball, a flat fold, a shell turned inside out",
+    StressCase("noise", "random noise of 0.3 elements, no handle", changed(release), shape=_noisy),
+    StressCase("crumpled", "crumpled into a ball", changed(release), shape=_crumpled),
+    StressCase("folded", "folded flat, a crease of 180°", changed(release), shape=_folded, level=QUICK),
+    StressCase("inside-out", "a shell turned inside out", _dome, shape=_mirrored),
+)
+
+SPIN = [3.0, 20.0, 1.0]
+"""rad/s"""
+
+
+def _tumbling(setting: Setting, bench: Bench) -> Content:
+    content = changed(release)(setting, bench)
+    content["initial"] = {**(content.get("initial") or {}), "angular_velocity": SPIN}
+    return content
+
+
+free = family(
+    "free",
+    "no handle: falling, and tumbling",
+    StressCase("falling", "no handle, released at rest", changed(release), level=QUICK),
+    StressCase("tumbling", "no handle, thrown with 20 rad/s", _tumbling),
+)
+
+
+ASPECT, RATIO = 1e3, 1e4
+"""Of a sliver's sides, and of the sizes of elements in one mesh."""
+
+
+def _slivers(setting: Setting, bench: Bench) -> Content:
+    """A strip held at one end, two cells long and a hundred high."""
+    nx, ny = 2, 100
+    mesh = bench.mesh(*rectangle(nx, ny, 1.0, ny / nx / ASPECT))
+    return setting.content() | {"mesh": mesh, "handles": [{"nodes": [j * (nx + 1) for j in range(ny + 1)]}]}
+
+
+def _graded(setting: Setting, bench: Bench) -> Content:
+    """A square held at two corners whose cells grow from one corner on."""
+    n = 24
+    sizes = RATIO ** (np.arange(n) / (n - 1.0))
+    places = np.concatenate([[0.0], np.cumsum(sizes)]) / sizes.sum()
+    vertices, triangles = rectangle(n, n, float(n), float(n))
+    vertices[:, :2] = places[np.rint(vertices[:, :2]).astype(np.int64)]
+    return setting.content() | {"mesh": bench.mesh(vertices, triangles), "handles": [{"nodes": [0, n]}]}
+
+
+def _one_triangle(setting: Setting, bench: Bench) -> Content:
+    """Hung by one corner, a thousand times as stiff."""
+    vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.9, 0.0]])
+    content = scale(setting.content(), stretching=1e3)
+    return content | {"mesh": bench.mesh(vertices, np.array([[0, 1, 2]])), "handles": [{"nodes": [0]}]}
+
+
+elements = family(
+    "elements",
+    "slivers, elements of very different sizes, a single one",
+    StressCase("slivers", "triangles with sides as 1 to 1000", _slivers, own=True, level=QUICK),
+    StressCase("graded", "elements whose sizes differ by 1e4", _graded, own=True),
+    StressCase("one-triangle", "a single stiff triangle", _one_triangle, steps=40, own=True, level=QUICK),
+)
+
+
+JUMP = (0.15, 0.1, 0.2)
+"""Over the size of the sheet."""
+
+TURNS = 10.0
+"""1/s"""
+
+SIDES = [{"group": "left"}, {"group": "right"}]
+STEPS = 40
+
+
+def _jump(setting: Setting, bench: Bench) -> Content:
+    far = [part * setting.size for part in JUMP]
+    still = {"time": 2.0 * setting.step}
+    return move(setting.content(), [{"time": 0.0}, still, {"time": 3.0 * setting.step, "translate": far}])
+
+
+def spinning(setting: Setting, bench: Bench) -> Content:
+    quarters = int(4.0 * TURNS * STEPS * setting.step) + 2
+    turn = [
+        {"time": k / (4.0 * TURNS), "rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0 * k}}
+        for k in range(quarters)
+    ]
+    return move(setting.content(), turn)
+
+
+def _pull(setting: Setting, bench: Bench, to: float) -> Content:
+    """Scale the handles' places along x; without a scene of the user, both sides are held."""
+    content = setting.content()
+    if not setting.given:
+        content["handles"] = [dict(side) for side in SIDES]
+    end = 0.75 * STEPS * setting.step
+    return move(content, [{"time": 0.0}, {"time": end, "scale": [to, 1.0, 1.0]}])
+
+
+handles = family(
+    "handles",
+    "handles that jump, spin, squeeze and stretch",
+    StressCase("jump", "handles jump by a quarter of the sheet in one step", _jump, level=QUICK),
+    StressCase("spin", "handles turn ten times a second", spinning, steps=STEPS),
+    StressCase("squeeze", "handles come together to a tenth", partial(_pull, to=0.1), steps=STEPS),
+    StressCase("stretch", "handles go apart threefold", partial(_pull, to=3.0), steps=STEPS, level=QUICK),
+)
+
+# -- a membrane that cannot buckle, pressed beyond where its model softens -------------------------------
+
+TO = 0.4
+"""Of the width, well below 1/√3."""
+
+
+def _pressed(setting: Setting, bench: Bench) -> Content:
+    content = setting.content() | {"handles": [dict(side) for side in SIDES]}
+    move(content, [{"time": 0.0}, {"time": STEPS * setting.step, "scale": [TO, 1.0, 1.0]}])
+    # a plane that the sheet cannot leave
+    content["handles"].append({"group": "sheet", "axes": ["z"]})
+    return content
+
+
+def _reached(setting: Setting, bench: Bench, record: Record) -> Mapping[str, Verdict]:
+    smallest = record.stretches[0]
+    return {"compressed": Verdict(smallest < SOFTENS_BELOW, f"to {smallest:.3f} of its length")}
+
+
+compression = family(
+    "compression",
+    "a membrane pressed in its plane beyond a stretch of 1/√3",
+    StressCase(
+        "pressed", "pressed in its plane to 0.4 of its width", _pressed, steps=STEPS, own=True,
+        judge=_reached, level=QUICK,
+    ),
+)  # fmt: skip
+
+
+CREASE = np.radians(179.0)
+"""Of a crease."""
+
+PART, CRUMPLED = 0.02, 0.3
+"""Of the length of a crushed strip, and of a crumpled sheet's width, what is left."""
+
+MANY, FEW, LONG = 80, 20, 0.02
+"""Numbers of steps, and Δt [s] of the few."""
+
+
+def _changed(change: Callable[..., Content], setting: Setting, bench: Bench, **numbers: float) -> Content:
+    return change(by_directors(setting.content()), **numbers)
+
+
+def _creased(x: Array, spacing: float) -> Array:
+    """What is beyond a crease in the middle of x, turned about it until it nearly lies on the rest."""
+    middle = 0.5 * (x[:, 0].min() + x[:, 0].max())
+    crease = x[np.argmin(np.abs(x[:, 0] - middle)), 0]
+    y = x.copy()
+    beyond = y[:, 0] > crease
+    way, height = y[beyond, 0] - crease, y[beyond, 2].copy()
+    y[beyond, 0] = crease + np.cos(CREASE) * way - np.sin(CREASE) * height
+    y[beyond, 2] = np.sin(CREASE) * way + np.cos(CREASE) * height
+    return y
+
+
+def _spun(setting: Setting, bench: Bench) -> Content:
+    return by_directors(spinning(setting, bench))
+
+
+def _strip(
+    setting: Setting,
+    bench: Bench,
+    frames: list[dict[str, Any]],
+    stiffer: bool,
+    integrator: str = "beuler",
+) -> Content:
+    """A strip of the base scene's sheet, or a stiffer one, clamped at both ends, one of which moves."""
+    content = by_directors(setting.content())
+    if stiffer:
+        content = scale(content, stretching=8.0, bending=10.0)
+    content["mesh"] = grid(1.0, 0.3, 40, 12, "alternating") | {"transform": {"translate": [0.0, -0.15, 0.0]}}
+    content["time"] = {**content["time"], "integrator": integrator}
+    content["handles"] = [{"group": "right", "clamp": True}]
+    content = move(content, frames)
+    content["handles"].append({"group": "left", "clamp": True})
+    return content
+
+
+def _drawn_together(setting: Setting, bench: Bench) -> Content:
+    """The sheet, whose four sides come together."""
+    content = by_directors(setting.content())
+    content["handles"] = [{"group": side} for side in ("left", "right", "bottom", "top")]
+    return move(content, [{"time": 0.0}, {"time": MANY * STEP, "scale": [CRUMPLED, CRUMPLED, 1.0]}])
+
+
+def _twist(degrees: float, seconds: float, parts: int) -> list[dict[str, Any]]:
+    """Keyframes."""
+    return [
+        {
+            "time": seconds * k / parts,
+            "rotate": {"axis": [1.0, 0.0, 0.0], "degrees": degrees * k / parts},
+        }
+        for k in range(parts + 1)
+    ]
+
+
+CRUSH: list[dict[str, Any]] = [{"time": 0.0}, {"time": MANY * STEP, "scale": [PART, 1.0, 1.0]}]
+
+directors = family(
+    "directors",
+    "bending_model: midedge",
+    StressCase("directors-plain", "as it is", changed(by_directors), level=QUICK),
+    *(
+        StressCase(
+            f"directors-1e6-{ms}ms", f"membrane × 1e6, Δt {ms} ms", partial(_changed, scale, stretching=1e6),
+            step=1e-3 * ms,
+        )
+        for ms in (5, 40)
+    ),
+    StressCase("directors-bending-1e6", "bending × 1e6", partial(_changed, scale, bending=1e6)),
+    StressCase("directors-wind-200", "wind 200 m/s", partial(_changed, blow, speed=200.0)),
+    StressCase("directors-spin", "handles turn ten times a second", _spun, steps=FEW, level=FULL),
+    StressCase("directors-folded", "a crease of 179°, no handle", partial(_changed, release), shape=_creased),
+    StressCase(
+        "directors-twist", "a stiff strip twisted by 720°", steps=MANY, own=True,
+        scene=partial(_strip, frames=_twist(720.0, MANY * STEP, 16), stiffer=True),
+    ),
+    StressCase(
+        "directors-twist-20ms", "a soft strip twisted by 1080°, Δt 20 ms", steps=FEW, step=LONG, own=True,
+        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False),
+    ),
+    StressCase(
+        "directors-twist-bdf2", "the same with bdf2", steps=FEW, step=LONG, own=True,
+        scene=partial(_strip, frames=_twist(1080.0, FEW * LONG, FEW), stiffer=False, integrator="bdf2"),
+    ),
+    StressCase(
+        "directors-crush", "a stiff strip crushed to 2 %", steps=MANY, own=True,
+        scene=partial(_strip, frames=CRUSH, stiffer=True),
+    ),
+    StressCase("directors-crumpled", "all sides come together to 0.3", _drawn_together, steps=MANY, own=True),
+)  # fmt: skip
