@@ -5,25 +5,26 @@ does not cross: a vertex or an edge that lies on the other triangle, triangles t
 sheet that is folded flat onto itself), triangles without area, which have no interior. Triangles with a
 common edge meet there alone, or lie in one plane; those with a common vertex may cross elsewhere.
 
-Candidates are triangles whose boxes meet; the decision comes from signs of determinants alone (Guigue &
-Devillers, Fast and Robust Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics
-Tools 8 (2003) 25-42, with open instead of closed triangles). These are exact for floating-point coordinates:
-the determinant in floating point with a bound of its error, and where that does not decide, as an expansion,
-an unevaluated sum of numbers without overlap (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast
-Robust Geometric Predicates, Discrete & Computational Geometry 18 (1997) 305-363).
+Candidates come from a tree of boxes of its own, so that what the solver's search misses is not missed here,
+too. The decision comes from signs of determinants alone (Guigue & Devillers, Fast and Robust
+Triangle-Triangle Overlap Test Using Orientation Predicates, Journal of Graphics Tools 8 (2003) 25-42, with
+open instead of closed triangles). These are exact for floating-point coordinates: the determinant in floating
+point with a bound of its error, and where that does not decide, as an expansion, an unevaluated sum of
+numbers without overlap (Shewchuk, Adaptive Precision Floating-Point Arithmetic and Fast Robust Geometric
+Predicates, Discrete & Computational Geometry 18 (1997) 305-363).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.mesh.near import near
 
 UNDECIDED = 2
 """Where products of the coordinates overflow or underflow, so that expansions are not exact."""
@@ -153,8 +154,28 @@ def rational_side(points: Mapping[int, tuple[Fraction, ...]], a: int, b: int, c:
     return (determinant > 0) - (determinant < 0)
 
 
-TINY = 2.0**-64
-"""By which boxes are made smaller: extents of what is as large as numbers go would overflow."""
+LEAF = 4
+"""Triangles in a leaf of the tree."""
+
+
+class _Tree(NamedTuple):
+    """A complete binary tree of boxes: node k has the children 2 k and 2 k + 1, node 1 contains all.
+
+    Attributes
+    ----------
+    order : (F,) int64
+        Triangles in the order of the leaves, `LEAF` to each.
+    low, high : (F, 3) float64
+        Boxes of the triangles, in this order [m].
+    node_low, node_high : (2 n, 3) float64
+        Boxes of the nodes, of which the last n are the leaves; low > high for those without a triangle [m].
+    """
+
+    order: Ints
+    low: Array
+    high: Array
+    node_low: Array
+    node_high: Array
 
 
 def self_crossings(points: Array, triangles: Ints) -> Ints:
@@ -171,7 +192,8 @@ def self_crossings(points: Array, triangles: Ints) -> Ints:
     (n, 2) int64
         Triangles, the smaller first, in lexicographic order. `have_common_vertex` tells those pairs apart.
     """
-    return _crossing_of(points, triangles, triangles, near(_boxes(points, triangles)))
+    found = _search(points, triangles, triangles, *_tree(points, triangles), True)
+    return _certain(points, triangles, triangles, *found)
 
 
 def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triangles: Ints) -> Ints:
@@ -191,8 +213,8 @@ def mutual_crossings(points: Array, triangles: Ints, others: Array, other_triang
     """
     every = np.concatenate([points, others])
     theirs = other_triangles + len(points)
-    pairs = near(_boxes(every, triangles), _boxes(every, theirs))
-    return _crossing_of(every, triangles, theirs, pairs)
+    found = _search(every, triangles, theirs, *_tree(every, theirs), False)
+    return _certain(every, triangles, theirs, *found)
 
 
 def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
@@ -201,22 +223,55 @@ def have_common_vertex(triangles: Ints, pairs: Ints) -> Mask:
     return np.asarray((first[:, :, None] == second[:, None, :]).any(axis=(1, 2)))
 
 
-def _boxes(points: Array, triangles: Ints) -> tuple[Array, Array]:
-    """Low and high corners (F, 3) of triangles."""
-    corners = TINY * points[triangles]
-    return corners.min(axis=1), corners.max(axis=1)
-
-
-def _crossing_of(points: Array, triangles: Ints, others: Ints, pairs: Ints) -> Ints:
-    """Those pairs (n, 2) of triangles and others that cross, in lexicographic order."""
-    found = np.empty(len(pairs), dtype=np.int64)
-    _decide(points, triangles, others, pairs, found)
-    for n in np.flatnonzero(found == UNDECIDED):
+def _certain(points: Array, triangles: Ints, others: Ints, pairs: Ints, decided: Mask) -> Ints:
+    """The pairs found without those among the undecided that do not cross, in lexicographic order."""
+    kept = decided.copy()
+    for n in np.flatnonzero(~decided):
         vertices = [*triangles[pairs[n, 0]].tolist(), *others[pairs[n, 1]].tolist()]
         exact = {vertex: tuple(map(Fraction, points[vertex].tolist())) for vertex in vertices}
-        found[n] = _rational_crossing(exact, *vertices)
-    pairs = pairs[found == 1]
+        kept[n] = _rational_crossing(exact, *vertices)
+    pairs = pairs[kept]
     return np.asarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
+
+
+def _tree(points: Array, triangles: Ints) -> _Tree:
+    """The tree of boxes of triangles, along a space-filling curve."""
+    corners = points[triangles]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    order = np.argsort(_curve(low, high), kind="stable")
+    low, high = low[order], high[order]
+    leaves = 1 << max(0, -(-len(triangles) // LEAF) - 1).bit_length()
+    node_low, node_high = np.full((2 * leaves, 3), np.inf), np.full((2 * leaves, 3), -np.inf)
+    begins = np.arange(0, len(triangles), LEAF)
+    if len(begins):
+        node_low[leaves:][: len(begins)] = np.minimum.reduceat(low, begins)
+        node_high[leaves:][: len(begins)] = np.maximum.reduceat(high, begins)
+    level = leaves
+    while level > 1:
+        below, level = slice(level, 2 * level), level // 2
+        node_low[level : 2 * level] = node_low[below].reshape(level, 2, 3).min(axis=1)
+        node_high[level : 2 * level] = node_high[below].reshape(level, 2, 3).max(axis=1)
+    return _Tree(order, low, high, node_low, node_high)
+
+
+def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
+    """(F,) places along Morton's curve of the centres of boxes, with 21 bits an axis."""
+    # a quarter each: coordinates may be as large as numbers go
+    centres = 0.25 * low + 0.25 * high
+    if not len(centres):
+        return np.empty(0, np.uint64)
+    least = centres.min(axis=0)
+    extent = (centres.max(axis=0) - least).max()
+    bits = ((centres - least) * (1.0 / extent if extent > 1e-300 else 0.0) * (2**21 - 1)).astype(np.uint64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return np.asarray(bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2))
 
 
 def _decides_crossing(side: Any) -> Callable[..., int]:
@@ -260,9 +315,58 @@ _rational_crossing = _decides_crossing(rational_side)
 
 
 @cached()
-def _decide(points, triangles, others, pairs, found):  # type: ignore[no-untyped-def]
-    """1, 0 or `UNDECIDED` into found (n,) for each pair (n, 2) of a triangle and another one."""
-    for n in range(len(pairs)):
-        a, b, c = triangles[pairs[n, 0]]
-        d, e, f = others[pairs[n, 1]]
-        found[n] = _crossing(points, a, b, c, d, e, f)
+def _search(
+    points: Any,
+    queries: Any,
+    triangles: Any,
+    order: Any,
+    low: Any,
+    high: Any,
+    node_low: Any,
+    node_high: Any,
+    within: bool,
+) -> tuple[Any, Any]:
+    """The pairs of a query and a triangle of the tree that cross or are undecided, and which are decided.
+
+    ``within``: queries and triangles are the same; each pair is looked at once.
+    """
+    pairs, decided, count = np.empty((64, 2), np.int64), np.empty(64, np.bool_), 0
+    leaves, stack = len(node_low) // 2, np.empty(64, np.int64)
+    for i in range(len(queries)):
+        a, b, c = queries[i, 0], queries[i, 1], queries[i, 2]
+        least, most = np.minimum(points[a], points[b]), np.maximum(points[a], points[b])
+        least, most = np.minimum(least, points[c]), np.maximum(most, points[c])
+        stack[0], top = 1, 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            if _apart(least, most, node_low[node], node_high[node]):
+                continue
+            if node < leaves:
+                stack[top], stack[top + 1] = 2 * node, 2 * node + 1
+                top += 2
+                continue
+            first = (node - leaves) * LEAF
+            for place in range(first, min(first + LEAF, len(order))):
+                j = order[place]
+                if (within and j <= i) or _apart(least, most, low[place], high[place]):
+                    continue
+                d, e, f = triangles[j, 0], triangles[j, 1], triangles[j, 2]
+                found = _crossing(points, a, b, c, d, e, f)
+                if found == 0:
+                    continue
+                if count == len(pairs):
+                    pairs, decided = np.concatenate((pairs, pairs)), np.concatenate((decided, decided))
+                pairs[count, 0], pairs[count, 1], decided[count] = i, j, found != UNDECIDED
+                count += 1
+    return pairs[:count], decided[:count]
+
+
+@cached()
+def _apart(low: Any, high: Any, other_low: Any, other_high: Any) -> bool:
+    """Whether two boxes have no point in common."""
+    return bool(
+        (low[0] > other_high[0] or high[0] < other_low[0])
+        or (low[1] > other_high[1] or high[1] < other_low[1])
+        or (low[2] > other_high[2] or high[2] < other_low[2])
+    )
