@@ -368,6 +368,12 @@ class Elastic(Term):
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0)
 
+    def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Array]:
+        """The same where repulsion stiffens at the end of the step, with its second derivative b″ (m,) [N/m]
+        instead of the force, and how far pairs that rest go in a step at most (m,) [m].
+        """
+        return *self.touching_points(x, frozen), np.empty(0)
+
     def carried(self, x: Array, way: Array, frozen: Any) -> Array:
         """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""
         return way
@@ -423,6 +429,9 @@ class Elastic(Term):
 
     def take_pairs(self, x: Array, frozen: Any) -> None:
         """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
+
+    def feel(self, force: Array) -> None:
+        """Know the normal forces (n_owned,) [N] in the step just taken, each pair's at its first vertex."""
 
     def element_state(self) -> tuple[Ints, Array]:
         """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,
