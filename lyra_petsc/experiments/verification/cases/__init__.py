@@ -55,6 +55,7 @@ CASES: Registry[VerificationCase] = Registry(
         "cloth-overhang": "cantilevers",
         "strip-vibration": "hinges",
         "incline": "contacts",
+        "sheets": "contacts",
         "rest": "contacts",
         "capstan": "contacts",
         "collision": "contacts",
