@@ -71,7 +71,7 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     """Add impulses, up to a factor, to rows of out (n_local, 3), between what touches at the stage of the
     pairs that this rank counts.
     """
-    points, beta, normal, force = term.touching_points(system.stage_positions, frozen)
+    points, beta, normal, force, _ = term.touching_points(system.stage_positions, frozen)
     sheet = points >= 0
     between = sheet.all(axis=1)
     beta = np.where(sheet, beta, 0.0)
@@ -83,25 +83,19 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
 
 
 def pressing(system: StageEquations) -> Array:
-    """Normal forces (n_owned,) [N] at the stage of the step just taken, each pair's at its first vertex."""
+    """Normal forces (n_owned,) [N] on vertices that meet something, at the stage of the step just taken."""
     x = system.x if system.stage.after == system.dt else system.stage_positions
     out = np.zeros(system.points.n_owned)
     for term in system.active.limiting:
-        points, _, _, force = term.touching_points(x, system.active.frozen[term])
-        _add_to_first(points, force, out)
+        *_, force, vertex = term.touching_points(x, system.active.frozen[term])
+        np.add.at(out, vertex[vertex >= 0], force[vertex >= 0])
     return out
-
-
-def _add_to_first(points: Ints, values: Array, out: Array) -> None:
-    """Add values (m,) to rows of out (n_owned,), of the first of each pair's vertices, points (m, 4)."""
-    first = points[np.arange(len(points)), (points >= 0).argmax(axis=1)]
-    np.add.at(out, first, values)
 
 
 def calm(system: StageEquations) -> Array:
     """Damp the rates at which distances in contact change; collective.
 
-    Returns the mean forces (n_owned,) [N] of that in the step, each pair's at its first vertex.
+    Returns the mean forces (n_owned,) [N] of that in the step on vertices that meet something.
 
     Impulses −w n·u of a pair with the rate n·u, w/m = s³/(2 + s³), s² = Δt² b″/m. As Σ_e w_e a_e a_eᵀ is not
     beyond the mass matrix for m the least over the pair's vertices of mass over Σ_e |β_ei| Σ_j |β_ej|, with
@@ -112,7 +106,9 @@ def calm(system: StageEquations) -> Array:
     pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.largest(sum(len(points) for points, *_ in pairs))):
         return felt
-    points, beta, normal, stiffness, slow = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    points, beta, normal, stiffness, vertex, slow = (
+        np.concatenate(part) for part in zip(*pairs, strict=True)
+    )
     sheet = points >= 0
     rows, beta = np.where(sheet, points, 0), np.where(sheet, beta, 0.0)
     shared = np.zeros_like(system.x)
@@ -131,5 +127,5 @@ def calm(system: StageEquations) -> Array:
     layout.add_to_owners(impulse)
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
     system.state.set(system.x[:n], system.v[:n] + change)
-    _add_to_first(points, push / dt, felt)
+    np.add.at(felt, vertex[vertex >= 0], push[vertex >= 0] / dt)
     return felt

@@ -144,7 +144,7 @@ class CoulombFriction(Elastic):
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
-        self._give(contact.stencil[at, 0], force)
+        self._give(contact.led_by(at), force)
         order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
@@ -152,17 +152,18 @@ class CoulombFriction(Elastic):
         friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
         self._pairs, self.stale = Pairs(key, what), True
 
-    def _give(self, first: Ints, force: Array) -> None:
-        """Let normal forces (m,) [N] of pairs with these first vertices be those that acted in the step."""
+    def _give(self, vertex: Ints, force: Array) -> None:
+        """Let normal forces (m,) [N] of pairs led by vertices be those that acted in the step."""
         more, missed = self._heat[:, MORE], self._heat[:, MISSED]
-        total = np.bincount(first, force, minlength=len(more))
+        led = vertex >= 0
+        total = np.bincount(vertex[led], force[led], minlength=len(more))
         if self._felt is not None:
             missed += self._felt[: len(more)] - total
             missed[(total == 0.0) & (self._felt[: len(more)] == 0.0)] = 0.0
             np.clip(missed, -total, total, out=more)
             missed -= more
         if more.any():
-            force *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[first]
+            force[led] *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[vertex[led]]
 
     def feel(self, force: Array) -> None:
         self._felt = force

@@ -156,7 +156,8 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=1e-2)
 
 
-def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> None:
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
+def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
     """Two sheets lie crosswise on a slope and stick, so heavy that their edges touch; on one rank edges are
     named in another order.
     """
@@ -173,7 +174,7 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> No
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE)},
             "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},
-            "time": {"end": 0.16, "step": 0.004},
+            "time": {"end": 0.16, "step": 0.004, "integrator": integrator},
             "solver": tight,
         }
     )
