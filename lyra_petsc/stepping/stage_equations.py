@@ -352,11 +352,15 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
-        if self.watches_impacts:
-            from lyra_petsc.stepping.impacts import surplus  # of no use elsewhere
+        if self.active.limiting and self.integrator.order > 1:
+            from lyra_petsc.stepping.impacts import calm, pressing, surplus  # of no use elsewhere
 
-            left = self.integrator.surplus
-            self.integrator.surplus = surplus(self, self._stored, before, left)
+            if self.watches_impacts:
+                left = self.integrator.surplus
+                self.integrator.surplus = surplus(self, self._stored, before, left)
+            pressed = pressing(self) + (0.0 if self.active.pushing else calm(self))
+            for term in self.active.near:
+                term.feel(pressed)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""

@@ -58,6 +58,9 @@ each other are held by pairs of vertices and triangles, two for a vertex; edges,
 what these do not. On obstacles' triangles a sheet's vertices lie, alike wherever the edges of these are.
 """
 
+RESTS = 0.1
+"""Part of the gap up to which the way of a pair in a step is that of what comes to rest, not of an impact."""
+
 SHARP = 0.5
 """Angle [rad] between triangles of an obstacle above which the edge between them is felt as they are."""
 
@@ -664,9 +667,24 @@ class ContactBarrier(Elastic):
         keeps = force > 0.0
         return beta[keeps], normal[keeps], force[keeps], at[keeps]
 
-    def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array]:
+    def led_by(self, at: Ints) -> Ints:
+        """The vertex of a sheet that each of pairs (m,) is of, −1 of edges and of points of obstacles."""
+        of_vertex = (self.kind[at] != EDGE_EDGE) & (self.points[at, 0] >= 0)
+        found: Ints = np.where(of_vertex, self.points[at, 0], -1)
+        return found
+
+    def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
         beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
-        return self.points[at], beta, normal, force
+        return self.points[at], beta, normal, force, self.led_by(at)
+
+    def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Array]:
+        met = self.meeting(x, frozen.after)
+        square = np.sum(met.felt[:, :3] ** 2, axis=1)
+        of = np.flatnonzero((met.counted > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
+        at, square = met.at[of], square[of]
+        normal = met.felt[of, :3] / np.sqrt(square)[:, None]
+        stiffness = met.counted[of] * met.felt[of, 4] * square
+        return self.points[at], met.beta[of], normal, stiffness, self.led_by(at), RESTS * self.gap[at]
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this

@@ -3,6 +3,9 @@
 Pairs, their normals and normal forces are those of the last accepted state; a pair that goes on keeps the
 elastic part of its way, so that what sticks does not creep, and so does a vertex that goes on over what it
 touches. The owner of a pair's first vertex knows it, and tells the owners of the others.
+
+The normal forces of a step are those that acted in the step before: what sums up over the time that a pair
+touches is μ times their impulse. Under integrators of second order they are not those at its end alone.
 """
 
 from __future__ import annotations
@@ -26,6 +29,10 @@ from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+WORK, MORE, MISSED = 0, 1, 2
+"""Columns of what is known of vertices: work of friction [J]; by how much the normal forces that acted in the
+last step exceed those at its end [N], as far as friction is given it, and the rest, of all steps."""
 
 SLIP = 4
 """Place of the elastic parts of the ways among what the kernels take."""
@@ -56,12 +63,16 @@ class ObstacleMoves(NamedTuple):
 
     Attributes
     ----------
+    part : float
+        Of the step, up to its stage; 1 also at its start.
     stage, end : list of (3, 3) and (3,)
-        Rotation and translation [m] of each from the start of the step to its stage and its end.
+        Rotation and translation [m] of each from the start of the step to where friction is asked, and to the
+        end.
     places : (m, 3)
-        Their points and normals at its end.
+        Their points and normals there.
     """
 
+    part: float
     stage: list[tuple[Array, Array]]
     end: list[tuple[Array, Array]]
     places: Array
@@ -91,6 +102,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
+        self._felt: Array | None = None  # normal forces in the step just taken, if not those at its end
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -109,13 +121,13 @@ class CoulombFriction(Elastic):
         self._beta, vectors = np.empty((n, 4)), np.empty((4, n, 3))
         self._normal, self._still, self._slip, self._foot = vectors
         friction_pairs.unpack(what, self._beta, self._normal, self._still, self._slip, self._foot)
-        self._start, self._obstacle = self._still, what[:, 1].astype(np.int64)
+        self._obstacle = what[:, 1].astype(np.int64)
         self._force = self._limit = self._spring = what[:, FORCE].copy()
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(what[:, SLID] > 0.5, kinetic, static) * self._force
             self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
-        self._moved: list[tuple[Array, Array]] | None = None  # what the starts are of
+        self._of: ObstacleMoves | None = None  # what is remembered of a stage
 
     # -- pairs -------------------------------------------------------------------------------------
 
@@ -127,16 +139,34 @@ class CoulombFriction(Elastic):
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
         contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
+            self._heat[:, MORE:] = 0.0
             return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
+        self._give(contact.led_by(at), force)
         order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
         touching = at[order], beta[order], normal[order], force[order]
         friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
         self._pairs, self.stale = Pairs(key, what), True
+
+    def _give(self, vertex: Ints, force: Array) -> None:
+        """Let normal forces (m,) [N] of pairs led by vertices be those that acted in the step."""
+        more, missed = self._heat[:, MORE], self._heat[:, MISSED]
+        led = vertex >= 0
+        total = np.bincount(vertex[led], force[led], minlength=len(more))
+        if self._felt is not None:
+            missed += self._felt[: len(more)] - total
+            missed[(total == 0.0) & (self._felt[: len(more)] == 0.0)] = 0.0
+            np.clip(missed, -total, total, out=more)
+            missed -= more
+        if more.any():
+            force[led] *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[vertex[led]]
+
+    def feel(self, force: Array) -> None:
+        self._felt = force
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
         self._renew(x, frozen.places, self._pairs)
@@ -164,34 +194,49 @@ class CoulombFriction(Elastic):
     # -- a step ------------------------------------------------------------------------------------
 
     def freeze(self, step: UpcomingStep) -> ObstacleMoves:
-        obstacles = self._contact.obstacles
-        stage, end = obstacles.moved(step.start, step.at), obstacles.moved(step.start, step.end)
-        return ObstacleMoves(stage, end, obstacles.at(step.end))
+        obstacles, part = self._contact.obstacles, 1.0
+        end = stage = obstacles.moved(step.start, step.end)
+        if step.start < step.at < step.end:
+            part = (step.at - step.start) / (step.end - step.start)
+        elif step.at < step.end:
+            stage = obstacles.moved(step.start, step.at)
+        return ObstacleMoves(part, stage, end, obstacles.at(step.end))
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
-        if self._moved is not moved:
-            start = self._still
-            for obstacle, (rotation, translation) in enumerate(moved):
-                if not translation.any() and (rotation == np.eye(3)).all():
-                    continue
-                mine, foot = self._obstacle == obstacle, self._foot
-                start = start.copy() if start is self._still else start
-                side, foot = self._beta[mine].sum(axis=1), foot[mine]
-                start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
-            self._moved, self._start = moved, start
-        return self.stencil, self._beta, self._normal, self._start, self._slip, self._spring, self._limit
+        start = self._still
+        for obstacle, (rotation, translation) in enumerate(moved):
+            if not translation.any() and (rotation == np.eye(3)).all():
+                continue
+            mine, foot = self._obstacle == obstacle, self._foot
+            start = start.copy() if start is self._still else start
+            side, foot = self._beta[mine].sum(axis=1), foot[mine]
+            start[mine] += side[:, None] * (foot @ rotation.T + translation - foot)
+        return self.stencil, self._beta, self._normal, start, self._slip, self._spring, self._limit
+
+    def _at_stage(self, frozen: ObstacleMoves) -> tuple[NDArray[Any], ...]:
+        """The same for positions of the stage, a part a of the way to the end: a D, with D there, has the
+        gradient of D there. What sticks would else tremble under the midpoint rule for ever.
+        """
+        if self._of is not frozen:
+            self._of, part = frozen, frozen.part
+            stencil, beta, normal, start, slip, spring, limit = self._state(frozen.stage)
+            if part != 1.0:
+                start = start + (1.0 / part - 1.0) * self._still
+                beta, spring, limit = beta / part, part * spring, part * limit
+            self._stage = stencil, beta, normal, start, slip, spring, limit
+        return self._stage
 
     def energies(self, x: Array, frozen: ObstacleMoves) -> Array:
         out = np.empty(self.n_owned)
         if not self.n_elements:
             return out
-        friction_pairs.energies(x, *self._state(frozen.stage), out)
+        friction_pairs.energies(x, *self._at_stage(frozen), out)
         return out
 
     def add_gradient(self, x: Array, frozen: ObstacleMoves, out: Array) -> None:
         if self.n_elements:
-            friction_pairs.add_gradient(x, *self._state(frozen.stage), out)
+            friction_pairs.add_gradient(x, *self._at_stage(frozen), out)
 
     def add_hessian(
         self,
@@ -203,14 +248,14 @@ class CoulombFriction(Elastic):
         values: Array,
         predicted: tuple[Array, Array] | None = None,
     ) -> None:
-        state = self._state(frozen.stage)
+        state = self._at_stage(frozen)
         friction_pairs.add_hessians(x, *state, weight, blend, offsets[self.name], values)
 
     def sticking(self, x: Array, frozen: ObstacleMoves) -> tuple[float, float, float]:
         """How many pairs that this rank counts stick and slide at positions x (n_local, 3), and the sum of
         the normal forces [N] that they are given in the step.
         """
-        mine, state = slice(self.n_owned), list(self._state(frozen.stage))
+        mine, state = slice(self.n_owned), list(self._at_stage(frozen))
         state[SLIP] = self._slip.copy()
         heat, slides = np.empty(self.n_elements), np.empty(self.n_elements, dtype=np.bool_)
         friction_pairs.slide(x, *state, heat, slides)
@@ -221,6 +266,12 @@ class CoulombFriction(Elastic):
         return self._spring * size
 
     def accept(self, x: Array, frozen: ObstacleMoves) -> None:
+        if self._felt is None:
+            self._heat[:, MORE:] = 0.0
+        self._take_step(x, frozen)
+        self._felt = None
+
+    def _take_step(self, x: Array, frozen: ObstacleMoves) -> None:
         if not self.n_elements:
             self._on_obstacles = np.zeros_like(self._on_obstacles)
             self._renew(x, frozen.places, self._known)
@@ -232,7 +283,7 @@ class CoulombFriction(Elastic):
         state[SLIP] = slip = self._slip.copy()
         friction_pairs.slide(x, *state, heat, slides)
         first = self.stencil[: self.n_owned, 0]
-        np.add.at(self._heat[:, 0], first, heat[: self.n_owned])
+        np.add.at(self._heat[:, WORK], first, heat[: self.n_owned])
         old = self._known.what.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
         self._renew(x, frozen.places, Pairs(self._known.key, old))
@@ -269,7 +320,7 @@ class CoulombFriction(Elastic):
         self._heat = state["friction_work"].copy()
 
     def history(self, x: Array, frozen: ObstacleMoves) -> Mapping[str, float]:
-        return {"friction_work": float(self._heat[:, 0].sum())}
+        return {"friction_work": float(self._heat[:, WORK].sum())}
 
 
 def elements(rest: RestShape) -> None:

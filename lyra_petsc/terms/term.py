@@ -361,13 +361,19 @@ class Elastic(Term):
         """
         raise NotImplementedError
 
-    def touching_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array]:
+    def touching_points(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints]:
         """What touches at positions x (n_local, 3), of the pairs that this rank counts: points (m, 4), below
         0 those of obstacles, their barycentric coordinates β (m, 4), unit normals (m, 3) towards the first,
-        and normal forces (m,) [N].
+        normal forces (m,) [N], and the vertex (m,) of a sheet that meets something, −1 of others.
         """
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
-        return *nothing, np.empty(0)
+        return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
+
+    def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints, Array]:
+        """The same where repulsion stiffens at the end of the step, with its second derivative b″ (m,) [N/m]
+        instead of the force, and how far pairs that rest go in a step at most (m,) [m].
+        """
+        return *self.touching_points(x, frozen), np.empty(0)
 
     def carried(self, x: Array, way: Array, frozen: Any) -> Array:
         """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""
@@ -424,6 +430,9 @@ class Elastic(Term):
 
     def take_pairs(self, x: Array, frozen: Any) -> None:
         """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
+
+    def feel(self, force: Array) -> None:
+        """Know the normal forces (n_owned,) [N] on vertices that met something in the step just taken."""
 
     def element_state(self) -> tuple[Ints, Array]:
         """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,

@@ -93,7 +93,71 @@ def test_it_stands(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
 
 
-def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> None:
+INTEGRATORS = ["semi-implicit", "beuler", "midpoint", "bdf2", "alpha2"]
+
+
+def on_a_sheet(friction: float, integrator: str, end: float) -> dict[str, Any]:
+    """A sheet on a larger one of other triangles, which is held as it lies on the slope."""
+    turn, side, low = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}, 0.2, 0.35
+    gap = 0.2 * GAP
+    place = [0.07 * along + 0.97 * gap * out for along, out in zip(DOWN, NORMAL, strict=True)]
+    lower = grid(1.4, low, 24, 6, "alternating") | {"transform": {"rotate": turn}}
+    upper = grid(side, side, 4, 4) | {"transform": {"rotate": turn, "translate": [place[0], 0.06, place[2]]}}
+    return {
+        "mesh": [lower, upper],
+        "material": CLOTH | {"bending": 1e-4, "damping": 0.01},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": gap, "friction": friction},
+        "handles": [{"nodes": list(range(25 * 7))}],
+        "time": {"end": end, "step": 0.01, "integrator": integrator},
+    }
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_sheet_stands_on_a_plane_and_on_a_sheet(comm: MPI.Comm, integrator: str) -> None:
+    """At 1.01 of the friction that holds it: it bounces at first, and then does not move."""
+    place = [0.96 * GAP * component for component in NORMAL]
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
+    friction = 1.01 * math.tan(SLOPE)
+    sheet = on_a_sheet(friction, integrator, 1.2)
+    plane = sheet | {
+        "mesh": grid(0.4, 0.4, 3, 3) | {"transform": {"rotate": turn, "translate": place}},
+        "obstacles": {"slope": PLANE},
+        "contact": {"gap": GAP, "friction": friction},
+        "handles": [],
+    }
+    for content in (plane, sheet):
+        simulation = SteppedScene(comm, scene_of(content))
+        system, n = simulation.problem.system, simulation.problem.points.n_owned
+        settled = None
+        while not simulation.finished:
+            simulation.step()
+            if settled is None and simulation.time > 0.8 - 1e-9:
+                settled = system.x[:n].copy()
+        moved = comm.allreduce(float(np.abs(system.x[:n] - settled).max(initial=0.0)), MPI.MAX)
+        simulation.destroy()
+        assert moved < 1e-6
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS[1:])
+def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: str) -> None:
+    friction, end, begin = 0.8 * math.tan(SLOPE), 0.5, 0.2
+    simulation = SteppedScene(comm, scene_of(on_a_sheet(friction, integrator, end)))
+    system, layout = simulation.problem.system, simulation.problem.points
+    upper = np.where(layout.original >= 25 * 7, system.mass[: layout.n_vertices], 0.0)
+    mass = comm.allreduce(float(upper.sum()))
+    speeds = []
+    while not simulation.finished:
+        simulation.step()
+        if simulation.time > begin - 1e-9:
+            speeds.append(comm.allreduce(float(upper @ system.v[: layout.n_vertices] @ DOWN)) / mass)
+    found = (speeds[-1] - speeds[0]) / (end - begin)
+    simulation.destroy()
+    assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=1e-2)
+
+
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
+def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integrator: str) -> None:
     """Two sheets lie crosswise on a slope and stick, so heavy that their edges touch; on one rank edges are
     named in another order.
     """
@@ -110,7 +174,7 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path) -> No
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE)},
             "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},
-            "time": {"end": 0.16, "step": 0.004},
+            "time": {"end": 0.16, "step": 0.004, "integrator": integrator},
             "solver": tight,
         }
     )

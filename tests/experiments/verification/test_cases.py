@@ -20,7 +20,7 @@ LONG = (
     "catenary", "catenary-unequal", "circular-membrane", "plate", "plate-vibration", "column",
     "post-buckling", "lateral-buckling", "elastica-tip", "elastica-weight", "elastica-roll-up",
     "elastica-overhang", "slit-annulus", "sze-end-moment", "pinched-cylinder", "open-cylinder",
-    "hinged-roof", "incline", "rest", "capstan", "collision", "layers", "ruck", "pole",
+    "hinged-roof", "incline", "sheets", "rest", "capstan", "collision", "layers", "ruck", "pole",
     "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
     "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane",
 )  # fmt: skip

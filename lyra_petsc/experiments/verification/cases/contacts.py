@@ -645,3 +645,63 @@ def cusick(bench: Bench, n: float) -> Sequence[Measured]:
         means[kind] = float(np.mean(found))
     common = float(np.mean(list(means.values())))
     return [Measured(f"drape coefficient, {kind}", mean, common, scale=1.0) for kind, mean in means.items()]
+
+
+# -- a sheet on a sheet -----------------------------------------------------------------------------------
+
+SLIDERS = ("beuler", "bdf2", "alpha2", "midpoint")
+LEAN, BED, BEGIN, RAN = 30.0, (1.6, 0.6), 0.2, 0.5
+"""Slope, size of the lower sheet [m], times [s] between which the upper one's acceleration is measured"""
+
+
+def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tuple[dict[str, Any], int]:
+    """A sheet of n cells a side on a larger one of other triangles, which is held; vertices of that."""
+    angle, cells = math.radians(LEAN), (round(2.3 * n), round(0.87 * n))
+    turn = {"axis": [0.0, 1.0, 0.0], "degrees": LEAN}
+    x, y, z = 0.1, 0.5 * (BED[1] - SIDE), CLEAR * LAYER_GAP
+    place = [x * math.cos(angle) + z * math.sin(angle), y, z * math.cos(angle) - x * math.sin(angle)]
+    lower = grid(*BED, *cells, "diagonal") | {"transform": {"rotate": turn}}
+    upper = grid(SIDE, SIDE, n, n, "alternating") | {"transform": {"rotate": turn, "translate": place}}
+    count = (cells[0] + 1) * (cells[1] + 1)
+    return {
+        "mesh": [lower, upper],
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": LAYER_GAP, "friction": friction},
+        "handles": [{"nodes": list(range(count))}],
+        "time": {"end": end, "step": STEP, "integrator": integrator},
+    }, count
+
+
+@case(
+    "Sheet on a larger one of other triangles that is held on a slope of 30°: stands at 1.01 of the friction "
+    "that holds it, slides with g (sin α − μ cos α) at 0.5 and 0.9 of it; four integrators",
+    source="Coulomb's law",
+    resolutions=(8, 12),
+    claim=Exact(2e-2),
+    claims={"acceleration, beuler": Exact(5e-3)} | {f"creep, {name}": Exact(1e-6) for name in SLIDERS},
+    counts="cells a side",
+    quick=1,
+)
+def sheets(bench: Bench, n: float) -> Iterator[Measured]:
+    angle = math.radians(LEAN)
+    down = np.array([math.cos(angle), 0.0, -math.sin(angle)])
+    for integrator in SLIDERS:
+        off = 0.0, 1.0, 1.0
+        for part in SLIDING[1:]:
+            content, count = _sheet_on_sheet(round(n), part * math.tan(angle), integrator, RAN)
+            with bench.simulation(content) as trial:
+                mass = trial.mass[count:]
+                before = _at(trial, BEGIN).v[count:] @ down
+                change = trial.run().v[count:] @ down - before
+            exact, found = (
+                G * (1.0 - part) * math.sin(angle),
+                float(mass @ change) / mass.sum() / (RAN - BEGIN),
+            )
+            off = max(off, (abs(found / exact - 1.0), found, exact))
+        yield Measured(f"acceleration, {integrator}", off[1], off[2], "m/s²")
+        content, count = _sheet_on_sheet(round(n), STICKS * math.tan(angle), integrator, 2.0 * SETTLED)
+        with bench.simulation(content) as trial:
+            settled = _at(trial, SETTLED).x
+            creep = float(np.abs((trial.run().x - settled) @ down).max())
+        yield Measured(f"creep, {integrator}", creep, 0.0, "m", scale=1.0)
