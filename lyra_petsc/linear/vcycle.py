@@ -103,12 +103,12 @@ class Smoother:
 
     def _choose_sweeps(self, own: Array) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
+        from lyra_petsc.linear.edge_sweeps import MOST_COARSE, SWEEPS  # of use for nothing else
 
         inertia, resistance = self.points.comm.allreduce(own)
         found = (number for until, number in SWEEPS if inertia < until * resistance)
-        self.n_coarse_sweeps = next(found, 1)
-        self.n_sweeps = self._asked_sweeps or self.n_coarse_sweeps
+        worth = next(found, 1)
+        self.n_sweeps, self.n_coarse_sweeps = self._asked_sweeps or worth, min(worth, MOST_COARSE)
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
@@ -204,9 +204,13 @@ class Smoother:
             self.b[lagged] = right
 
     def _add_interpolated(self, coarse: Floats) -> None:
-        more = self.x if self._turns is None else np.zeros_like(self.x)
-        sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
-        if self._turns is not None:
+        if self._turns is None:
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, self.x)
+        else:
+            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+            more = self._sweeps.moved
+            more[:] = 0.0
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
             self._turns.follow(more)
             self.x += more
         if self._sweeps.correct(self.x):
