@@ -49,9 +49,6 @@ SWEEPS = ((0.03, 3), (0.3, 2))
 all levels; beyond, one. Of numbers that take equally long those with which iterations grow least with the
 mesh."""
 
-MOST_COARSE = 2
-"""Sweeps on coarser levels at most: a third saves no more iterations than it costs."""
-
 
 def room(pattern: BlockPattern) -> tuple[int, int]:
     """How much memory `SweepsWithEdges` takes, in numbers of double precision: its rows, and its vectors."""

@@ -103,12 +103,12 @@ class Smoother:
 
     def _choose_sweeps(self, own: Array) -> None:
         """Sweep more often where bending is stiff beside inertia; collective."""
-        from lyra_petsc.linear.edge_sweeps import MOST_COARSE, SWEEPS  # of use for nothing else
+        from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
 
         inertia, resistance = self.points.comm.allreduce(own)
         found = (number for until, number in SWEEPS if inertia < until * resistance)
-        worth = next(found, 1)
-        self.n_sweeps, self.n_coarse_sweeps = self._asked_sweeps or worth, min(worth, MOST_COARSE)
+        self.n_coarse_sweeps = next(found, 1)
+        self.n_sweeps = self._asked_sweeps or self.n_coarse_sweeps
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
