@@ -28,6 +28,13 @@ def _add_diagonal(indptr, diagonal, values):  # type: ignore[no-untyped-def]
 
 
 @cached()
+def _add_to_edges(indptr, first, diagonal, flat):  # type: ignore[no-untyped-def]
+    """Add the diagonal of their rows to the edges' own numbers, of which ``first`` is the first."""
+    for edge in range(len(indptr) - 1):
+        flat[first + indptr[edge]] += diagonal[edge // 3]
+
+
+@cached()
 def _add_at(source, place, values):  # type: ignore[no-untyped-def]
     for k in range(len(place)):
         at = place[k]
@@ -116,8 +123,9 @@ class BlockRows:
         pattern = self.pattern
         _add_diagonal(pattern.indptr[: pattern.n_diagonal + 1], diagonal, values)
         if pattern.edge_couplings is not None:
-            at = pattern.edge_couplings.diagonal(pattern.n_blocks)
-            values.reshape(-1)[at] += np.repeat(diagonal[pattern.n_diagonal :], 3)
+            first = pattern.edge_couplings.first_number(pattern.n_blocks)
+            indptr, own = pattern.edge_couplings.numbers.indptr, diagonal[pattern.n_diagonal :]
+            _add_to_edges(indptr, first, own, values.reshape(-1))
 
     def enlarge(self, values: Array, factor: float) -> None:
         """Multiply the diagonal blocks, and of edges their own entries, by a factor."""

@@ -44,10 +44,10 @@ EDGES_EVERY = 2
 ALIGNED = 8
 """Vectors begin at a multiple of so many numbers of double precision."""
 
-SWEEPS = ((0.03, 3), (0.3, 2))
-"""Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices on
-all levels; beyond, one. Of numbers that take equally long those with which iterations grow least with the
-mesh."""
+SWEEPS = ((0.03, (3, 2, 3)), (0.3, (2, 2, 2)))
+"""Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices of
+the mesh, of the next coarser level, and of those below, which cost little; beyond, one. Of numbers that take
+equally long those with which iterations grow least with the mesh."""
 
 
 def room(pattern: BlockPattern) -> tuple[int, int]:
@@ -64,17 +64,39 @@ def invert_numbers(indptr, numbers, inverse):  # type: ignore[no-untyped-def]
         flat[edge] = 1.0 / value if value != 0.0 else 0.0
 
 
+@cached()
+def _sum_of_traces(weight, blocks):  # type: ignore[no-untyped-def]
+    """Sum of the traces of blocks (n_blocks, 9), the first ones times weights (n,)."""
+    total = 0.0
+    for k in range(Index(len(weight))):
+        total += weight[k] * (blocks[k, 0] + blocks[k, 4] + blocks[k, 8])
+    return total
+
+
+@cached()
+def _begin(b, n, n_owned, r, of_edges):  # type: ignore[no-untyped-def]
+    """b (n_local, 3) of the first n rows into r (n_local, 4), of other owned rows into of_edges."""
+    for row in range(Index(n)):
+        r[row, 0], r[row, 1], r[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+    for row in range(Index(n), Index(n_owned)):
+        of_edges[row, 0], of_edges[row, 1], of_edges[row, 2] = b[row, 0], b[row, 1], b[row, 2]
+
+
 @cached(fastmath=True)
 def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
-    """``gauss_seidel.backward`` over the owned edges, from place ``first`` on, in x and r (n_local, 3)."""
+    """``gauss_seidel.backward`` over the owned edges, from place ``first`` on, in x and r (n_local, 3).
+
+    Each edge waits for the one before it, which is mostly the nearest that it couples to: that one is taken
+    last, here and in ``forward_edges``.
+    """
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
     n, first = Index(len(inverses)), Index(first)
     for below in range(n):
         edge = n - Index(1) - below
         at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
         s = rest[at]
-        for k in range(lo, hi):
-            s -= numbers[k, 0] * flat[Index(others[k])]
+        for k in range(hi - lo):
+            s -= numbers[hi - Index(1) - k, 0] * flat[Index(others[hi - Index(1) - k])]
         y = flushed(inverses[edge] * s)
         less = flat[at] - y
         flat[at], rest[at] = y, 0.0
@@ -82,33 +104,20 @@ def backward_edges(first, indptr, others, numbers, inverse, x, r):  # type: igno
             rest[Index(others[k])] += numbers[k, 0] * less
 
 
-@cached(inline="always")
-def _forward_edge(edge, beyond, first, indptr, others, numbers, inverses, x, r):  # type: ignore[no-untyped-def]
-    at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
-    s = r[at] - beyond
-    for k in range(lo, hi):
-        s -= numbers[k, 0] * x[Index(others[k])]
-    y = flushed(inverses[edge] * s)
-    x[at] = y
-    for k in range(lo, hi):
-        r[Index(others[k])] -= numbers[k, 0] * y
-
-
 @cached(fastmath=True)
-def forward_edges(  # type: ignore[no-untyped-def]
-    row_ptr, columns, blocks, n_vertices, indptr, others, numbers, inverse, x, r
-):
-    """``gauss_seidel.forward`` over the owned edges; of their rows there are blocks of ghosts alone."""
+def forward_edges(first, indptr, others, numbers, inverse, x, r):  # type: ignore[no-untyped-def]
+    """``gauss_seidel.forward`` over the owned edges; r has what ghosts make of them taken off."""
     flat, rest, inverses = x.reshape(-1), r.reshape(-1), inverse.reshape(-1)
-    n, first = Index(n_vertices), Index(3) * Index(n_vertices)
-    for row in range(Index(len(inverse))):
-        lo, hi, edge = Index(row_ptr[n + row]), Index(row_ptr[n + row + Index(1)]), Index(3) * row
-        s0 = s1 = s2 = blocks.dtype.type(0.0)
-        if lo < hi:
-            s0, s1, s2 = gather(blocks, columns, x, lo, hi, AHEAD)
-        _forward_edge(edge, s0, first, indptr, others, numbers, inverses, flat, rest)
-        _forward_edge(edge + Index(1), s1, first, indptr, others, numbers, inverses, flat, rest)
-        _forward_edge(edge + Index(2), s2, first, indptr, others, numbers, inverses, flat, rest)
+    first = Index(first)
+    for edge in range(Index(len(inverses))):
+        at, lo, hi = first + edge, Index(indptr[edge]) + Index(1), Index(indptr[edge + Index(1)])
+        s = numbers.dtype.type(0.0)
+        for k in range(lo, hi):
+            s += numbers[k, 0] * flat[Index(others[k])]
+        y = flushed(inverses[edge] * (rest[at] - s))
+        flat[at] = y
+        for k in range(lo, hi):
+            rest[Index(others[k])] -= numbers[k, 0] * y
 
 
 @cached(fastmath=True)
@@ -219,8 +228,8 @@ class SweepsWithEdges:
 
     Attributes
     ----------
-    b, x : (n_local, 3)
-        Right-hand side and solution.
+    b, x, moved : (n_local, 3)
+        Right-hand side and solution; room for what is added to it.
     r : (n_local, 4)
         Residual of vertices, and numbers without a meaning.
     of_edges : (n_local, 3)
@@ -253,7 +262,7 @@ class SweepsWithEdges:
         self._changing = vectors[: 13 * n_local]  # what a cycle begins with is in the rest
         self._clean = False
         self.r = vectors[: 4 * n_local].reshape(-1, 4)
-        self.x, self.of_edges, self._moved, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
+        self.x, self.of_edges, self.moved, self.b = vectors[4 * n_local :].reshape(4, -1, 3)
         self.flops = 18.0 * pattern.n_couplings
 
     def _of_all_alike(self, pattern: BlockPattern, n: int) -> NDArray[np.int8]:
@@ -280,8 +289,7 @@ class SweepsWithEdges:
 
         Moving all vertices alike meets nothing else than inertia. ``values`` (n_stored, 9) as ``invert`` got.
         """
-        blocks = values[: len(self._weight)]
-        together = sum(np.dot(self._weight, blocks[:, i]) for i in (0, 4, 8))
+        together = _sum_of_traces(self._weight, values)
         softness = self._inverse[:, [0, 4, 8]].sum(axis=1)
         return np.array([together / 3.0, np.sum(1.0 / softness[softness > 0.0])])
 
@@ -312,9 +320,8 @@ class SweepsWithEdges:
         if not self._clean:
             self._changing[:] = 0.0
             self._clean = True
-        self.r[:n, :3] = b[:n]
+        _begin(b, n, n_owned, self.r, self.of_edges)
         self.r[n_owned:] = 0.0  # to which turns of edges are added
-        self.of_edges[n:n_owned] = b[n:n_owned]
 
     def add(self, rows: Ints, more: Floats) -> None:
         """Add to the residual of rows (n,)."""
@@ -332,13 +339,13 @@ class SweepsWithEdges:
     def backward_again(self, x: Floats, number: int) -> None:
         """Sweep over the vertices once more, and if ``number`` is even over the edges before that."""
         if number % EDGES_EVERY == 0:
-            self._moved[:] = 0.0
-            self.backward(self._moved)
-            x += self._moved
+            self.moved[:] = 0.0
+            self.backward(self.moved)
+            x += self.moved
             return
         blocks, groups, _ = self._values
         rows = *self._rows, *self._groups, blocks, groups
-        backward_again(*rows, self._inverse, self._moved, x, self.r, self.of_edges)
+        backward_again(*rows, self._inverse, self.moved, x, self.r, self.of_edges)
 
     def subtract_ghosts(self, x: Floats) -> None:
         """As the function, of both residuals."""
@@ -358,5 +365,9 @@ class SweepsWithEdges:
             forward_ahead(*rows, self._inverse, b, x, self.r)
             return
         forward_vertices(*rows, self._inverse, b, x, self.r, self.of_edges)
-        beyond = self._rows[0], self._rows[2], blocks, len(self._inverse)
-        forward_edges(*beyond, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
+        beside = self._edges_beside
+        before = self.of_edges[beside]
+        subtract_ghosts(beside, *self._rows, blocks, x, self.of_edges)
+        beyond = before - self.of_edges[beside]
+        forward_edges(self._first, *self._numbers, numbers, self._inverse_of_edges, x, self.of_edges)
+        self.of_edges[beside] += beyond  # which stays in the residual, as of vertices

@@ -140,7 +140,7 @@ class Hierarchy:
         self._below = below
         level = Level(points, pattern, below.turns if below else None)
         self.rows: Array | None = None
-        self._spare = spare
+        self._spare, self._overwritten = spare, False
         if below is not None:
             from lyra_petsc.linear.edge_sweeps import room  # of use for nothing else
 
@@ -160,6 +160,20 @@ class Hierarchy:
             level.galerkin = Galerkin(level.points, fine, *rows)
             level = Level(level.galerkin.points, level.galerkin.pattern)
             self.levels.append(level)
+
+    def new_rows(self) -> None:
+        """``rows`` are those of a new matrix."""
+        self._overwritten = False
+
+    def entries(self) -> Array:
+        """What ``rows`` were set to, or what the sweeps keep of that, in single precision."""
+        finest = self.levels[0]
+        assert self.rows is not None
+        assert finest.memory is not None
+        if not self._overwritten:
+            return self.rows
+        kept = finest.memory.view(np.float32)[: self.rows.size].reshape(self.rows.shape)
+        return kept.astype(np.float64)
 
     def block_rows(self, values: Array, held: Mask) -> Iterator[tuple[Array, Array]]:
         """Of each level, finest first, the block rows that those of the finest make; collective.
@@ -188,6 +202,7 @@ class Hierarchy:
         for level in self.levels:
             yield values, free
             if self._below is not None and self._spare and level is finest:
+                self._overwritten = True
                 values = self._below.values(held, self._room_below)
             if below is not None:
                 (values, free), below = below, None

@@ -42,11 +42,17 @@ class _Product:
     """
 
     def __init__(
-        self, points: Points, pattern: BlockPattern, rows: Array, summary: Callable[[], list[str]] | None
+        self,
+        points: Points,
+        pattern: BlockPattern,
+        rows: Array,
+        summary: Callable[[], list[str]] | None,
+        entries: Callable[[], Array] | None,
     ) -> None:
-        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: the summary's
-        # object has PETSc objects of its own, and must not be freed then
+        # PETSc may free the matrix, and with it this object, when Python and MPI are gone: the methods'
+        # objects have PETSc objects of their own, and must not be freed then
         self._summary = None if summary is None else weakref.WeakMethod(summary)
+        self._entries = None if entries is None else weakref.WeakMethod(entries)
         self._points = points if points.comm.size > 1 else None
         self._all_points, self._pattern, self._rows = points, pattern, rows
         self._multiply = product_of(pattern, rows)
@@ -76,7 +82,8 @@ class _Product:
             viewer.printfASCII("".join(f"  {line}\n" for line in lines))
             return
         whole = AssembledMatrix(self._all_points, self._pattern, "aij")
-        whole.set(self._rows)
+        entries = None if self._entries is None else self._entries()
+        whole.set(self._rows if entries is None else entries())
         whole.mat.view(viewer)
         whole.destroy()
 
@@ -93,6 +100,8 @@ class BlockMatrix:
         Further lines of ``-ksp_view``; collective. Its object is not kept alive.
     rows : (n_stored, 3, 3) float64, optional
         Where its block rows shall be.
+    entries : method, optional
+        Returns them where something else may have taken their place. Its object is not kept alive.
 
     Attributes
     ----------
@@ -112,6 +121,7 @@ class BlockMatrix:
         pattern: BlockPattern,
         summary: Callable[[], list[str]] | None = None,
         rows: Array | None = None,
+        entries: Callable[[], Array] | None = None,
     ) -> None:
         n = 3 * points.n_owned
         self.mat = PETSc.Mat().create(points.comm)
@@ -121,7 +131,7 @@ class BlockMatrix:
         self._blocks = BlockRows(pattern)
         self.rows = self._blocks.zeros() if rows is None else rows
         self.followers: list[Callable[[Array], None]] = []
-        self.mat.setPythonContext(_Product(points, pattern, self.rows, summary))
+        self.mat.setPythonContext(_Product(points, pattern, self.rows, summary, entries))
         _set_vec_type(self.mat)
         self.mat.setUp()
         # what PETSc frees when Python is gone must not call it

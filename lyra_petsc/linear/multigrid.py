@@ -73,6 +73,7 @@ class Multigrid:
 
     def _follow(self, values: Array) -> None:
         self._values = values
+        self.hierarchy.new_rows()
 
     def _renew(self) -> Iterator[tuple[Array, Array]]:
         """Block rows of all levels for the matrix as it is now; collective."""

@@ -65,8 +65,10 @@ class Smoother:
 
     Attributes
     ----------
-    n_sweeps, n_coarse_sweeps : int
-        Before and after the coarser level, on this level and on coarser ones.
+    n_sweeps : int
+        Before and after the coarser level.
+    coarse_sweeps : tuple of int
+        What that should be on the next coarser level and on those below.
     b, x : (n_local, 3)
         Right-hand side and solution.
     """
@@ -78,7 +80,7 @@ class Smoother:
         self._edge = np.flatnonzero(pattern.ends < pattern.indptr[1:])
         self._turns, self._sweeps = level.turns, _sweeps_of(level)
         self.x, self.b = self._sweeps.x, self._sweeps.b
-        self._asked_sweeps, self.n_sweeps, self.n_coarse_sweeps = vertex_sweeps, 1, 1
+        self._asked_sweeps, self.n_sweeps, self.coarse_sweeps = vertex_sweeps, 1, (1, 1)
         assert level.galerkin is not None
         self._coarse = level.galerkin.points
         start, parents, weights = level.galerkin.interpolation
@@ -106,9 +108,9 @@ class Smoother:
         from lyra_petsc.linear.edge_sweeps import SWEEPS  # of use for nothing else
 
         inertia, resistance = self.points.comm.allreduce(own)
-        found = (number for until, number in SWEEPS if inertia < until * resistance)
-        self.n_coarse_sweeps = next(found, 1)
-        self.n_sweeps = self._asked_sweeps or self.n_coarse_sweeps
+        found = (numbers for until, numbers in SWEEPS if inertia < until * resistance)
+        worth, *coarse = next(found, (1, 1, 1))
+        self.n_sweeps, self.coarse_sweeps = self._asked_sweeps or worth, (coarse[0], coarse[1])
 
     def _increase_diagonal(self, values: Array) -> None:
         """Let D + Dᵀ − (couplings to other ranks) be positive definite, D with the increase; collective.
@@ -204,9 +206,13 @@ class Smoother:
             self.b[lagged] = right
 
     def _add_interpolated(self, coarse: Floats) -> None:
-        more = self.x if self._turns is None else np.zeros_like(self.x)
-        sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
-        if self._turns is not None:
+        if self._turns is None:
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, self.x)
+        else:
+            assert not isinstance(self._sweeps, sweeps.BlockSweeps)
+            more = self._sweeps.moved
+            more[:] = 0.0
+            sweeps.add_interpolated(*self._all_parents, self._free, coarse, more)
             self._turns.follow(more)
             self.x += more
         if self._sweeps.correct(self.x):
@@ -281,10 +287,10 @@ class VCycle:
             prefix = pc.getOptionsPrefix() or ""
             raise InputError("works as the main preconditioner only", key=f"-{prefix}pc_python_type")
         finest = self._levels[0]
-        for level, rows in zip(self._levels, self._renew(), strict=True):
+        for number, (level, rows) in enumerate(zip(self._levels, self._renew(), strict=True)):
             level.set(*rows)
-            if isinstance(level, Smoother) and isinstance(finest, Smoother) and level is not finest:
-                level.n_sweeps = finest.n_coarse_sweeps
+            if number > 0 and isinstance(level, Smoother) and isinstance(finest, Smoother):
+                level.n_sweeps = finest.coarse_sweeps[min(number, 2) - 1]
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """x = one cycle on b; collective."""

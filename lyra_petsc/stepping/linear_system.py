@@ -94,7 +94,8 @@ class LinearSystem:
             hierarchy = self._levels(spare=spare)
             if spare:
                 summary = self._equations.block_summary
-                self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows)
+                entries = None if hierarchy.rows is None else hierarchy.entries
+                self.preconditioner = BlockMatrix(layout, pattern, summary, hierarchy.rows, entries)
             assert isinstance(self.preconditioner, BlockMatrix)
             self._multigrid = Multigrid(
                 self.preconditioner, hierarchy, held=lambda: self._equations.prescribed.mask

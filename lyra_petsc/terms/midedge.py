@@ -40,6 +40,7 @@ from lyra_petsc.terms.midedge_shape import (
     carried,
     directions,
     directors,
+    largest_angle,
     some_perpendicular,
     tangents,
     tangents_at,
@@ -299,9 +300,7 @@ class MidEdge(Elastic):
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
     def largest_turn(self, way: Array) -> float:
-        places, length = self.of_edges.places, self.of_edges.length
-        own = slice(np.searchsorted(places, way.size))
-        return float(np.abs(way.ravel()[places[own]] / length[own]).max(initial=0.0))
+        return float(largest_angle(way.ravel(), self.of_edges.places, self.of_edges.length))
 
     def force_scale(self, size: float) -> Array:
         data = self.elements.data

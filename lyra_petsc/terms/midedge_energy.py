@@ -34,37 +34,47 @@ import numpy as np
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_corners, fetch
-from lyra_petsc.terms.hinge import cross, dot, point, scaled
+from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
 from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
 
 AHEAD = 4
 """Triangles by which blocks are fetched before they are added to: each takes longer than other elements."""
 
+BATCH = 16
+"""Triangles that are computed together, several at a time where the processor can, but for those that fade or
+have an angle beyond 45°. Number i of each stands in a row of its own, so that a compiler sees what it may do
+at once: in arrays of elements, looked up by numbers of points, it cannot know that they do not overlap."""
+
+
+@kernel(inline="always")
+def _six(stiffness, e):  # type: ignore[no-untyped-def]
+    """K of triangle e: 00, 01, 02, 11, 12, 22."""
+    k = stiffness
+    return k[e, 0], k[e, 1], k[e, 2], k[e, 3], k[e, 4], k[e, 5]
+
 
 @kernel(inline="always")
 def _at_rest(rest, e):  # type: ignore[no-untyped-def]
-    """T̄ of triangle e."""
+    """T̄ and S̄ of triangle e."""
     if rest.shape[0] == 0:
-        return 0.0, 0.0, 0.0
-    return rest[e, 0], rest[e, 1], rest[e, 2]
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    u0, u1, u2 = rest[e, 0], rest[e, 1], rest[e, 2]
+    return u0, u1, u2, fading_tangent(u0), fading_tangent(u1), fading_tangent(u2)
 
 
 @kernel(inline="always")
-def _own(stiffness, rest, e, t0, t1, t2):  # type: ignore[no-untyped-def]
-    """K_ii (T_i − T̄_i) of triangle e, and the differences."""
-    u0, u1, u2 = _at_rest(rest, e)
-    f0, f1, f2 = t0 - u0, t1 - u1, t2 - u2
-    return stiffness[e, 0] * f0, stiffness[e, 3] * f1, stiffness[e, 5] * f2, f0, f1, f2
+def _own(k, rest, t0, t1, t2):  # type: ignore[no-untyped-def]
+    """K_ii (T_i − T̄_i) of a triangle, and the differences."""
+    f0, f1, f2 = t0 - rest[0], t1 - rest[1], t2 - rest[2]
+    return k[0] * f0, k[3] * f1, k[5] * f2, f0, f1, f2
 
 
 @kernel(inline="always")
-def _others(stiffness, rest, e, s0, s1, s2):  # type: ignore[no-untyped-def]
-    """Σ_j≠i K_ij (S_j − S̄_j) of triangle e, and the differences."""
-    u0, u1, u2 = _at_rest(rest, e)
-    h0, h1, h2 = s0 - fading_tangent(u0), s1 - fading_tangent(u1), s2 - fading_tangent(u2)
-    k01, k02, k12 = stiffness[e, 1], stiffness[e, 2], stiffness[e, 4]
-    return k01 * h1 + k02 * h2, k01 * h0 + k12 * h2, k02 * h0 + k12 * h1, h0, h1, h2
+def _others(k, rest, s0, s1, s2):  # type: ignore[no-untyped-def]
+    """Σ_j≠i K_ij (S_j − S̄_j) of a triangle, and the differences."""
+    h0, h1, h2 = s0 - rest[3], s1 - rest[4], s2 - rest[5]
+    return k[1] * h1 + k[2] * h2, k[1] * h0 + k[4] * h2, k[2] * h0 + k[4] * h1, h0, h1, h2
 
 
 @kernel(inline="always")
@@ -80,10 +90,82 @@ def _twice(own, others):  # type: ignore[no-untyped-def]
     )
 
 
+@kernel(inline="always")
+def _put(batch, at, i, numbers):  # type: ignore[no-untyped-def]
+    """Rows from ``at`` on of triangle i of a batch become three numbers."""
+    batch[Index(BATCH * at) + i] = numbers[0]
+    batch[Index(BATCH * at + BATCH) + i] = numbers[1]
+    batch[Index(BATCH * at + 2 * BATCH) + i] = numbers[2]
+
+
+@kernel(inline="always")
+def _got(batch, at, i):  # type: ignore[no-untyped-def]
+    return (
+        batch[Index(BATCH * at) + i],
+        batch[Index(BATCH * at + BATCH) + i],
+        batch[Index(BATCH * at + 2 * BATCH) + i],
+    )
+
+
+@kernel()
+def _load(x, stencil, edges, shape, first, batch):  # type: ignore[no-untyped-def]
+    """Into rows 0 to 26 of a batch e_i, directors, γ_i of triangles from ``first`` on; the last fills it."""
+    last = stencil.shape[0] - 1
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
+        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+        _put(batch, 0, i, minus(x2, x1))
+        _put(batch, 3, i, minus(x0, x2))
+        _put(batch, 6, i, minus(x1, x0))
+        _put(batch, 9, i, row(shape, edges[e, 0], 0))
+        _put(batch, 12, i, row(shape, edges[e, 1], 0))
+        _put(batch, 15, i, row(shape, edges[e, 2], 0))
+        _put(batch, 18, i, row(shape, edges[e, 0], 3))
+        _put(batch, 21, i, row(shape, edges[e, 1], 3))
+        _put(batch, 24, i, row(shape, edges[e, 2], 3))
+
+
+@kernel(inline="always")
+def _plain(d, e, normal):  # type: ignore[no-untyped-def]
+    """``tangent_of`` up to 45°, and whether it is."""
+    height, side = dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
+    t = side / height
+    slope = 1.0 + t * t
+    bend = 2.0 * t * slope
+    return (t, slope, bend, t, slope, bend), abs(side) < height
+
+
+@kernel()
+def _compute_tangents(batch):  # type: ignore[no-untyped-def]
+    """Into rows 27 to 29 of a batch T up to 45°, and into the next |N|², 0 where an angle is beyond."""
+    for number in range(BATCH):
+        i = Index(number)
+        e0, e1, e2 = _got(batch, 0, i), _got(batch, 3, i), _got(batch, 6, i)
+        normal = cross(e1, e2)
+        one, fits0 = _plain(_got(batch, 9, i), e0, normal)
+        two, fits1 = _plain(_got(batch, 12, i), e1, normal)
+        three, fits2 = _plain(_got(batch, 15, i), e2, normal)
+        _put(batch, 27, i, (one[0], two[0], three[0]))
+        batch[Index(BATCH * 30) + i] = dot(normal, normal) if fits0 & fits1 & fits2 else 0.0
+
+
 @kernel()
 def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) triangles; infinite where an edge is too far from its frame."""
+    batch = np.empty(31 * BATCH)
     for e in range(out.shape[0]):
+        i = Index(e % BATCH)
+        if i == 0:
+            _load(x, stencil, edges, shape, e, batch)
+            _compute_tangents(batch)
+        square = batch[Index(BATCH * 30) + i]
+        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        if square > 0.0 and square >= limit[e]:
+            t0, t1, t2 = _got(batch, 27, i)
+            out[e] = 0.5 * _twice(_own(k, bar, t0, t1, t2), _others(k, bar, t0, t1, t2))
+            if friction.shape[0] > 0:
+                out[e] += friction[e, 1]
+            continue
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, square = edges_of(x0, x1, x2)
         if square <= GONE * limit[e]:
@@ -92,7 +174,7 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  
         t0, _, _, s0, _, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
         t1, _, _, s1, _, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
         t2, _, _, s2, _, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        out[e] = 0.5 * _twice(_own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2))
+        out[e] = 0.5 * _twice(_own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2))
         if friction.shape[0] > 0:
             out[e] += friction[e, 1]
         if square < limit[e]:
@@ -106,16 +188,26 @@ def add_gradient(  # type: ignore[no-untyped-def]
     x, stencil, edges, places, sign, shape, stiffness, rest, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
-    flat = out.reshape(-1)
+    flat, batch = out.reshape(-1), np.empty(31 * BATCH)
     for e in range(stencil.shape[0]):
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
-        if square <= GONE * limit[e]:
-            continue
-        t0, a0, _, s0, b0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        t1, a1, _, s1, b1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        t2, a2, _, s2, b2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
+        at = Index(e % BATCH)
+        if at == 0:
+            _load(x, stencil, edges, shape, e, batch)
+            _compute_tangents(batch)
+        e0, e1, e2 = _got(batch, 0, at), _got(batch, 3, at), _got(batch, 6, at)
+        normal, square = cross(e1, e2), batch[Index(BATCH * 30) + at]
+        if square > GONE * limit[e]:
+            t0, t1, t2 = s0, s1, s2 = _got(batch, 27, at)
+            a0, a1, a2 = b0, b1, b2 = 1.0 + t0 * t0, 1.0 + t1 * t1, 1.0 + t2 * t2
+        else:
+            square = dot(normal, normal)
+            if square <= GONE * limit[e]:
+                continue
+            t0, a0, _, s0, b0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
+            t1, a1, _, s1, b1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
+            t2, a2, _, s2, b2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        own, others = _own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2)
         p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
         if square < limit[e]:
             weight, slope, _ = fade(square, limit[e])
@@ -303,6 +395,139 @@ def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
         fetch(values, offsets[later, pair] // 9)
 
 
+@kernel(inline="always")
+def _hessian(e0, e1, e2, normal, square, tangents, spins, k, rest, sliding, q, exact):  # type: ignore[no-untyped-def]
+    """Of one triangle: blocks of the corners 11, 12, 22, couplings of the corners 1 and 2 with the edges,
+    those of edges with edges; and what `_faded` is made of.
+
+    Of its edges and normal, of tangents as by ``tangent_of``, γ, K, T̄ with S̄, and friction's c; q is
+    ∂φ/∂(unknown) times s.
+    """
+    inverse = 1.0 / math.sqrt(square)  # 1 / 2A
+    n = scaled(inverse, normal)
+    (t0, a0, c0, s0, b0, d0), (t1, a1, c1, s1, b1, d1), (t2, a2, c2, s2, b2, d2) = tangents
+    own, others = _own(k, rest, t0, t1, t2), _others(k, rest, s0, s1, s2)
+    p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
+    # ∇α_i
+    s00, s11, s22 = dot(e0, e0), dot(e1, e1), dot(e2, e2)
+    s01, s02, s12 = dot(e0, e1), dot(e0, e2), dot(e1, e2)
+    r0, r1, r2 = -inverse / math.sqrt(s00), -inverse / math.sqrt(s11), -inverse / math.sqrt(s22)
+    spin0, spin1, spin2 = spins
+    g1 = (
+        _along(r0 * s01, n, scaled(-1.0, spin0)),
+        scaled(r1 * s11, n),
+        _along(r2 * s12, n, spin2),
+    )
+    g2 = (
+        _along(r0 * s02, n, spin0),
+        _along(r1 * s12, n, scaled(-1.0, spin1)),
+        scaled(r2 * s22, n),
+    )
+    # ∇f K ∇fᵀ, and what T and S add as they bend
+    c = exact * sliding
+    k00 = a0 * a0 * k[0] + exact * (own[0] * c0 + others[0] * d0) + c * p0 * p0
+    k11 = a1 * a1 * k[3] + exact * (own[1] * c1 + others[1] * d1) + c * p1 * p1
+    k22 = a2 * a2 * k[5] + exact * (own[2] * c2 + others[2] * d2) + c * p2 * p2
+    k01, k02, k12 = b0 * b1 * k[1] + c * p0 * p1, b0 * b2 * k[2] + c * p0 * p2, b1 * b2 * k[4] + c * p1 * p2
+    w1 = (
+        _weighted(k00, g1[0], k01, g1[1], k02, g1[2]),
+        _weighted(k01, g1[0], k11, g1[1], k12, g1[2]),
+        _weighted(k02, g1[0], k12, g1[1], k22, g1[2]),
+    )
+    w2 = (
+        _weighted(k00, g2[0], k01, g2[1], k02, g2[2]),
+        _weighted(k01, g2[0], k11, g2[1], k12, g2[2]),
+        _weighted(k02, g2[0], k12, g2[1], k22, g2[2]),
+    )
+    # Σ_i p_i ∂²α_i
+    m0, m1, m2 = exact * p0, exact * p1, exact * p2
+    f0, f1, f2 = m0 * r0, m1 * r1, m2 * r2
+    half = 0.5 * math.sqrt(square)
+    bend0 = _bend(spin0, e0, s00, n, half * f0 / s00, m0)
+    bend1 = _bend(spin1, e1, s11, n, half * f1 / s11, m1)
+    bend2 = _bend(spin2, e2, s22, n, half * f2 / s22, m2)
+    u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
+    v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
+    nothing = (0.0, 0.0, 0.0)
+    b11 = _sum(_products(g1, w1), _sum(_sum(bend2, bend0), _symmetric(scaled(-v1, n), u1, nothing, nothing)))
+    b22 = _sum(_products(g2, w2), _sum(_sum(bend0, bend1), _symmetric(scaled(-v2, n), u2, nothing, nothing)))
+    turned = _products((scaled(-v2, n), scaled(-v1, u2), nothing), (u1, n, nothing))
+    b12 = _sum(_products(g1, w2), _sum(turned, _times(-1.0, bend0)))
+    q0, q1, q2 = q
+    one = scaled(q0, w1[0]), scaled(q1, w1[1]), scaled(q2, w1[2])
+    two = scaled(q0, w2[0]), scaled(q1, w2[1]), scaled(q2, w2[2])
+    numbers = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02, q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
+    return ((b11, b12, b22), one, two, numbers), (0.5 * _twice(own, others), (p0, p1, p2), g1, g2)
+
+
+@kernel(inline="always")
+def _put_nine(batch, at, i, numbers):  # type: ignore[no-untyped-def]
+    _put(batch, at, i, (numbers[0], numbers[1], numbers[2]))
+    _put(batch, at + 3, i, (numbers[3], numbers[4], numbers[5]))
+    _put(batch, at + 6, i, (numbers[6], numbers[7], numbers[8]))
+
+
+@kernel(inline="always")
+def _got_nine(batch, at, i):  # type: ignore[no-untyped-def]
+    a, b, c = _got(batch, at, i), _got(batch, at + 3, i), _got(batch, at + 6, i)
+    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+
+
+@kernel(inline="always")
+def _friction(friction, e):  # type: ignore[no-untyped-def]
+    """c of triangle e."""
+    return friction[e, 0] if friction.shape[0] > 0 else 0.0
+
+
+@kernel()
+def _load_constants(edges, sign, stiffness, rest, friction, length, first, batch):  # type: ignore[no-untyped-def]
+    """Into rows 27 to 42 of a batch K, T̄ and S̄, ∂φ/∂(unknown) times s, and friction's c."""
+    last = edges.shape[0] - 1
+    for number in range(BATCH):
+        e, i = min(first + number, last), Index(number)
+        k, bar = _six(stiffness, e), _at_rest(rest, e)
+        _put(batch, 27, i, (k[0], k[1], k[2]))
+        _put(batch, 30, i, (k[3], k[4], k[5]))
+        _put(batch, 33, i, (bar[0], bar[1], bar[2]))
+        _put(batch, 36, i, (bar[3], bar[4], bar[5]))
+        q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
+        _put(batch, 39, i, (q0, q1, sign[e, 2] / length[edges[e, 2]]))
+        batch[Index(BATCH * 42) + i] = _friction(friction, e)
+
+
+@kernel()
+def _compute(exact, batch):  # type: ignore[no-untyped-def]
+    """The Hessians of a batch, several at a time, where no angle is beyond 45°; |n|², or 0 elsewhere."""
+    for number in range(BATCH):
+        i = Index(number)
+        e0, e1, e2 = _got(batch, 0, i), _got(batch, 3, i), _got(batch, 6, i)
+        normal = cross(e1, e2)
+        square = dot(normal, normal)
+        one, fits0 = _plain(_got(batch, 9, i), e0, normal)
+        two, fits1 = _plain(_got(batch, 12, i), e1, normal)
+        three, fits2 = _plain(_got(batch, 15, i), e2, normal)
+        spins = _got(batch, 18, i), _got(batch, 21, i), _got(batch, 24, i)
+        (k0, k1, k2), (k3, k4, k5) = _got(batch, 27, i), _got(batch, 30, i)
+        (u0, u1, u2), (u3, u4, u5) = _got(batch, 33, i), _got(batch, 36, i)
+        k, rest, q = (k0, k1, k2, k3, k4, k5), (u0, u1, u2, u3, u4, u5), _got(batch, 39, i)
+        c = batch[Index(BATCH * 42) + i]
+        (blocks, first, second, numbers), _ = _hessian(
+            e0, e1, e2, normal, square, (one, two, three), spins, k, rest, c, q, exact
+        )
+        _put_nine(batch, 43, i, blocks[0])
+        _put_nine(batch, 52, i, blocks[1])
+        _put_nine(batch, 61, i, blocks[2])
+        _put(batch, 70, i, first[0])
+        _put(batch, 73, i, first[1])
+        _put(batch, 76, i, first[2])
+        _put(batch, 79, i, second[0])
+        _put(batch, 82, i, second[1])
+        _put(batch, 85, i, second[2])
+        _put(batch, 88, i, (numbers[0], numbers[1], numbers[2]))
+        _put(batch, 91, i, (numbers[3], numbers[4], numbers[5]))
+        batch[Index(BATCH * 94) + i] = square if fits0 & fits1 & fits2 else 0.0
+
+
 @kernel()
 def add_hessian(  # type: ignore[no-untyped-def]
     x,
@@ -326,89 +551,48 @@ def add_hessian(  # type: ignore[no-untyped-def]
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
-    flat, exact = values.reshape(-1), 1.0 - blend
+    flat, exact, batch = values.reshape(-1), 1.0 - blend, np.empty(95 * BATCH)
     for e in range(stencil.shape[0]):
         _fetch_ahead(e, corners, offsets, values)
-        x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        e0, e1, e2, normal, square = edges_of(x0, x1, x2)
-        if square <= GONE * limit[e]:
-            continue
-        inverse = 1.0 / math.sqrt(square)  # 1 / 2A
-        n = scaled(inverse, normal)
-        t0, a0, c0, s0, b0, d0 = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        t1, a1, c1, s1, b1, d1 = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        t2, a2, c2, s2, b2, d2 = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
-        own, others = _own(stiffness, rest, e, t0, t1, t2), _others(stiffness, rest, e, s0, s1, s2)
-        p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
-        # ∇α_i
-        s00, s11, s22 = dot(e0, e0), dot(e1, e1), dot(e2, e2)
-        s01, s02, s12 = dot(e0, e1), dot(e0, e2), dot(e1, e2)
-        r0, r1, r2 = -inverse / math.sqrt(s00), -inverse / math.sqrt(s11), -inverse / math.sqrt(s22)
-        spin0, spin1 = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3)
-        spin2 = row(shape, edges[e, 2], 3)
-        g1 = (
-            _along(r0 * s01, n, scaled(-1.0, spin0)),
-            scaled(r1 * s11, n),
-            _along(r2 * s12, n, spin2),
-        )
-        g2 = (
-            _along(r0 * s02, n, spin0),
-            _along(r1 * s12, n, scaled(-1.0, spin1)),
-            scaled(r2 * s22, n),
-        )
-        q0, q1 = sign[e, 0] / length[edges[e, 0]], sign[e, 1] / length[edges[e, 1]]
-        q2 = sign[e, 2] / length[edges[e, 2]]
-        # ∇f K ∇fᵀ, and what T and S add as they bend
-        k00 = a0 * a0 * stiffness[e, 0] + exact * (own[0] * c0 + others[0] * d0)
-        k11 = a1 * a1 * stiffness[e, 3] + exact * (own[1] * c1 + others[1] * d1)
-        k22 = a2 * a2 * stiffness[e, 5] + exact * (own[2] * c2 + others[2] * d2)
-        k01, k02, k12 = b0 * b1 * stiffness[e, 1], b0 * b2 * stiffness[e, 2], b1 * b2 * stiffness[e, 4]
-        if friction.shape[0] > 0:
-            c = exact * friction[e, 0]
-            k00, k11, k22 = k00 + c * p0 * p0, k11 + c * p1 * p1, k22 + c * p2 * p2
-            k01, k02, k12 = k01 + c * p0 * p1, k02 + c * p0 * p2, k12 + c * p1 * p2
-        w1 = (
-            _weighted(k00, g1[0], k01, g1[1], k02, g1[2]),
-            _weighted(k01, g1[0], k11, g1[1], k12, g1[2]),
-            _weighted(k02, g1[0], k12, g1[1], k22, g1[2]),
-        )
-        w2 = (
-            _weighted(k00, g2[0], k01, g2[1], k02, g2[2]),
-            _weighted(k01, g2[0], k11, g2[1], k12, g2[2]),
-            _weighted(k02, g2[0], k12, g2[1], k22, g2[2]),
-        )
-        b11, b12, b22 = _products(g1, w1), _products(g1, w2), _products(g2, w2)
-        if exact > 0.0:
-            # Σ_i p_i ∂²α_i
-            m0, m1, m2 = exact * p0, exact * p1, exact * p2
-            f0, f1, f2 = m0 * r0, m1 * r1, m2 * r2
-            half = 0.5 * math.sqrt(square)
-            bend0 = _bend(spin0, e0, s00, n, half * f0 / s00, m0)
-            bend1 = _bend(spin1, e1, s11, n, half * f1 / s11, m1)
-            bend2 = _bend(spin2, e2, s22, n, half * f2 / s22, m2)
-            u1, u2 = scaled(inverse, cross(n, e1)), scaled(inverse, cross(n, e2))
-            v1, v2 = f0 * s01 + f1 * s11 + f2 * s12, f0 * s02 + f1 * s12 + f2 * s22
-            nothing = (0.0, 0.0, 0.0)
-            b11 = _sum(b11, _sum(_sum(bend2, bend0), _symmetric(scaled(-v1, n), u1, nothing, nothing)))
-            b22 = _sum(b22, _sum(_sum(bend0, bend1), _symmetric(scaled(-v2, n), u2, nothing, nothing)))
-            turned = _products((scaled(-v2, n), scaled(-v1, u2), nothing), (u1, n, nothing))
-            b12 = _sum(b12, _sum(turned, _times(-1.0, bend0)))
-        one = scaled(q0, w1[0]), scaled(q1, w1[1]), scaled(q2, w1[2])
-        two = scaled(q0, w2[0]), scaled(q1, w2[1]), scaled(q2, w2[2])
-        numbers = q0 * q0 * k00, q0 * q1 * k01, q0 * q2 * k02, q1 * q1 * k11, q1 * q2 * k12, q2 * q2 * k22
-        hessian = (b11, b12, b22), one, two, numbers
-        if square < limit[e]:
-            energy, pulls = 0.5 * (_twice(own, others) + _more(friction, e)), (p0, p1, p2)
-            hessian = _faded(
-                x0, x1, x2, normal, square, limit[e], energy, exact, pulls, g1, g2, (q0, q1, q2), hessian
+        i = Index(e % BATCH)
+        if i == 0:
+            _load(x, stencil, edges, shape, e, batch)
+            _load_constants(edges, sign, stiffness, rest, friction, length, e, batch)
+            _compute(exact, batch)
+        square = batch[Index(BATCH * 94) + i]
+        if square > 0.0 and square >= limit[e]:
+            b11, b12, b22 = _got_nine(batch, 43, i), _got_nine(batch, 52, i), _got_nine(batch, 61, i)
+            one = _got(batch, 70, i), _got(batch, 73, i), _got(batch, 76, i)
+            two = _got(batch, 79, i), _got(batch, 82, i), _got(batch, 85, i)
+            h00, h01, h02 = _got(batch, 88, i)
+            h11, h12, h22 = _got(batch, 91, i)
+        else:
+            x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
+            e0, e1, e2, normal, square = edges_of(x0, x1, x2)
+            if square <= GONE * limit[e]:
+                continue
+            tangents = (
+                tangent_of(row(shape, edges[e, 0], 0), e0, normal),
+                tangent_of(row(shape, edges[e, 1], 0), e1, normal),
+                tangent_of(row(shape, edges[e, 2], 0), e2, normal),
             )
-        (b11, b12, b22), one, two, numbers = hessian
+            spins = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
+            k, bar, q = _six(stiffness, e), _at_rest(rest, e), _got(batch, 39, i)
+            c = _friction(friction, e)
+            hessian, (energy, pulls, g1, g2) = _hessian(
+                e0, e1, e2, normal, square, tangents, spins, k, bar, c, q, exact
+            )
+            if square < limit[e]:
+                energy += 0.5 * _more(friction, e)
+                hessian = _faded(
+                    x0, x1, x2, normal, square, limit[e], energy, exact, pulls, g1, g2, q, hessian
+                )
+            (b11, b12, b22), one, two, (h00, h01, h02, h11, h12, h22) = hessian
         factor = weight[e]
         add_corners(values, corners, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
         _add_columns(flat, offsets, e, 0, one[0], two[0], factor)
         _add_columns(flat, offsets, e, 1, one[1], two[1], factor)
         _add_columns(flat, offsets, e, 2, one[2], two[2], factor)
-        h00, h01, h02, h11, h12, h22 = numbers
         _add_number(flat, offsets[e, 9], factor * h00)
         _add_number(flat, offsets[e, 10], factor * h01)
         _add_number(flat, offsets[e, 11], factor * h02)

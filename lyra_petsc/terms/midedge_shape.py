@@ -89,6 +89,18 @@ def against(x, ends, tangent, out):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def largest_angle(unknowns, places, length):  # type: ignore[no-untyped-def]
+    """Largest angle [rad] that unknowns (m,) of edges are, whose places (n,) ascend; of places up to m."""
+    most = 0.0
+    for k in range(len(places)):
+        if places[k] >= len(unknowns):
+            break
+        angle = abs(unknowns[places[k]]) / length[k]
+        most = angle if angle > most or angle != angle else most
+    return most
+
+
+@kernel()
 def _carry(tangent, across, present, out):  # type: ignore[no-untyped-def]
     for k in range(len(out)):
         t = present[k, 0], present[k, 1], present[k, 2]

@@ -255,6 +255,38 @@ def test_sweeps_that_grow_without_bound_are_negative_curvature(comm: MPI.Comm) -
     simulation.destroy()
 
 
+def test_what_the_cycle_is_made_of_can_be_shown_once_its_room_is_taken(
+    comm: MPI.Comm, shared_tmp: Path
+) -> None:
+    """Its block rows stand where the sweeps keep theirs afterwards, where edges carry unknowns."""
+    content = hanging(12, integrator="beuler")
+    content["material"]["bending_model"] = "midedge"
+    options = PETSc.Options()
+    options["pc_type"] = "python"
+    simulation = SteppedScene(comm, Scene.model_validate(content))
+    try:
+        simulation.step()
+        ksp, linear = simulation.stepper.ksp, simulation.stepper.linear
+
+        def shown(name: str) -> PETSc.Mat:
+            path = str(shared_tmp / name)
+            linear.preconditioner.mat.view(PETSc.Viewer().createBinary(path, "w", comm))
+            return PETSc.Mat().load(PETSc.Viewer().createBinary(path, "r", comm))
+
+        linear.preconditioner.set(linear.operator.rows)
+        before = shown("before")
+        ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
+        ksp.setUp()
+        after = shown("after")
+    finally:
+        for name in ["pc_type", *simulation.stepper.our_options]:
+            options.delValue(name)
+    simulation.destroy()
+    size = before.norm(PETSc.NormType.INFINITY)
+    after.axpy(-1.0, before)
+    assert 0.0 < after.norm(PETSc.NormType.INFINITY) < 1e-6 * size  # which is single precision
+
+
 def test_the_operator_has_no_entries_but_where_they_are_asked_for(comm: MPI.Comm) -> None:
     """PETSc only multiplies by our rows; ``-mat_type`` makes a matrix with entries."""
     for asked, with_entries in (({}, False), ({"mat_type": "aij"}, True)):

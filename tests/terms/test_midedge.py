@@ -31,9 +31,9 @@ from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
-from lyra_petsc.terms import midedge
+from lyra_petsc.terms import midedge, midedge_energy
 from lyra_petsc.terms.midedge import MidEdge
-from lyra_petsc.terms.midedge_shape import unit
+from lyra_petsc.terms.midedge_shape import tangents, unit
 from lyra_petsc.terms.moment import Moment
 
 Array = NDArray[np.float64]
@@ -158,6 +158,42 @@ def test_energy_is_continuous_all_the_way_round() -> None:
         assert energy(0.25 * np.pi - 1e-9) == pytest.approx(energy(0.25 * np.pi + 1e-9), rel=1e-7)
         values = [energy(turn) for turn in np.linspace(0.0, np.pi, 20)]
         assert (np.diff(values) > 0.0).all()
+
+
+def test_triangles_that_are_computed_together_do_not_mix() -> None:
+    """Whatever of a batch folds beyond 45° or fades, and where the last batch ends."""
+    with Simulation(SHEET, MPI.COMM_SELF) as simulation:
+        term, n = midedge_of(simulation), simulation.problem.points.n_vertices
+        rows = simulation.system.discretisation.rows
+        random = np.random.default_rng(4)
+        x = simulation.system.x.copy()
+        x[:n] += random.normal(0.0, 0.05, (n, 3))
+        x[term.stencil[7, 2]] = x[term.stencil[7, :2]].mean(axis=0) + 1e-4
+        x.ravel()[term.of_edges.places] = directors_along_normals(term, x)
+        shape, length, weight = term.shape(x, term.frames), term.of_edges.length, np.ones(term.n_elements)
+        data, offsets = term.elements.data, rows.pattern.offsets
+        angle = np.empty((term.n_elements, 3))
+        tangents(x, term.stencil, term.of_edges.of_triangles, shape, angle)
+        assert 0.1 < np.mean(np.abs(angle) > 1.0) < 0.9
+        assert term.n_elements % midedge_energy.BATCH
+
+        def computed(size: int) -> list[Array]:
+            """Energies, gradient and Hessian of so many triangles at a time."""
+            energies, pull, values = np.empty(term.n_elements), np.zeros_like(x), rows.zeros()
+            for first in range(0, term.n_elements, size):
+                part = slice(first, first + size)
+                triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
+                sign, at = data["sign"][part], term.edges[part]
+                constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
+                midedge_energy.energies(x, triangles, edges, shape, *constants, energies[part])
+                midedge_energy.add_gradient(x, triangles, edges, at, sign, shape, *constants, length, pull)
+                corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
+                numbers = *constants, length, weight[part], corners, mixed, values
+                midedge_energy.add_hessian(x, triangles, 0.0, edges, sign, shape, *numbers)
+            return [energies, pull, values]
+
+        for whole, apart in zip(computed(term.n_elements), computed(1), strict=True):
+            np.testing.assert_allclose(whole, apart, rtol=1e-12, atol=1e-12 * np.abs(apart).max())
 
 
 def test_frames_follow_edges_that_turn_far() -> None:
