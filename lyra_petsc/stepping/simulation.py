@@ -266,6 +266,8 @@ class SteppedScene:
         newton = linear = rejected = halvings = 0
         self._tried = []
         system.integrator = self._usual
+        if not self._usual.iterates and system.slips:
+            system.integrator = LaggedBackwardEuler()
         while True:
             end = self.control.next_end(self.time)
             past, past_error = system.integrator.memory(), self.estimated_error

@@ -743,6 +743,14 @@ class StageEquations:
             self.touches = any(self.points.largest(number))
         return self.discretisation.renew_pattern(acting)
 
+    @property
+    def slips(self) -> bool:
+        """Whether there is anything of which one linear solve cannot tell whether it sticks or slides;
+        collective.
+        """
+        terms = [term for term in self.active.near if term.slips]
+        return bool(terms) and any(self.points.largest(sum(term.n_elements for term in terms)))
+
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
 

@@ -97,6 +97,8 @@ class CoulombFriction(Elastic):
         That this rank owns.
     """
 
+    slips = True
+
     def __init__(self, scene: Scene, n_vertices: int) -> None:
         assert scene.contact is not None
         self._common = coefficients(scene.contact.friction)

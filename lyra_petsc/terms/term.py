@@ -266,6 +266,9 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
+    slips: bool = False
+    """Whether the force of its elements turns within so short a way that one linear solve does not follow it."""
+
     partner: Elastic | None = None
     """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
 
