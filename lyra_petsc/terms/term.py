@@ -267,7 +267,7 @@ class Elastic(Term):
         """
 
     slips: bool = False
-    """Whether the force of its elements turns within so short a way that one linear solve does not follow it."""
+    """Whether its force turns within so short a way that one linear solve does not follow it."""
 
     partner: Elastic | None = None
     """The term whose ``frozen`` it is given, too, since it looks at the sheet through it."""
