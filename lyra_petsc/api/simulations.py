@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.api.scenes import SceneLike, load
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output.fields import FIELDS, check_field
@@ -22,7 +23,6 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 take_back_signals()  # the import of PETSc has replaced them
 
-Array = NDArray[np.float64]
 
 _OPEN: weakref.WeakSet[Simulation] = weakref.WeakSet()
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Ints
 from lyra_petsc.kernels.cache import cached
-
-Ints = NDArray[np.int64]
 
 
 def ascending(which: Ints, first: NDArray[np.int64], then: NDArray[np.generic], columns: int) -> Ints:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
 from lyra_petsc.linear.pattern import BlockPattern
@@ -14,7 +14,6 @@ from lyra_petsc.linear.pattern import BlockPattern
 if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import ProductWithEdges
 
-Array = NDArray[np.float64]
 
 MOST_KEPT = 20_000
 """Rows up to which scratch is kept; more of it is got quickly enough, and assembly needs the room."""

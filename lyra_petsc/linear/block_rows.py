@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.linear.block_product import product_of
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @cached()

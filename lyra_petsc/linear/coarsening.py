@@ -18,12 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.mesh.partitioner import vertex_graph
 from lyra_petsc.mesh.topology import boundary_edges
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 OUTSIDE = -0.3
 """Smallest barycentric coordinate with which a linear function is continued beyond its triangle."""

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.linear.block_rows import BlockRows
@@ -24,10 +25,6 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.near import swept_boxes
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Coupling, Elastic, Term
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 TELLING = 6
 """Of the numbers that go with an element, how many tell it from others with its stencil."""

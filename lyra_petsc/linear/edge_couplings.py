@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, block_of, index_type, union
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
     from lyra_petsc.terms.term import Offsets, WithEdges
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 GROUP = 4
 """Edges of a vertex in one block."""

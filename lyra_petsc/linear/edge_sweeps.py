@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.edge_couplings import AHEAD_EDGES
@@ -33,9 +34,7 @@ if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import EdgeCouplings
     from lyra_petsc.linear.pattern import BlockPattern
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 
 EDGES_EVERY = 2

@@ -6,10 +6,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STRAIGHT, TURNED, BOTH = 0, 1, 2
 """How a block goes out: as it is, transposed, or their sum (half of a diagonal block)."""

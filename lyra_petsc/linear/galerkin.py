@@ -7,16 +7,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.linear.exchange_blocks import SharedBlocks
 from lyra_petsc.linear.pattern import BlockPattern, begins, diagonal_keys, index_type, union
 from lyra_petsc.mesh.distribute import local_numbers
 from lyra_petsc.mesh.points import Points
 from lyra_petsc.phases import GALERKIN, logged
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 CHUNK_ROWS = 1 << 13
 """Fine rows whose products are looked at together while the coarse pattern is made."""

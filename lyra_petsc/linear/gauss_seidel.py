@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.vectors import AHEAD, gather, scatter
 
 if TYPE_CHECKING:
     from lyra_petsc.linear.pattern import BlockPattern
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 TINY = np.float32(1e-20)
 """Velocities [m/s] below it are none."""

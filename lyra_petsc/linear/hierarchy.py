@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.coarsening import coarsen
 from lyra_petsc.linear.galerkin import Galerkin
 from lyra_petsc.linear.pattern import BlockPattern, begins
@@ -18,9 +19,6 @@ from lyra_petsc.mesh.points import Layout, Points
 if TYPE_CHECKING:
     from lyra_petsc.terms.edge_turns import EdgeTurns
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 COARSEST = 100
 """Vertices, over all ranks, at which a factorisation takes over."""

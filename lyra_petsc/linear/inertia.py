@@ -10,15 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.failed_factors import LACKS_ROOM, LARGEST
 from lyra_petsc.linear.matrix import AssembledMatrix
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.points import Layout
-
-Array = NDArray[np.float64]
 
 PREFIX = "stability_"
 

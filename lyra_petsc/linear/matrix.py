@@ -7,17 +7,15 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear.block_product import MOST_KEPT, product_of
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern, diagonal_keys
 from lyra_petsc.linear.storage import KINDS, Storage, StoredRows
 from lyra_petsc.mesh.points import Points
-
-Array = NDArray[np.float64]
 
 SUMMARIES = (PETSc.Viewer.Format.ASCII_INFO, PETSc.Viewer.Format.ASCII_INFO_DETAIL)
 """In which PETSc shows a matrix without its entries."""

@@ -5,18 +5,14 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 
-import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear.hierarchy import Hierarchy
 from lyra_petsc.linear.matrix import BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.linear.vcycle import VCycle
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 MOST_LEVELS = 20
 """Of them the fine one is one; ``-pc_mg_levels``."""

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Ints
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.terms.term import Across, Coupling, Couplings, WithEdges
 
 if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import EdgeCouplings
 
-Ints = NDArray[np.int64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 LARGEST_INT32 = 2**31 - 1

@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import cached
 from lyra_petsc.kernels.vectors import put_plain, put_transposed
 from lyra_petsc.linear.pattern import BlockPattern, begins, index_type
 from lyra_petsc.mesh.points import Points
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 KINDS = {"aij": "AIJ", "baij": "BAIJ"}
 """Matrix types whose storage is known here, as the C library spells them."""

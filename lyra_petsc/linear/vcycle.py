@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear import failed_factors
 from lyra_petsc.linear import gauss_seidel as sweeps
@@ -31,7 +32,6 @@ from lyra_petsc.phases import SWEEP, TRANSFER
 if TYPE_CHECKING:
     from lyra_petsc.linear.edge_sweeps import SweepsWithEdges
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 TWICE = 3

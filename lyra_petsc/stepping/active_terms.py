@@ -6,13 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, Load, Term, UpcomingStep, Viscous
-
-Array = NDArray[np.float64]
 
 
 class ActiveTerms:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Load
-
-Array = NDArray[np.float64]
 
 
 class AppliedLoads:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 
 def vertex_scales(system: StageEquations, size: float) -> Array:

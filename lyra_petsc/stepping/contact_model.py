@@ -13,15 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.one_sided import Springs
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SOLVES = 10
 """Linear systems with springs in a Newton iteration, at most."""

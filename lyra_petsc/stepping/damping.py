@@ -9,12 +9,11 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import Elastic, Term
-
-Array = NDArray[np.float64]
 
 
 class Multiple:

@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Pulling
-
-Array = NDArray[np.float64]
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 

@@ -33,15 +33,13 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.energy_balance import Budget, Works
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.state import fitted
 from lyra_petsc.terms.registry import Role
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-Array = NDArray[np.float64]
 
 LARGEST_GAIN = 0.01
 """Gain of a step, over S, above which it is repeated."""

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import Solver
 from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.integrators.static import Static
@@ -28,8 +28,6 @@ from lyra_petsc.stepping.relaxation import Relaxation
 from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
-
-Array = NDArray[np.float64]
 
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""

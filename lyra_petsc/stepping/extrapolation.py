@@ -7,9 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 MOST = 2
 """Degree of the polynomial; the third gained no more, and each is an array to keep."""

@@ -13,15 +13,13 @@ from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.newton_trace import FailedSolve
 from lyra_petsc.terms.membrane import Membrane
 from lyra_petsc.terms.prescribed_handles import Held
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Result = TypeVar("Result")
 
 TIE = 1e-6

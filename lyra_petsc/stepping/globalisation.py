@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.watchdog import Watchdog
-
-Array = NDArray[np.float64]
 
 ENERGY_ROUNDOFF = 1e-14
 """Differences of the objective below this fraction of its summands are noise."""

@@ -24,13 +24,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def surplus(system: StageEquations, before: float, x_before: Array, surplus_before: float) -> float:

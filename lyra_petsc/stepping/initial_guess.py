@@ -7,13 +7,9 @@ and staying is nearer; the objective tells. An equilibrium is sought from where 
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 
 def first_guess(system: StageEquations, out: Array) -> None:

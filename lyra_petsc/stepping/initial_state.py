@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.scene.schema import FASTEST, Initial, Scene
-
-Array = NDArray[np.float64]
 
 RESOLVED = 1e6
 """Mean edge over the round-off of the largest coordinate, at least."""

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear import multigrid, presets
 from lyra_petsc.linear.hierarchy import Hierarchy, InterpolationRows, Surface, interpolations
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
@@ -22,8 +21,6 @@ from lyra_petsc.phases import JACOBIAN_AGAIN, logged
 from lyra_petsc.stepping.diagonal_shift import DiagonalShift
 from lyra_petsc.stepping.reuse import Reuse
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 
 class LinearSystem:

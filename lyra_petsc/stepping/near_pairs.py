@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.failure_diagnosis import worst
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
 
 TOUCHING = 2e-9
 """Gap over the skin of a search up to which there is none."""

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear import failed_factors
 from lyra_petsc.linear.petsc_options import is_set
 from lyra_petsc.linear.pivots import negative_pivots
@@ -23,7 +23,6 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 if TYPE_CHECKING:
     from lyra_petsc.stepping.contact_model import ContactModel
 
-Array = NDArray[np.float64]
 
 SMALL = 0.005
 """Half the gap over the edges' mean length below which the linear model has what is on its way: with larger

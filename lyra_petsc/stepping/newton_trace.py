@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.terms.term import Term
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 
 class Objective:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.linear.block_rows import Beside, BlockRows
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.terms.prescribed_handles import Held
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 class Prescribed:

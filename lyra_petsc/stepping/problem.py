@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.linear.hierarchy import Surface
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.clamped_edges import ClampedEdges
     from lyra_petsc.terms.contact import Barrier
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 FLAT = 1e-6
 """Distance over the sheet's size up to which a vertex lies in a symmetry plane."""

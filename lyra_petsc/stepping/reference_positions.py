@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class ReferencePositions:

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 LEAST, MOST = 0.02, 1.0
 

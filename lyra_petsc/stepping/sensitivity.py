@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.phases import Phases
@@ -42,8 +43,6 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import Frames, carried
 from lyra_petsc.terms.term import Term
-
-Array = NDArray[np.float64]
 
 CENTRAL = {-2: 1.0 / 12.0, -1: -2.0 / 3.0, 1: 2.0 / 3.0, 2: -1.0 / 12.0}
 FORWARD = {0: -25.0 / 12.0, 1: 4.0, 2: -3.0, 3: 4.0 / 3.0, 4: -0.25}

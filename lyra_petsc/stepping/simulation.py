@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.kernels.compilation import COMPILATION
 from lyra_petsc.linear.petsc_options import fill_gaps, is_set, petsc_number
@@ -38,9 +38,6 @@ from lyra_petsc.stepping.step_control import HALVINGS, LoadControl, StepControl,
 from lyra_petsc.stepping.stepper import MEETS, Attempt, Stepper
 from lyra_petsc.stepping.ts_options import STEP_OPTIONS, step_option, with_ts_options
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SMALLEST_FRACTION = 2.0**-12
 """Δt below which no retry is made, over the nominal one (``-ts_adapt_dt_min`` overrides it)."""

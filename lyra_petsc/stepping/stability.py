@@ -12,13 +12,11 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.inertia import Inertia
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 MOST_VERTICES = 200_000
 """Above it no factors are computed."""

@@ -25,6 +25,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
@@ -43,7 +44,6 @@ from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, Upcom
 if TYPE_CHECKING:
     from lyra_petsc.terms.one_sided import Springs
 
-Array = NDArray[np.float64]
 
 FARTHEST_TURN = 0.25
 """Angle [rad] by which a Newton iteration of a static analysis may turn a director."""

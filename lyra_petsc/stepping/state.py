@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.discretisation import Discretisation
-
-Array = NDArray[np.float64]
 
 
 class State:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError, SolverError
 from lyra_petsc.linear import failed_factors, presets, reasons
 from lyra_petsc.linear.hierarchy import Surface
@@ -30,8 +30,6 @@ from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.ts_options import hidden
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,14 @@ all unknowns see.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.edge_turns import EdgeTurns
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.term import Coupling, Elastic, Viscous
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class VertexEquations:

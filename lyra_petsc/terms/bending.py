@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import hinge_forces, hinge_shape
@@ -27,7 +28,6 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Across, Couplings, Elastic, Offsets
 
-Array = NDArray[np.float64]
 Stencil = NDArray[np.int32] | NDArray[np.int64]
 
 

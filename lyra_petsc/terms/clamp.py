@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
@@ -27,9 +28,6 @@ from lyra_petsc.terms.hinge_energy import fading_limit, hinge_energy, hinge_grad
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-Array = NDArray[np.float64]
-
 
 NO_LIMIT = 0.0
 """Of the mirror image, which is rigid."""

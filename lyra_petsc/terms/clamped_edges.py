@@ -14,17 +14,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.terms.midedge import MidEdge, edge_numbers, normals_of
 from lyra_petsc.terms.midedge_shape import Frames, carried, unit
 from lyra_petsc.terms.motion import Motion, Window
 from lyra_petsc.terms.rest import RestShape
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class _Plane(NamedTuple):

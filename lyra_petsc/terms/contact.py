@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.measures import edge_lengths
@@ -30,9 +31,6 @@ from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 KEPT = 0.2
 """Part of its distance, or of the gap where it is farther, that a pair keeps in a Newton iteration."""

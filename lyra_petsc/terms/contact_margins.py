@@ -12,13 +12,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh import patches
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class Margins:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel, leaf
 from lyra_petsc.mesh import patches
@@ -14,9 +14,6 @@ from lyra_petsc.mesh.near import near_in_order
 from lyra_petsc.mesh.topology import edge_table
 from lyra_petsc.terms.contact_margins import Margins
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE, VERTEX_TRIANGLE, distance, speed
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SPARE = 0.7
 """Over the reach, how much farther simplices of neighbouring patches are looked for: as long as they do not

@@ -16,9 +16,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 LEAST = 1e-14
 """Stiffness of what slides, over that of what sticks, where a parabola stands for it."""

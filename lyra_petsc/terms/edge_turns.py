@@ -13,15 +13,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Mask
 from lyra_petsc.kernels.cache import Index, cached
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms.hinge import dot, point, scaled
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import edges_of
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 
 @kernel()

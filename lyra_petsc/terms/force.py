@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import find_group, select_triangles, select_vertices
 from lyra_petsc.scene.schema import AppliedLoad, Scene
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
-
-Array = NDArray[np.float64]
 
 
 class Force(Load):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.sorting import ascending
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene, coefficients
@@ -25,10 +26,6 @@ from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, SLID
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 WORK, MORE, MISSED = 0, 1, 2
 """Columns of what is known of vertices: work of friction [J]; by how much the normal forces that acted in the

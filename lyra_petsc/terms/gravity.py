@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
-
-Array = NDArray[np.float64]
 
 
 class Gravity(Load):

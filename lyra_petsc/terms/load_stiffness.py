@@ -8,10 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.terms.term import Term
-
-Array = NDArray[np.float64]
 
 STEP = 1e-5
 """Displacement in the difference, over the size of the elements."""

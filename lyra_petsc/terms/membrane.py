@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
@@ -30,7 +31,6 @@ from lyra_petsc.terms.membrane_laws import law_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets
 
-Array = NDArray[np.float64]
 Stencil = NDArray[np.int32]
 
 

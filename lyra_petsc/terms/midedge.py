@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
@@ -50,9 +51,6 @@ from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, Term, UpcomingStep
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
 STEEPEST = np.radians(89.95)

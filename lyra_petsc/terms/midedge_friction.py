@@ -17,8 +17,8 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms import bending, midedge, midedge_energy
@@ -28,8 +28,6 @@ from lyra_petsc.terms.midedge_shape import Frames, tangents
 from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic, Offsets, Term, UpcomingStep
-
-Array = NDArray[np.float64]
 
 GIVE = 2.0
 """κ_y [1/m]: change of curvature at which friction is at its limit."""

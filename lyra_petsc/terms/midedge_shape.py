@@ -24,14 +24,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEFT = 0.75 * math.pi
 """Angle from 45° to 180° [rad]."""

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import find_group
@@ -24,8 +24,6 @@ from lyra_petsc.terms.midedge_shape import unit
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load, Term
-
-Array = NDArray[np.float64]
 
 
 class Moment(Load):

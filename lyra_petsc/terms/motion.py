@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import FASTEST, Handle, Keyframe, Rotation, Scene
-
-Array = NDArray[np.float64]
 
 HALF_TURN = 180.0
 """Angle [degrees] up to which the interpolation of quaternions goes the way that angles say."""

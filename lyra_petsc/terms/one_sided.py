@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_outer
 from lyra_petsc.terms.term import Offsets
-
-Array = NDArray[np.float64]
 
 
 class Springs(NamedTuple):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.capacity import available_memory
 from lyra_petsc.mesh.mesh import Mesh
@@ -19,7 +20,6 @@ from lyra_petsc.terms.motion import Motion, Window, motion_of
 if TYPE_CHECKING:
     from lyra_petsc.terms.clamped_edges import ClampedEdges
 
-Array = NDArray[np.float64]
 Selection = dict[int, NDArray[np.int64]]
 Reference = Callable[[float, NDArray[np.int64]], Array]
 """Of a start time [s] and local rows (n,), their positions (n, 3) [m] at that time."""

@@ -7,8 +7,8 @@ symmetric.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_triangles
@@ -16,8 +16,6 @@ from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.motion import Window
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Load
-
-Array = NDArray[np.float64]
 
 
 @kernel()

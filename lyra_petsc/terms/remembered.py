@@ -8,7 +8,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
+
 Result = TypeVar("Result", bound="Array | tuple[Array, ...]")
 
 

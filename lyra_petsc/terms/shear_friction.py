@@ -9,15 +9,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.coulomb import Friction
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
 
 GIVE = 0.002
 """γ_y: change of shear at which friction is at its limit."""

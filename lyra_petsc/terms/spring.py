@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Pulling, UpcomingStep
-
-Array = NDArray[np.float64]
 
 ORIGINAL_STIFFNESS = 1000.0
 """[N/m], of the original program; what a fading exact handle takes."""

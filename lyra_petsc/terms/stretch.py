@@ -11,9 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
-
-Array = NDArray[np.float64]
 
 SOFTENS_BELOW = 1.0 / math.sqrt(3.0)
 """Stretch at which the stress of a St. Venant-Kirchhoff bar, c λ (λ² − 1)/2, is at its most compressive."""

@@ -8,12 +8,9 @@ that is −1 of a side and 1 of a corner within, and 0 on the border.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.topology import edge_table
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SIDES, CORNERS, TIMES = 3, 63, 7
 """Most triangles that a side and a corner are said to have, and how often a corner counts at most, either

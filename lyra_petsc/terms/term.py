@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.one_sided import Springs
     from lyra_petsc.terms.registry import Registration
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 CHUNK_VALUES = 32_768

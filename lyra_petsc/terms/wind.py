@@ -15,8 +15,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.scatter import fetch_ahead
 from lyra_petsc.kernels.vectors import add_outer
@@ -24,8 +24,6 @@ from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Offsets, UpcomingStep, Viscous
-
-Array = NDArray[np.float64]
 
 
 @kernel()

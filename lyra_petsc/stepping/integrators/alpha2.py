@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
-
-Array = NDArray[np.float64]
 
 
 class GeneralisedAlpha(Integrator):

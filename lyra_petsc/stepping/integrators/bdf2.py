@@ -7,10 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.alpha2 import GeneralisedAlpha
 from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
-
-Array = NDArray[np.float64]
 
 
 class Bdf2(Integrator):

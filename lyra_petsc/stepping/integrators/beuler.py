@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.integrator import Integrator, Stage
-
-Array = NDArray[np.float64]
 
 
 class BackwardEuler(Integrator):

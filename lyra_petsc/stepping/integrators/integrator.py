@@ -18,7 +18,8 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
+
 Arrays = dict[str, Array]
 
 

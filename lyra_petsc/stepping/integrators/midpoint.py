@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.integrators.integrator import Arrays, Integrator, Stage
-
-Array = NDArray[np.float64]
 
 
 class Midpoint(Integrator):

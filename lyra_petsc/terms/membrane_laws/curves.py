@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.materials.curves import interpolation
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.terms.membrane_laws import compression
-
-Array = NDArray[np.float64]
 
 SOFTENS = False
 

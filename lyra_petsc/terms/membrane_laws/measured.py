@@ -21,13 +21,11 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.terms.membrane_laws import compression
-
-Array = NDArray[np.float64]
 
 SOFTENS = False
 

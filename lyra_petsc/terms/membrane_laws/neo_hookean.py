@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.materials.library import ShellMaterial
-
-Array = NDArray[np.float64]
 
 SOFTENS = False
 

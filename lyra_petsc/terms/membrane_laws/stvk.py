@@ -6,12 +6,10 @@ Source: the Lyra paper, eq. 2-3; Bonet and Wood, Nonlinear Continuum Mechanics f
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.materials.library import ShellMaterial
-
-Array = NDArray[np.float64]
 
 SOFTENS = True
 
