@@ -29,7 +29,7 @@ from lyra_petsc.terms.term import Coupling, Elastic, Term
 TELLING = 6
 """Of the numbers that go with an element, how many tell it from others with its stencil."""
 
-SHORTER = 1.0, 0.25, 0.0625, 0.015625, 0.0
+SHORTER = *(0.25**k for k in range(12)), 0.0
 """Parts of a way that are searched one after the other, until there are not too many elements along it."""
 
 FEW = 0.1

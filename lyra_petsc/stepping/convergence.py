@@ -159,7 +159,7 @@ class Convergence:
         """
         discretisation, was_good = self._equations.discretisation, self._was_good
         self._was_good = True
-        if was_good or not discretisation.guards:
+        if was_good or not (discretisation.guards and self._equations.integrator.moves):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
         return (self.norm > part * enough or self.left > part * near) and discretisation.meets

@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
 
@@ -89,6 +90,15 @@ def pressing(system: StageEquations) -> Array:
     return out
 
 
+def _leading(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Ints:
+    """Local rows (m,) of the vertices that pairs are of, or of those of edges and of points of obstacles the
+    vertex with the least global number that a nearest point is on or beside.
+    """
+    number = np.where((points >= 0) & (beta != 0.0), layout.global_number[points], np.iinfo(np.int64).max)
+    found: Ints = points[np.arange(len(points)), number.argmin(axis=1)]
+    return np.where(vertex >= 0, vertex, found)
+
+
 def calm(system: StageEquations) -> Array:
     """Damp the rates at which distances in contact change; collective.
 
@@ -103,9 +113,10 @@ def calm(system: StageEquations) -> Array:
     pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.largest(sum(len(points) for points, *_ in pairs))):
         return felt
-    points, beta, normal, stiffness, vertex, slow = (
-        np.concatenate(part) for part in zip(*pairs, strict=True)
-    )
+    every = tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
+    # each is that of the rank of one vertex, which knows all pairs with the same nearest points
+    mine = _leading(layout, every[0], every[1], every[4]) < n
+    points, beta, normal, stiffness, vertex, slow = (part[mine] for part in every)
     sheet = points >= 0
     rows, beta = np.where(sheet, points, 0), np.where(sheet, beta, 0.0)
     shared = np.zeros_like(system.x)

@@ -65,9 +65,10 @@ SHARP = 0.5
 SKIN = 0.5
 """Over the gap, how far points may come nearer to each other between two searches."""
 
-MANY = 100
-"""Pairs per vertex above which shorter ways are looked at: a step of Newton's method may lead through all of
-a crumpled sheet, and none of that is gone at once."""
+MANY, MANY_PER_VERTEX = 500_000, 100
+"""Pairs above both of which shorter ways are looked at: a step of Newton's method may lead through all of a
+crumpled sheet, and none of that is gone at once. Not in a static analysis, whose first load step may lead far
+where nothing holds the sheet yet."""
 
 STRAIN = 0.01
 """Least strain of an edge under the force k · gap: by a softer barrier a small force would close a small gap,
@@ -259,7 +260,7 @@ class ContactBarrier(Elastic):
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, rings: Ints) -> None:
         empty = {"what": np.empty((0, 7)), "number": np.empty((0, 4))}
-        self.obstacles, self.itself = Obstacles([]), True
+        self.obstacles, self.itself, self.moves = Obstacles([]), True, True
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
@@ -271,12 +272,15 @@ class ContactBarrier(Elastic):
         self._taken: Ints | None = None  # triangles that the search has
         self._meeting = Remembered(self._meet)
 
-    def set_up(self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool) -> None:
+    def set_up(
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool, moves: bool
+    ) -> None:
         """Take what all ranks know alike; before anything else is asked.
 
-        ``itself`` says whether sheets meet sheets.
+        ``itself`` says whether sheets meet sheets, ``moves`` whether this is a motion.
         """
-        self.barrier, self.obstacles, self.itself = barrier, Obstacles(obstacles), itself
+        self.barrier, self.obstacles = barrier, Obstacles(obstacles)
+        self.itself, self.moves = itself, moves
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
@@ -339,7 +343,7 @@ class ContactBarrier(Elastic):
             self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
             self._taken = triangles
         boxes = self._sheets.boxes(x, way)
-        most = MANY * len(x) if way.any() else np.inf
+        most = max(MANY, MANY_PER_VERTEX * len(x)) if self.moves and way.any() else np.inf
         found = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.each:
             found += self._at_obstacles(x, way, boxes)
@@ -678,10 +682,10 @@ class ContactBarrier(Elastic):
     def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Array]:
         met = self.meeting(x, frozen.after)
         square = np.sum(met.felt[:, :3] ** 2, axis=1)
-        of = np.flatnonzero((met.counted > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
+        of = np.flatnonzero((met.weight > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
         at, square = met.at[of], square[of]
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]
-        stiffness = met.counted[of] * met.felt[of, 4] * square
+        stiffness = met.weight[of] * met.felt[of, 4] * square
         return self.points[at], met.beta[of], normal, stiffness, self.led_by(at), RESTS * self.gap[at]
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:

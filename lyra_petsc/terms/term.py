@@ -372,8 +372,9 @@ class Elastic(Term):
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
     def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints, Array]:
-        """The same where repulsion stiffens at the end of the step, with its second derivative b″ (m,) [N/m]
-        instead of the force, and how far pairs that rest go in a step at most (m,) [m].
+        """The same where repulsion stiffens at the end of the step, of pairs that other ranks count, too;
+        with its second derivative b″ (m,) [N/m] instead of the force, and how far pairs that rest go in a
+        step at most (m,) [m].
         """
         return *self.touching_points(x, frozen), np.empty(0)
 
