@@ -206,11 +206,6 @@ class Discretisation:
         """Whether ways must be looked at before they are gone: a term has to see who meets there."""
         return any(np.isfinite(term.unseen) for term in self._changing)
 
-    @property
-    def meets(self) -> bool:
-        """Whether any rank has elements of stencils that depend on the positions; collective."""
-        return any(self.layout.largest(any(term.n_elements for term in self._changing)))
-
     def largest_step(self, x: Array, way: Array) -> float:
         """Fraction, up to 1, of the way (n_owned, 3) [m] from x that vertices may go until stencils are
         looked for again; collective.

@@ -19,8 +19,8 @@ FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
 FINER_IN_CONTACT = 0.1
-"""Part of the tolerances above which one more iteration is taken where parts touch: an impact magnifies
-what a step leaves, which depends on the number of ranks."""
+"""Part of the tolerances above which one more iteration is taken where parts meet: an impact magnifies what a
+step leaves, which depends on the number of ranks."""
 
 SLOWEST = 0.5
 """Fraction of the increment before above which increments are not extrapolated."""
@@ -155,14 +155,14 @@ class Convergence:
 
     def _finer_in_contact(self, near: float) -> bool:
         """Whether a solve that is good enough, with corrections below ``near`` [m], takes another iteration
-        as parts touch; collective.
+        as parts meet; collective.
         """
-        discretisation, was_good = self._equations.discretisation, self._was_good
+        equations, was_good = self._equations, self._was_good
         self._was_good = True
-        if was_good or not (discretisation.guards and self._equations.integrator.moves):
+        if was_good or not (equations.discretisation.guards and equations.integrator.moves):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
-        return (self.norm > part * enough or self.left > part * near) and discretisation.meets
+        return (self.norm > part * enough or self.left > part * near) and equations.hits
 
     def _force_tolerance(self) -> float:
         """Residual norm [N] that the scene asks for."""

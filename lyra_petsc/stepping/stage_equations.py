@@ -54,6 +54,9 @@ SEARCHES = 40
 FEW = 0.3
 """Part of a way that must be known for the rest to be searched bit by bit; else all of it is at once."""
 
+HITS = 0.1
+"""How far vertices go in a step, over the skin of what they touch, from which on that may be an impact."""
+
 PUSHES = 40
 """By which what has come too near is set aside, or what leaves taken back, at most."""
 
@@ -750,6 +753,17 @@ class StageEquations:
         """
         terms = [term for term in self.active.near if term.slips]
         return bool(terms) and any(self.points.largest(sum(term.n_elements for term in terms)))
+
+    @property
+    def hits(self) -> bool:
+        """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
+        limiting, reach = self.active.limiting, self.stage.reach
+        if not limiting:
+            return False
+        far = HITS * min(term.skin for term in limiting)
+        near = any(term.n_elements for term in limiting)
+        goes = reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0) > far
+        return all(self.points.largest(near, bool(goes)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.
