@@ -87,8 +87,8 @@ class Multipliers(ContactBarrier):
     solving = False
     """Whether energies are those of a solve: between steps nothing is stored."""
 
-    def set_up(self, barrier: Barrier, obstacles: Sequence[Any], *, itself: bool, moves: bool) -> None:
-        super().set_up(barrier, obstacles, itself=itself, moves=moves)
+    def set_up(self, barrier: Barrier, obstacles: Sequence[Any], *, itself: bool, static: bool) -> None:
+        super().set_up(barrier, obstacles, itself=itself, static=static)
         self.r = self.ratio * HALFWAY * barrier.stiffness
         self.keys, self.multipliers = np.empty(0, dtype=np.int64), np.empty(0)
 

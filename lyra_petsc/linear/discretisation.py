@@ -216,13 +216,11 @@ class Discretisation:
         reach = 0.5 * min(term.unseen for term in self._searching)
         x, way = x[:n], way[:n]
         start, end = self._way
-        for part in (1.0, self._searched):
+        for part in (1.0, self._searched) if 0.0 < self._searched < 1.0 else (1.0,):
             from_start, back, from_end = _leaves_on(x, part * way, start, end, reach)
             *left, apart = self.layout.largest(from_start, back, from_start or from_end)
             if not apart:
                 return part
-            if self._searched in (0.0, 1.0):
-                break
         # near both ends of a short way there may be no room left at the one, and all at the other
         places = zip(left, (start, end), strict=True)
         less = self.layout.largest(

@@ -162,7 +162,7 @@ class Convergence:
         if was_good or not (equations.discretisation.guards and equations.integrator.moves):
             return False
         enough, part = self._force_tolerance(), FINER_IN_CONTACT
-        return (self.norm > part * enough or self.left > part * near) and equations.hits
+        return (self.norm > part * enough or self.left > part * near) and equations.may_impact
 
     def _force_tolerance(self) -> float:
         """Residual norm [N] that the scene asks for."""

@@ -12,10 +12,10 @@ and along the lines between their nearest points at the end of the step, so that
 stay as they are. (Energy by projection: Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. IV.4.)
 
 **All of them**: they hardly damp how a sheet bounces on the barrier, and one that bounces slides on where it
-should stand, as its normal force is too small every other moment. `calm` damps the rates at which distances
-in contact change, along the lines between nearest points. A bounce of angular frequency ω loses about
-(ω Δt)³/2 of its velocity in a step, so that the order stays. Where distances change by much of the gap in a
-step that is an impact, and what meets bounces.
+should stand, as its normal force is too small every other moment. `damp_bounces` damps the rates at which
+distances in contact change, along the lines between nearest points. A bounce of angular frequency ω loses
+about (ω Δt)³/2 of its velocity in a step, so that the order stays. Where distances change by much of the gap
+in a step that is an impact, and what meets bounces.
 """
 
 from __future__ import annotations
@@ -77,10 +77,15 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     apart = np.einsum("ei,eik->ek", beta[between], system.x[rows[between]])
     normal = normal.copy()
     normal[between] = apart / np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)[:, None]
-    np.add.at(out, rows, (force[:, None] * beta)[:, :, None] * normal[:, None, :])
+    _add_along(rows, beta, normal, force, out)
 
 
-def pressing(system: StageEquations) -> Array:
+def _add_along(rows: Ints, beta: Array, normal: Array, size: Array, out: Array) -> None:
+    """Add impulses of sizes (m,) along normals (m, 3), times β (m, 4), to rows (m, 4) of out (n_local, 3)."""
+    np.add.at(out, rows, (size[:, None] * beta)[:, :, None] * normal[:, None, :])
+
+
+def normal_forces(system: StageEquations) -> Array:
     """Normal forces (n_owned,) [N] on vertices that meet something, at the stage of the step just taken."""
     x = system.x if system.stage.after == system.dt else system.stage_positions
     out = np.zeros(system.points.n_owned)
@@ -90,7 +95,7 @@ def pressing(system: StageEquations) -> Array:
     return out
 
 
-def _leading(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Ints:
+def _vertices_of(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Ints:
     """Local rows (m,) of the vertices that pairs are of, or of those of edges and of points of obstacles the
     vertex with the least global number that a nearest point is on or beside.
     """
@@ -99,7 +104,7 @@ def _leading(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Ints:
     return np.where(vertex >= 0, vertex, found)
 
 
-def calm(system: StageEquations) -> Array:
+def damp_bounces(system: StageEquations) -> Array:
     """Damp the rates at which distances in contact change; collective.
 
     Returns the mean forces (n_owned,) [N] of that in the step on vertices that meet something.
@@ -115,7 +120,7 @@ def calm(system: StageEquations) -> Array:
         return felt
     every = tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
-    mine = _leading(layout, every[0], every[1], every[4]) < n
+    mine = _vertices_of(layout, every[0], every[1], every[4]) < n
     points, beta, normal, stiffness, vertex, slow = (part[mine] for part in every)
     sheet = points >= 0
     rows, beta = np.where(sheet, points, 0), np.where(sheet, beta, 0.0)
@@ -131,7 +136,7 @@ def calm(system: StageEquations) -> Array:
     part = np.sqrt(dt**2 * stiffness * least)
     weight = part * dt**2 * stiffness / (2.0 + part**3) / (1.0 + (rate * dt / slow) ** 4)
     impulse, push = np.zeros_like(system.x), -weight * rate
-    np.add.at(impulse, rows, (push[:, None] * beta)[:, :, None] * normal[:, None, :])
+    _add_along(rows, beta, normal, push, impulse)
     layout.add_to_owners(impulse)
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
     system.state.set(system.x[:n], system.v[:n] + change)

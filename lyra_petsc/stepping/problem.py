@@ -290,8 +290,8 @@ def _set_up_contact(
 
     obstacles = obstacles_of(layout.comm, scene, mesh, Motion)
     contact = next(term for term in terms.values() if isinstance(term, ContactBarrier))
-    moves = not scene.time.static
-    contact.set_up(outline.barrier, obstacles, itself=scene.contact.self, moves=moves)
+    itself, static = scene.contact.self, scene.time.static
+    contact.set_up(outline.barrier, obstacles, itself=itself, static=static)
     if "friction" in terms:
         from lyra_petsc.terms.friction import CoulombFriction
 

@@ -54,7 +54,7 @@ SEARCHES = 40
 FEW = 0.3
 """Part of a way that must be known for the rest to be searched bit by bit; else all of it is at once."""
 
-HITS = 0.1
+IMPACT = 0.1
 """How far vertices go in a step, over the skin of what they touch, from which on that may be an impact."""
 
 PUSHES = 40
@@ -356,14 +356,17 @@ class StageEquations:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
         if self.active.limiting and self.integrator.order > 1:
-            from lyra_petsc.stepping.impacts import calm, pressing, surplus  # of no use elsewhere
+            from lyra_petsc.stepping import impacts  # of no use elsewhere
 
             if self.watches_impacts:
                 left = self.integrator.surplus
-                self.integrator.surplus = surplus(self, self._stored, before, left)
-            pressed = pressing(self) + (0.0 if self.active.pushing else calm(self))
-            for term in self.active.near:
-                term.feel(pressed)
+                self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
+            rubbing = [term for term in self.active.near if term.slips]
+            acted = impacts.normal_forces(self) if rubbing else np.zeros(n)
+            if not self.active.pushing:
+                acted += impacts.damp_bounces(self)
+            for term in rubbing:
+                term.take_normal_forces(acted)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
@@ -755,12 +758,12 @@ class StageEquations:
         return bool(terms) and any(self.points.largest(sum(term.n_elements for term in terms)))
 
     @property
-    def hits(self) -> bool:
+    def may_impact(self) -> bool:
         """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
         limiting, reach = self.active.limiting, self.stage.reach
         if not limiting:
             return False
-        far = HITS * min(term.skin for term in limiting)
+        far = IMPACT * min(term.skin for term in limiting)
         near = any(term.n_elements for term in limiting)
         goes = reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0) > far
         return all(self.points.largest(near, bool(goes)))

@@ -260,7 +260,7 @@ class ContactBarrier(Elastic):
 
     def __init__(self, surface: NDArray[np.int32], uv: Array, rings: Ints) -> None:
         empty = {"what": np.empty((0, 7)), "number": np.empty((0, 4))}
-        self.obstacles, self.itself, self.moves = Obstacles([]), True, True
+        self.obstacles, self.itself, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
@@ -273,14 +273,14 @@ class ContactBarrier(Elastic):
         self._meeting = Remembered(self._meet)
 
     def set_up(
-        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool, moves: bool
+        self, barrier: Barrier, obstacles: Sequence[Solid | Container], *, itself: bool, static: bool
     ) -> None:
         """Take what all ranks know alike; before anything else is asked.
 
-        ``itself`` says whether sheets meet sheets, ``moves`` whether this is a motion.
+        ``itself`` says whether sheets meet sheets, ``static`` whether an equilibrium is sought.
         """
         self.barrier, self.obstacles = barrier, Obstacles(obstacles)
-        self.itself, self.moves = itself, moves
+        self.itself, self.static = itself, static
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
         self.unseen = (EDGES if itself else 1.0) * barrier.gap + self.skin
@@ -343,7 +343,7 @@ class ContactBarrier(Elastic):
             self._sheets.take(x, numbers, triangles[:, :3], triangles[:, 3])
             self._taken = triangles
         boxes = self._sheets.boxes(x, way)
-        most = max(MANY, MANY_PER_VERTEX * len(x)) if self.moves and way.any() else np.inf
+        most = max(MANY, MANY_PER_VERTEX * len(x)) if way.any() and not self.static else np.inf
         found = [np.empty((0, 7), dtype=np.int64)]
         if self.obstacles.each:
             found += self._at_obstacles(x, way, boxes)
@@ -669,7 +669,7 @@ class ContactBarrier(Elastic):
         keeps = force > 0.0
         return beta[keeps], normal[keeps], force[keeps], at[keeps]
 
-    def led_by(self, at: Ints) -> Ints:
+    def vertex_of(self, at: Ints) -> Ints:
         """The vertex of a sheet that each of pairs (m,) is of, −1 of edges and of points of obstacles."""
         of_vertex = (self.kind[at] != EDGE_EDGE) & (self.points[at, 0] >= 0)
         found: Ints = np.where(of_vertex, self.points[at, 0], -1)
@@ -677,7 +677,7 @@ class ContactBarrier(Elastic):
 
     def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
         beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
-        return self.points[at], beta, normal, force, self.led_by(at)
+        return self.points[at], beta, normal, force, self.vertex_of(at)
 
     def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Array]:
         met = self.meeting(x, frozen.after)
@@ -686,7 +686,7 @@ class ContactBarrier(Elastic):
         at, square = met.at[of], square[of]
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]
         stiffness = met.weight[of] * met.felt[of, 4] * square
-        return self.points[at], met.beta[of], normal, stiffness, self.led_by(at), RESTS * self.gap[at]
+        return self.points[at], met.beta[of], normal, stiffness, self.vertex_of(at), RESTS * self.gap[at]
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this

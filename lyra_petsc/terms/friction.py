@@ -143,7 +143,7 @@ class CoulombFriction(Elastic):
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
-        self._give(contact.led_by(at), force)
+        self._give(contact.vertex_of(at), force)
         order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
@@ -152,7 +152,7 @@ class CoulombFriction(Elastic):
         self._pairs, self.stale = Pairs(key, what), True
 
     def _give(self, vertex: Ints, force: Array) -> None:
-        """Let normal forces (m,) [N] of pairs led by vertices be those that acted in the step."""
+        """Let normal forces (m,) [N] of pairs of vertices be those that acted in the step."""
         more, missed = self._heat[:, MORE], self._heat[:, MISSED]
         led = vertex >= 0
         total = np.bincount(vertex[led], force[led], minlength=len(more))
@@ -164,7 +164,7 @@ class CoulombFriction(Elastic):
         if more.any():
             force[led] *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[vertex[led]]
 
-    def feel(self, force: Array) -> None:
+    def take_normal_forces(self, force: Array) -> None:
         self._felt = force
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:

@@ -434,7 +434,7 @@ class Elastic(Term):
     def take_pairs(self, x: Array, frozen: Any) -> None:
         """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
 
-    def feel(self, force: Array) -> None:
+    def take_normal_forces(self, force: Array) -> None:
         """Know the normal forces (n_owned,) [N] on vertices that met something in the step just taken."""
 
     def element_state(self) -> tuple[Ints, Array]:

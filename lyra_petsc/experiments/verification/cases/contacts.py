@@ -89,6 +89,12 @@ def _at(trial: Trial, time: float) -> Trial:
     return trial
 
 
+def _creep(trial: Trial, down: Array) -> float:
+    """Farthest way [m] of a vertex down a slope from when it has settled to the end; collective."""
+    settled = _at(trial, SETTLED).x
+    return float(np.abs((trial.run().x - settled) @ down).max())
+
+
 @case(
     "Sheet on a slope of 5, 30 and 60°: stands at 1.01 of the friction that holds it, slides with "
     "g (sin α − μ cos α) at 0.99, 0.9 and 0.5 of it; on one of triangles, too; friction over the weight",
@@ -108,8 +114,7 @@ def incline(bench: Bench, n: float) -> Sequence[Measured]:
         with bench.simulation(
             sheet_on_slope(degrees, STICKS * math.tan(angle), round(n), END) | slope
         ) as trial:
-            settled = _at(trial, SETTLED).x
-            creep = max(creep, float(np.abs((trial.run().x - settled) @ down).max()))
+            creep = max(creep, _creep(trial, down))
         for part in SLIDING[1:2] if triangles else SLIDING:
             friction = part * math.tan(angle)
             with bench.simulation(sheet_on_slope(degrees, friction, round(n), SLID) | slope) as trial:
@@ -694,14 +699,10 @@ def sheets(bench: Bench, n: float) -> Iterator[Measured]:
                 mass = trial.mass[count:]
                 before = _at(trial, BEGIN).v[count:] @ down
                 change = trial.run().v[count:] @ down - before
-            exact, found = (
-                G * (1.0 - part) * math.sin(angle),
-                float(mass @ change) / mass.sum() / (RAN - BEGIN),
-            )
+            exact = G * (1.0 - part) * math.sin(angle)
+            found = float(mass @ change) / mass.sum() / (RAN - BEGIN)
             off = max(off, (abs(found / exact - 1.0), found, exact))
         yield Measured(f"acceleration, {integrator}", off[1], off[2], "m/s²")
         content, count = _sheet_on_sheet(round(n), STICKS * math.tan(angle), integrator, 2.0 * SETTLED)
         with bench.simulation(content) as trial:
-            settled = _at(trial, SETTLED).x
-            creep = float(np.abs((trial.run().x - settled) @ down).max())
-        yield Measured(f"creep, {integrator}", creep, 0.0, "m", scale=1.0)
+            yield Measured(f"creep, {integrator}", _creep(trial, down), 0.0, "m", scale=1.0)
