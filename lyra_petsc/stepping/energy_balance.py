@@ -29,8 +29,8 @@ class Budget:
     """Energies [J] at a state, and cumulative works [J] up to it.
 
     ``external_work`` is that of handles, springs and loads other than gravity, ``dissipation`` that of
-    material damping and of friction within the fabric; ``more`` are the energies of terms with a column of
-    their own.
+    material damping, of friction within the fabric and of impacts; ``more`` are the energies of terms with a
+    column of their own.
     """
 
     kinetic: float = 0.0
@@ -59,7 +59,7 @@ class Works:
     Attributes
     ----------
     external, heat : float
-        Work [J] of handles, springs and loads without a potential, and of material damping.
+        Work [J] of handles, springs and loads without a potential, and of what damps.
     moving : float
         By how much the energy [J] of this rank's terms with moving targets is more than before the step.
     damping : (m,)
@@ -162,6 +162,7 @@ class Ledger:
             damping = parts["damping"].take(self._at)
         damped = float(local[1])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
+        local[1] += system.damped.heat if system.damped else 0.0
         del parts, external, moved  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
@@ -183,6 +184,8 @@ class Ledger:
         system = self._system
         self._at = system.prescribed.at
         self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
+        if system.damped:
+            self._reactions += system.damped.held
         del parts["inertia"]  # what follows needs the room
         external = np.negative(parts["loads"], out=parts.pop("loads"))
         system.prescribed.put(external, external.take(self._at) + self._reactions)
@@ -244,13 +247,16 @@ class Ledger:
 
     def obstacle_forces(self, count: int) -> Array:
         """Force [N] of the sheets on each of a scene's ``count`` obstacles, and its torque [N m] about the
-        origin, (count, 6), at the end of the last step; collective.
+        origin, (count, 6), at the end of the last step, and of dashpots in it; collective.
         """
         system, total = self._system, np.zeros((count, 6))
         for term in system.active.elastic:
             found = term.obstacle_forces(system.x, system.active.frozen[term], count)
             if found is not None:
                 total += found
+        if damped := system.damped:
+            torque = np.cross(damped.at, damped.force)
+            np.add.at(total, damped.obstacle, np.column_stack([damped.force, torque]))
         system.points.comm.Allreduce(MPI.IN_PLACE, total)
         return total
 

@@ -215,7 +215,8 @@ class EnergyGuard:
     def _of_targets(self, x0: Array, x1: Array) -> tuple[float, float, float, float]:
         """Of this rank's terms with targets [J]: change of energy, what of it the targets' motion did, and
         the energy of springs at both ends."""
-        system, rise, work, springs = self._system, 0.0, 0.0, [0.0, 0.0]
+        system, rise, springs = self._system, 0.0, [0.0, 0.0]
+        work = system.damped.work if system.damped else 0.0
         for term in system.active.pushing:
             for x, time in ((x0, system.t0), (x1, system.t1)):
                 work += 0.5 * term.work(x, time, system.t0, system.t1)
@@ -272,6 +273,8 @@ class EnergyGuard:
         for load in self._weights:
             load.add_force(x1, system.t0, system.t1, weight)
         force += 0.5 * targets[:n].take(at) - weight[:n].take(at) + works.damping
+        if system.damped:
+            force += system.damped.held
         return float(np.vdot(force, way))
 
     @property

@@ -1,4 +1,11 @@
-"""Impacts under integrators of second order: what they do to velocities at the end of a step.
+"""Impacts: what is done to velocities at the end of a step where something touches.
+
+**All integrators**: the barrier is no spring to bounce on. `damp_impacts` damps the rates at which distances
+in contact change by dashpots of half the critical damping of barrier and mass, along the lines between
+nearest points. What meets parts with about a sixth of its speed, whatever Δt is, and comes to rest within a
+few periods of the barrier; what lies, slides or rolls at the same distance is not damped. (Without it sheets
+bounce for long under backward Euler with short steps, and with any under integrators of second order; and
+what bounces slides on where it should stand, as its normal force is too small every other moment.)
 
 **The midpoint rule**: what contact would add to the energy is taken from the velocities. The rule works with
 the forces at its stage, and a barrier that stiffens within a step stores less energy than they take, or gives
@@ -10,18 +17,12 @@ is summed up, negative no farther than what contact has stored, as only that com
 taken from the kinetic energy by impulses between the pairs in contact, in proportion to their normal forces
 and along the lines between their nearest points at the end of the step, so that momentum and angular momentum
 stay as they are. (Energy by projection: Hairer, Lubich & Wanner, Geometric Numerical Integration, sec. IV.4.)
-
-**All of them**: they hardly damp how a sheet bounces on the barrier, and one that bounces slides on where it
-should stand, as its normal force is too small every other moment. `damp_bounces` damps the rates at which
-distances in contact change, along the lines between nearest points. A bounce of angular frequency ω loses
-about (ω Δt)³/2 of its velocity in a step, so that the order stays. Where distances change by much of the gap
-in a step that is an impact, and what meets bounces.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,33 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.term import Elastic
+
+DAMPING = 0.5
+"""Of the distances in contact, over the critical one."""
+
+
+class Damped(NamedTuple):
+    """What dashpots did in a step, on this rank.
+
+    Attributes
+    ----------
+    felt : (n_owned,)
+        Mean forces [N] on vertices that meet something.
+    held : (m,)
+        What handles must hold against [N], at the prescribed unknowns.
+    work, heat : float
+        What obstacles did by them [J], and what became heat.
+    obstacle, at, force : (m,), (m, 3), (m, 3)
+        Obstacles, where they are pushed [m], and the mean force on them [N].
+    """
+
+    felt: Array
+    held: Array
+    work: float
+    heat: float
+    obstacle: Ints
+    at: Array
+    force: Array
 
 
 def surplus(system: StageEquations, before: float, x_before: Array, surplus_before: float) -> float:
@@ -99,29 +127,31 @@ def _vertices_of(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Int
     """Local rows (m,) of the vertices that pairs are of, or of those of edges and of points of obstacles the
     vertex with the least global number that a nearest point is on or beside.
     """
-    number = np.where((points >= 0) & (beta != 0.0), layout.global_number[points], np.iinfo(np.int64).max)
+    number = np.where(
+        (points >= 0) & (beta != 0.0), layout.global_number[np.maximum(points, 0)], np.iinfo(np.int64).max
+    )
     found: Ints = points[np.arange(len(points)), number.argmin(axis=1)]
     return np.where(vertex >= 0, vertex, found)
 
 
-def damp_bounces(system: StageEquations) -> Array:
+def damp_impacts(system: StageEquations) -> Damped:
     """Damp the rates at which distances in contact change; collective.
 
-    Returns the mean forces (n_owned,) [N] of that in the step on vertices that meet something.
-
-    Impulses −w n·u of a pair with the rate n·u, w/m = s³/(2 + s³), s² = Δt² b″/m. As Σ_e w_e a_e a_eᵀ is not
-    beyond the mass matrix for m the least over the pair's vertices of mass over Σ_e |β_ei| Σ_j |β_ej|, with
-    all pairs e, no impulse is too large, however many pairs a vertex has.
+    Impulses −w r of a pair with the rate r, w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m), which is a dashpot's in Δt
+    and keeps second order. As Σ_e w_e a_e a_eᵀ is not beyond the mass matrix for m the least over the pair's
+    vertices of mass over Σ_e |β_ei| Σ_j |β_ej|, with all pairs e, no impulse is too large, however many pairs
+    a vertex has.
     """
     layout, free = system.points, system.prescribed.free
     n, dt, felt = layout.n_owned, system.dt, np.zeros(layout.n_owned)
     pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.largest(sum(len(points) for points, *_ in pairs))):
-        return felt
+        held = np.zeros(len(system.prescribed.at))
+        return Damped(felt, held, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3)))
     every = tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
     mine = _vertices_of(layout, every[0], every[1], every[4]) < n
-    points, beta, normal, stiffness, vertex, slow = (part[mine] for part in every)
+    points, beta, normal, stiffness, vertex, obstacle, pushed = (part[mine] for part in every)
     sheet = points >= 0
     rows, beta = np.where(sheet, points, 0), np.where(sheet, beta, 0.0)
     shared = np.zeros_like(system.x)
@@ -132,13 +162,20 @@ def damp_bounces(system: StageEquations) -> Array:
     inverse[:n] = np.divide(shared[:n, :1], mass, out=np.zeros_like(shared[:n]), where=free)
     layout.update_ghosts(inverse)
     least = np.where(beta != 0.0, inverse[rows].max(axis=2), 0.0).max(axis=1, initial=0.0)
-    rate = np.einsum("ei,eik,ek->e", beta, system.v[rows], normal)
-    part = np.sqrt(dt**2 * stiffness * least)
-    weight = part * dt**2 * stiffness / (2.0 + part**3) / (1.0 + (rate * dt / slow) ** 4)
-    impulse, push = np.zeros_like(system.x), -weight * rate
-    _add_along(rows, beta, normal, push, impulse)
+    rate = np.einsum("ei,eik,ek->e", beta, system.v[rows], normal) - pushed / dt
+    part = -np.expm1(-2.0 * DAMPING * dt * np.sqrt(stiffness * least))
+    push = -np.divide(part, least, out=np.zeros_like(part), where=least > 0.0) * rate
+    _add_along(rows, beta, normal, push, impulse := np.zeros_like(system.x))
     layout.add_to_owners(impulse)
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
+    work = float(push @ pushed) / dt
+    # what is held goes on, against its part of the impulses; what is not loses or gains
+    heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
+    system.integrator.take_jump(change)
     np.add.at(felt, vertex[vertex >= 0], push[vertex >= 0] / dt)
-    return felt
+    on, side = obstacle >= 0, beta.sum(axis=1)
+    at = np.einsum("ei,eik->ek", beta[on], system.x[rows[on]]) / side[on, None]
+    force = -(push * side / dt)[on, None] * normal[on]
+    held = -impulse[:n].take(system.prescribed.at) / dt
+    return Damped(felt, held, work, heat, obstacle[on], at, force)

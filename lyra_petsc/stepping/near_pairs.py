@@ -16,7 +16,7 @@ from lyra_petsc.terms.term import Elastic
 TOUCHING = 2e-9
 """Gap over the skin of a search up to which there is none."""
 
-TIGHT = 2e-2
+TIGHT = 3e-2
 """The same, up to which next to nothing is left."""
 
 

@@ -42,6 +42,7 @@ from lyra_petsc.terms.remembered import Remembered
 from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
+    from lyra_petsc.stepping.impacts import Damped
     from lyra_petsc.terms.one_sided import Springs
 
 
@@ -165,6 +166,7 @@ class StageEquations:
         self._leaps = False
         self._uncorrected: Array | None = None
         self._last_parts: dict[str, Array] = {}
+        self.damped: Damped | None = None
 
     @property
     def points(self) -> Layout:
@@ -355,7 +357,7 @@ class StageEquations:
         if given:
             self.prescribed.overwrite_with_rates(rate)
         self.state.set(moved, rate)
-        if self.active.limiting and self.integrator.order > 1:
+        if self.active.limiting and self.integrator.moves:
             from lyra_petsc.stepping import impacts  # of no use elsewhere
 
             if self.watches_impacts:
@@ -363,10 +365,9 @@ class StageEquations:
                 self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
             rubbing = [term for term in self.active.near if term.slips]
             acted = impacts.normal_forces(self) if rubbing else np.zeros(n)
-            if not self.active.pushing:
-                acted += impacts.damp_bounces(self)
+            self.damped = impacts.damp_impacts(self)
             for term in rubbing:
-                term.take_normal_forces(acted)
+                term.take_normal_forces(acted + self.damped.felt)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
@@ -468,7 +469,8 @@ class StageEquations:
     def pushed(self) -> float:
         """Work [J] in the step of what pushes this rank's elements, by its forces at the stage."""
         at = self.t0 + self.stage.after if self.integrator.moves else self.t1
-        return sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
+        work = sum(term.work(self._xs, at, self.t0, self.t1) for term in self.active.pushing)
+        return work + (self.damped.work if self.damped else 0.0)
 
     def turn_targets_to_end(self) -> float:
         """Let moving targets stand where the step ends; energy [J] that this gives this rank's terms."""

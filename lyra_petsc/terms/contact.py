@@ -56,9 +56,6 @@ each other are held by pairs of vertices and triangles, two for a vertex; edges,
 what these do not. On obstacles' triangles a sheet's vertices lie, alike wherever the edges of these are.
 """
 
-RESTS = 0.1
-"""Part of the gap up to which the way of a pair in a step is that of what comes to rest, not of an impact."""
-
 SHARP = 0.5
 """Angle [rad] between triangles of an obstacle above which the edge between them is felt as they are."""
 
@@ -100,14 +97,15 @@ class Places(NamedTuple):
     ----------
     before, now, after : (m, 3)
         At the start of a step, at its stage and at its end.
-    moved : list of (3, 3) and (3,)
-        Rotation and translation [m] of each obstacle up to the stage.
+    moved, moved_on : list of (3, 3) and (3,)
+        Rotation and translation [m] of each obstacle up to the stage, and to the end.
     """
 
     before: Array
     now: Array
     after: Array
     moved: list[tuple[Array, Array]]
+    moved_on: list[tuple[Array, Array]]
 
 
 class Meeting(NamedTuple):
@@ -321,13 +319,15 @@ class ContactBarrier(Elastic):
     def freeze(self, step: UpcomingStep) -> Places:
         if not self.moving:
             before, now, after = self._places
-            return Places(before, now, after, self.obstacles.moved(step.start, step.at))
+            moved = self.obstacles.moved(step.start, step.at)
+            return Places(before, now, after, moved, moved)
         before, now, after = (self.obstacles.at(time) for time in (step.start, step.at, step.end))
         self._swept = np.stack([before, now, after])
         moved = np.linalg.norm(self._swept - self._places, axis=-1).max(initial=0.0)
         self.stale = bool(moved > 0.5 * self.skin or (moved > 0.0 and len(self.obstacles.planes) > 0))
         self._bulge = self.obstacles.bulges(step.start, step.end)
-        return Places(before, now, after, self.obstacles.moved(step.start, step.at))
+        ways = (self.obstacles.moved(step.start, time) for time in (step.at, step.end))
+        return Places(before, now, after, *ways)
 
     @property
     def moving(self) -> bool:
@@ -679,14 +679,22 @@ class ContactBarrier(Elastic):
         beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
         return self.points[at], beta, normal, force, self.vertex_of(at)
 
-    def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Array]:
+    def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Ints, Array]:
         met = self.meeting(x, frozen.after)
         square = np.sum(met.felt[:, :3] ** 2, axis=1)
         of = np.flatnonzero((met.weight > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
-        at, square = met.at[of], square[of]
+        at, square, beta = met.at[of], square[of], met.beta[of]
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]
         stiffness = met.weight[of] * met.felt[of, 4] * square
-        return self.points[at], met.beta[of], normal, stiffness, self.vertex_of(at), RESTS * self.gap[at]
+        points, obstacle, pushed = self.points[at], self.obstacle[at], np.zeros(len(at))
+        for number, (turn, way) in enumerate(frozen.moved_on if self.moving else []):
+            mine = np.flatnonzero(obstacle == number)
+            part = np.where(points[mine] >= 0, beta[mine], 0.0)
+            side = part.sum(axis=1, keepdims=True)
+            foot = np.einsum("ei,eik->ek", part, x[np.maximum(points[mine], 0)]) / side
+            moved = foot - (foot - way) @ turn  # where it is now, less where it was
+            pushed[mine] = np.einsum("ek,ek->e", side * moved, normal[mine])
+        return points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this

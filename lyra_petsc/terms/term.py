@@ -371,12 +371,12 @@ class Elastic(Term):
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
-    def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints, Array]:
+    def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints, Ints, Array]:
         """The same where repulsion stiffens at the end of the step, of pairs that other ranks count, too;
-        with its second derivative b″ (m,) [N/m] instead of the force, and how far pairs that rest go in a
-        step at most (m,) [m].
+        with its second derivative b″ (m,) [N/m] instead of the force, the obstacle (m,), −1 between sheets,
+        and by how much its motion in the step brought it nearer (m,) [m].
         """
-        return *self.touching_points(x, frozen), np.empty(0)
+        return *self.touching_points(x, frozen), np.empty(0, dtype=np.int64), np.empty(0)
 
     def carried(self, x: Array, way: Array, frozen: Any) -> Array:
         """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""

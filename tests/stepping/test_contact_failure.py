@@ -84,7 +84,7 @@ def test_what_moves_does_work(comm: MPI.Comm) -> None:
         take_all_steps(simulation)
         budget = simulation.budget
         assert budget.potential == pytest.approx(0.2 * 9.81 * 0.01, rel=0.2)
-        lost.append(budget.external_work - (budget.total - before))
+        lost.append(budget.external_work - (budget.total - before) - budget.dissipation)
         simulation.destroy()
     # what backward Euler loses while the sheet swings on the barrier
     assert 0.0 < 2.0 * lost[1] < lost[0]
@@ -126,7 +126,7 @@ def test_what_comes_fast_takes_the_sheet_along(comm: MPI.Comm, integrator: str) 
     budget = simulation.budget
     assert 0.2 * 0.5 * 0.2 * speed**2 < budget.external_work < 4.0 * 0.5 * 0.2 * speed**2
     if integrator == "midpoint":
-        assert budget.total == pytest.approx(budget.external_work, rel=0.02)
+        assert budget.total + budget.dissipation == pytest.approx(budget.external_work, rel=0.02)
     middle = simulation.problem.system.x[:, 2].max(initial=-1.0)
     assert comm.allreduce(middle, MPI.MAX) > 0.3 + speed * 4 * step
     simulation.destroy()
@@ -143,9 +143,9 @@ def test_impacts_add_little_energy_under_the_midpoint_rule(comm: MPI.Comm) -> No
     start, most = simulation.budget.total, 0.0
     while not simulation.finished:
         simulation.step()
-        most = max(most, simulation.budget.total)
+        most = max(most, simulation.budget.total + simulation.budget.dissipation)
     assert most < 1.01 * start
-    assert simulation.budget.total > 0.5 * start
+    assert simulation.budget.total + simulation.budget.dissipation > 0.9 * start
     simulation.destroy()
 
 
@@ -158,7 +158,7 @@ ON_A_TABLE: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(("integrator", "step"), [("bdf2", 0.001), ("alpha2", 0.01), ("midpoint", 0.005)])
+@pytest.mark.parametrize(("integrator", "step"), [("bdf2", 0.001), ("alpha2", 0.02), ("midpoint", 0.005)])
 def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) -> None:
     """What these remember of a motion does not hold over an impact; there backward Euler takes over."""
     time = {"end": 0.04, "step": step, "integrator": integrator}
@@ -166,10 +166,11 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str, step: float) ->
     start, most = simulation.budget.total, 0.0
     while not simulation.finished:
         simulation.step()
-        most = max(most, simulation.budget.total)
+        most = max(most, simulation.budget.total + simulation.budget.dissipation)
         assert simulation.problem.system.integrator.name == integrator
     assert most < 1.005 * start
-    assert simulation.budget.total > 0.6 * start
+    assert simulation.budget.total + simulation.budget.dissipation > 0.8 * start
+    assert simulation.budget.total == pytest.approx(0.31 * start, rel=0.03)  # whatever the integrator
     assert any("backward Euler" in note for note in simulation.notes) == (integrator == "alpha2")
     simulation.destroy()
 

@@ -55,4 +55,4 @@ def test_what_meets_in_a_step_is_found_in_few_iterations(
     assert np.linalg.norm(x - [0.0, 0.0, -0.31], axis=1).min() > 0.3
     monkeypatch.setattr(ContactModel, "improve", lambda *_: False)
     _, before = steps(comm)  # some of these may be repeated, and lead less far
-    assert sum(newton) < 0.7 * sum(before)
+    assert sum(newton) < 0.9 * sum(before)

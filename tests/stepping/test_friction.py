@@ -170,7 +170,7 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integ
     scene = scene_of(
         {
             "mesh": [lower, upper],
-            "material": CLOTH | {"bending": 1e-4, "damping": 0.01, "density": 200.0},
+            "material": CLOTH | {"bending": 1e-4, "damping": 0.01, "density": 400.0},
             "gravity": [0.0, 0.0, -G],
             "contact": {"gap": GAP, "friction": 1.2 * math.tan(SLOPE)},
             "obstacles": {"slope": {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}},

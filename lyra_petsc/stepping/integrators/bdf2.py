@@ -100,6 +100,13 @@ class Bdf2(Integrator):
     def shift_past(self, change: Array) -> None:
         self._past = [(x + change, v, dt) for x, v, dt in self._past]
 
+    def take_jump(self, change: Array) -> None:
+        past, ago = [], 0.0
+        for x, v, dt in self._past:
+            ago += dt
+            past.append((x - ago * change, v + change, dt))
+        self._past = past
+
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         arrays: Arrays = {}
         numbers: dict[str, float] = {}

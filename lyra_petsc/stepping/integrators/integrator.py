@@ -80,6 +80,9 @@ class NoHistory:
     def shift_past(self, change: Array) -> None:
         """Add ``change`` (n_owned, 3) [m] to remembered positions, as their reference is another."""
 
+    def take_jump(self, change: Array) -> None:
+        """Go on as if velocities had been other by ``change`` (n_owned, 3) [m/s] before the state, too."""
+
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
         return {}, {}
