@@ -14,7 +14,6 @@ from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet,
 from peers import write_files, write_scene
 from processes import Failed, Limits, run
 from tables import (
-    COLUMNS,
     against_table,
     bending_table,
     document,
@@ -143,7 +142,10 @@ def test_markdown_shows_them(measured):
         assert {len(line) for line in lines} == {len(lines[0])}
         assert all(cell for line in lines for cell in line)
     rows, meshes, weak, apart, presets, single = tables_of(text)
-    assert tuple(rows[0]) == COLUMNS
+    assert rows[0][:7] == [
+        "vertices", "who", "ranks", "ms a step", "CPU ms", "times the first", "residual ms"
+    ]  # fmt: skip
+    assert len(rows[0]) == 22
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
     assert rows[1][5] == "1.00"
     assert [line[1] for line in meshes[1:]] == list(MESHES)
