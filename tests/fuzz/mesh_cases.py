@@ -7,6 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
+from odd_values import listed
 from text_damage import damaged
 
 SCENE = """\
@@ -21,42 +22,9 @@ TRIANGLES = [(1, 2, 5), (2, 3, 5), (3, 4, 5), (4, 1, 5)]
 EDGES = [(1, 2), (2, 3)]
 NAMES = '$PhysicalNames\n2\n1 7 "edge"\n2 3 "sheet"\n$EndPhysicalNames\n'
 
-INTEGERS = [
-    0,
-    -1,
-    1,
-    2,
-    3,
-    6,
-    15,
-    99,
-    255,
-    2**15,
-    2**31 - 1,
-    -(2**31),
-    2**31,
-    2**32,
-    2**53,
-    2**62,
-    2**63 - 1,
-    2**63,
-]
-REALS = [
-    "nan",
-    "inf",
-    "-inf",
-    "1e308",
-    "-1e308",
-    "1e309",
-    "5e-324",
-    "1e-160",
-    "0",
-    "-0.0",
-    "1e16",
-    "abc",
-    "1,5",
-    "0x1p3",
-]
+POWERS = (15, 31, 32, 53, 62, 63)
+INTEGERS = [0, -1, 1, 2, 3, 6, 15, 99, 255, *(2**k for k in POWERS), 2**31 - 1, 2**63 - 1, -(2**31)]
+REALS = listed("nan inf -inf 1e308 -1e308 1e309 5e-324 1e-160 0 -0.0 1e16 abc 1,5 0x1p3")
 
 Draw = Any
 
