@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.near import near, near_in_order, swept_boxes
-
-Array = NDArray[np.float64]
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,

@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
+from lyra_petsc.arrays import Array
 from lyra_petsc.cli.check_run import RunCrossings
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.scene.load import load_scene
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel
 

@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import grid
 
 import lyra_petsc
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 STEP = 2e-4
 """Relative change of a number to both sides."""
