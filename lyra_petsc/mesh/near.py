@@ -37,16 +37,6 @@ def swept_boxes(x: Array, way: Array, simplices: Ints) -> tuple[Array, Array]:
 
 
 @cached()
-def _common(corners, other):  # type: ignore[no-untyped-def]
-    """Whether two simplices (n,) and (m,) have a vertex in common."""
-    for i in range(len(corners)):
-        for j in range(len(other)):
-            if corners[i] == other[j]:
-                return True
-    return False
-
-
-@cached()
 def _of_boxes(low, high, origin, size, n):  # type: ignore[no-untyped-def]
     """The first and the last cell (k, 2, 3) that boxes reach into."""
     out = np.empty((len(low), 2, 3), np.int32)
@@ -73,7 +63,7 @@ def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]  # fmt: skip
+def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
     """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
 
     The others, low and high corners (2, k, 3), stand in cells of a grid: ``first`` (cells + 1,) and
@@ -98,7 +88,7 @@ def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells,
                         for m in range(3):
                             apart = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
                             left -= apart * apart
-                        if left < 0.0 or _common(corners[a], other_corners[b]):
+                        if left < 0.0:
                             continue
                         if found < len(out):
                             out[found, 0], out[found, 1] = a, b
@@ -107,12 +97,7 @@ def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells,
 
 
 def near(
-    boxes: tuple[Array, Array],
-    others: tuple[Array, Array] | None = None,
-    *,
-    reach: float = 0.0,
-    corners: Ints | None = None,
-    other_corners: Ints | None = None,
+    boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, reach: float = 0.0
 ) -> Ints:
     """Pairs (m, 2) of boxes and other ones that are not farther from each other than ``reach`` [m].
 
@@ -120,17 +105,12 @@ def near(
     ----------
     boxes, others : pairs of (n, 3), (k, 3)
         Their low and high corners [m]. Without others the boxes themselves; the lesser number is first.
-    corners, other_corners : (n, i), (k, j)
-        Numbers of which those of a pair have none in common.
     """
     same = others is None
     low, high = boxes
     other_low, other_high = boxes if others is None else others
     if not len(low) or not len(other_low):
         return np.empty((0, 2), dtype=np.int64)
-    mine = np.empty((len(low), 0), dtype=np.int64) if corners is None else corners
-    theirs = np.empty((len(other_low), 0), dtype=np.int64) if other_corners is None else other_corners
-    theirs = mine if same else theirs
     origin, end = other_low.min(axis=0), other_high.max(axis=0)
     extent = np.maximum(end - origin, 1e-300)
     size = np.maximum((other_high - other_low).mean(axis=0) + reach, extent * 1e-6)
@@ -149,7 +129,7 @@ def near(
     _sort(other_cells, n, at, items, True)
     out = np.empty((4 * len(low) + 64, 2), dtype=np.int64)
     stacked = np.stack([other_low, other_high])
-    given = low, high, mine, stacked, theirs, reach, cells, other_cells, n, same, first, items
+    given = low, high, stacked, reach, cells, other_cells, n, same, first, items
     found = _pairs(*given, out)
     if found > len(out):
         out = np.empty((found, 2), dtype=np.int64)
