@@ -93,11 +93,7 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
 
 def gathered(layout: Layout, owned: Array) -> Array:
     """Rows of the owned vertices (n_vertices or more, …) in mesh order, on every rank; collective."""
-    pieces = layout.comm.allgather((layout.original, np.array(owned[: layout.n_vertices])))
-    out = np.empty((layout.n_vertices_global, *owned.shape[1:]))
-    for original, rows in pieces:
-        out[original] = rows
-    return out
+    return layout.gathered(owned)
 
 
 class Simulation:

@@ -92,12 +92,7 @@ class Trial:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
-        points = self.simulation.problem.points
-        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_vertices])))
-        out = np.empty((points.n_vertices_global, *owned.shape[1:]))
-        for original, rows in pieces:
-            out[original] = rows
-        return out
+        return self.simulation.problem.points.gathered(owned)
 
     @property
     def x(self) -> Array:

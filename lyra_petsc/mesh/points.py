@@ -209,6 +209,16 @@ class Layout(Points):
         rows.ravel()[self.edge_places] = edges
         return rows
 
+    def gathered(self, owned: Array) -> Array:
+        """Rows of the owned vertices (n_vertices or more, …) in the mesh's order (V, …), on every rank;
+        collective.
+        """
+        pieces = self.comm.allgather((self.original, np.array(owned[: self.n_vertices])))
+        out = np.empty((self.n_vertices_global, *owned.shape[1:]))
+        for original, rows in pieces:
+            out[original] = rows
+        return out
+
     def in_mesh(self) -> Ints:
         """Position among the mesh's vertices of each local one, (n_local,), ghosts too; 0 of edges;
         collective.
