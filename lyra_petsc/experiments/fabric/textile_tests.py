@@ -44,7 +44,7 @@ from lyra_petsc.experiments.fabric.records import (
     restore,
 )
 from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rounded
 from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
@@ -517,8 +517,7 @@ PIXELS = 240
 def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
     """A disc of radius 1, a square of irregular cells mapped smoothly: no direction has more folds for it."""
     flat, faces = irregular_rectangle(cells, cells, 2.0, 2.0, seed)
-    i, j = flat[:, 0] - 1.0, flat[:, 1] - 1.0
-    return np.column_stack([i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2), 0.0 * i]), faces
+    return rounded(flat - [1.0, 1.0, 0.0]), faces
 
 
 def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
