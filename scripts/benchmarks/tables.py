@@ -7,8 +7,9 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import numpy as np
 from cases import BENDING_MODELS, METHODS
+
+from lyra_petsc.show.report.plots import fitted_slope
 
 Result = dict[str, Any]
 
@@ -245,11 +246,7 @@ def against_table(results: Sequence[Result]) -> list[str]:
 
 def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
     """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
-    x = np.log([row["vertices"] for row in rows])
-    y = np.log([cost(row) for row in rows])
-    if len(np.unique(x)) < 2 or not np.isfinite(y).all():
-        return math.nan
-    return float(np.polyfit(x, y, 1)[0])
+    return fitted_slope([row["vertices"] for row in rows], [cost(row) for row in rows])
 
 
 def growth(rows: Sequence[Result]) -> Result:

@@ -208,8 +208,7 @@ def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]
     for panel, label in zip(axes, labels, strict=True):
         panel.set_ylabel(label)
         panel.grid(True, color="#dfe3e8", lw=0.8)
-        for side in ("top", "right"):
-            panel.spines[side].set_visible(False)
+        panel.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("load factor" if facts.static else "time [s]")
     return figure, axes
 
