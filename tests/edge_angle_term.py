@@ -77,8 +77,7 @@ class EdgeAngle(Elastic):
         out[:, 12, 12] = (FIRST + SECOND) * k / length**2
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = (FIRST + SECOND) * self.elements.data["k"] * size / self.elements.data["height"] ** 2
-        return scale
+        return (FIRST + SECOND) * self.elements.data["k"] * size / self.elements.data["height"] ** 2
 
 
 def elements(rest: RestShape) -> Elements:

@@ -43,8 +43,7 @@ REFERENCE = Path(__file__).parent / "reference"
 
 def reference(name: str) -> dict[str, Any]:
     """A file of ``tests/reference``."""
-    content: dict[str, Any] = json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
-    return content
+    return json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def scene_of(content: dict[str, Any]) -> Scene:

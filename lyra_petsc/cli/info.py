@@ -137,8 +137,7 @@ def info(comm: Any) -> str:
         else ["All fits together."]
     )
     # what rank 0 found counts: h5py and the libraries are the same files on every rank
-    shared: str = comm.bcast("\n".join(text), root=0)
-    return shared
+    return comm.bcast("\n".join(text), root=0)
 
 
 def launched_ranks(environment: Mapping[str, str]) -> int:

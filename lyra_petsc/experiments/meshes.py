@@ -68,8 +68,7 @@ def _halved(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
     other = flipped[:, None]
     first = np.where(other, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
     second = np.where(other, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
-    halves: Ints = np.concatenate([first, second])
-    return halves
+    return np.concatenate([first, second])
 
 
 def rounded(flat: Array) -> Array:

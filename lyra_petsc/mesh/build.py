@@ -448,5 +448,4 @@ def _rotation_matrix(rotation: Rotation) -> Array:
         cosine, sine = math.cos(math.radians(rotation.degrees)), math.sin(math.radians(rotation.degrees))
     x, y, z = direction
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix: Array = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)
-    return matrix
+    return cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)

@@ -283,8 +283,7 @@ def one(values: Values, width: Width = "int") -> int:
 
 def several(values: Values, n: int, width: Width = "int") -> list[int]:
     """The next ``n`` whole numbers."""
-    found: list[int] = values.rows(n, 1, width=width)[0][:, 0].tolist()
-    return found
+    return values.rows(n, 1, width=width)[0][:, 0].tolist()
 
 
 def _whole(table: Array) -> Ints:

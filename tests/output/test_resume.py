@@ -85,8 +85,7 @@ def journey(
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return content
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 
 def last(folder: Path) -> tuple[int, float]:

@@ -189,8 +189,7 @@ def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Arr
         changes = {key: value * (1.0 + factor * step) for key, value in direction.items()}
         return end(scene.changed(changes))
 
-    slope: Array = (at(1.0) - at(-1.0)) / (2.0 * step)
-    return slope
+    return (at(1.0) - at(-1.0)) / (2.0 * step)
 
 
 @pytest.mark.slow

@@ -104,8 +104,7 @@ class Places(Reading):
     def means(self, total: Array) -> Array:
         """Mean positions (n, 3) [m]."""
         sums = total.reshape(-1, 4)
-        means: Array = sums[:, :3] / sums[:, 3:]
-        return means
+        return sums[:, :3] / sums[:, 3:]
 
     def values(self, total: Array) -> Array:
         means = self.means(total)

@@ -188,5 +188,4 @@ def _camera(scene: Scene) -> Camera:
 
 def _unit(vector: Array) -> Array:
     scaled = vector / np.abs(vector).max()
-    unit: Array = scaled / np.linalg.norm(scaled)
-    return unit
+    return scaled / np.linalg.norm(scaled)

@@ -119,8 +119,7 @@ class Stiffness:
         size = len(self.held)
         full = np.zeros((size, size))
         full[self.rows, self.columns] = self.values
-        free: Array = full[np.ix_(~self.held, ~self.held)]
-        return free
+        return full[np.ix_(~self.held, ~self.held)]
 
     def solve(self, force: Array) -> Array:
         """Heights [m] (V,) under forces [N] (V,), by a direct solve on every rank."""
@@ -257,8 +256,7 @@ def _relaxed(
     if not relaxed:
         return form[:size, :size]
     coupling, periodic = form[:size, size:], form[size:, size:]
-    energy: Array = form[:size, :size] - coupling @ np.linalg.pinv(periodic, rcond=1e-9) @ coupling.T
-    return energy
+    return form[:size, :size] - coupling @ np.linalg.pinv(periodic, rcond=1e-9) @ coupling.T
 
 
 PATTERNS = ("diagonal", "alternating", "criss-cross")
