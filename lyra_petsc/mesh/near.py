@@ -12,7 +12,7 @@ MOST_CELLS = 1 << 22
 
 @cached()
 def _cell(place, origin, size, n):  # type: ignore[no-untyped-def]
-    """Which of n cells a coordinate is in, or nearest to."""
+    """The number of the cell that holds a coordinate, or of the nearest one of n."""
     # of a plane that is one but for rounding, farther cells than whole numbers can count
     return int(min(max((place - origin) / size, 0.0), n - 1.0))
 
@@ -64,7 +64,7 @@ def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
 
 @cached()
 def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
-    """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
+    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
 
     The others, low and high corners (2, k, 3), stand in cells of a grid: ``first`` (cells + 1,) and
     ``items``. A pair is found in the first cell that both have.
@@ -99,7 +99,7 @@ def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, 
 def near(
     boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, reach: float = 0.0
 ) -> Ints:
-    """Pairs (m, 2) of boxes and other ones that are not farther from each other than ``reach`` [m].
+    """Pairs (m, 2) of boxes and other boxes at most ``reach`` [m] apart.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def near(
 
 @cached()
 def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
-    """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
+    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
 
     ``tree`` (2 k, 2, 3), k a power of 2 from len(low) on, takes boxes around pairs of boxes, pairs of these …
     """
@@ -178,8 +178,9 @@ def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
 
 
 def near_in_order(low: Array, high: Array, reach: float) -> Ints:
-    """Pairs (m, 2) of boxes, given by their corners (n, 3) [m], that are not farther from each other than
-    ``reach`` [m], the lesser number first; fast where those next to each other in the order mostly are.
+    """Pairs (m, 2) of boxes with corners (n, 3) [m] at most ``reach`` [m] apart, the lesser number first.
+
+    Fast where boxes with neighbouring numbers are neighbours in space.
     """
     tree = np.empty((2 << max(len(low) - 1, 0).bit_length(), 2, 3))
     out = np.empty((8 * len(low), 2), dtype=np.int64)
