@@ -64,7 +64,7 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
 
 
 def petsc_cannot_start(words: Sequence[str]) -> str:
-    """Why PETSc would fail or crash while it reads these options, PETSC_OPTIONS and its files; or nothing."""
+    """Why PETSc would fail or crash as it reads these options, PETSC_OPTIONS and option files; else empty."""
     every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
     files = [] if "-skip_petscrc" in every else [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
     for path in filter(os.path.isfile, files):
@@ -75,7 +75,7 @@ def petsc_cannot_start(words: Sequence[str]) -> str:
 
 
 def _cannot_start(every: Sequence[str], files: list[str]) -> str:
-    """Why PETSc would not start with these options, in the last of ``files`` that include one another."""
+    """Why PETSc would not start with these options; ``files`` are those whose inclusion led here."""
     for option, value in itertools.pairwise([*every, ""]):
         if not option.startswith("-"):
             continue
