@@ -81,16 +81,7 @@ def _source(name: str) -> str:
     return f"pip install {name}"
 
 
-EXTERNAL = (
-    "ptscotch",
-    "parmetis",
-    "hypre",
-    "ml",
-    "mumps",
-    "superlu_dist",
-    "suitesparse",
-    "hdf5",
-)
+EXTERNAL = ("ptscotch", "parmetis", "hypre", "ml", "mumps", "superlu_dist", "suitesparse", "hdf5")
 """Packages PETSc may have been built with that matter here (suitesparse brings CHOLMOD)."""
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 import subprocess
 import sys
 import time
@@ -60,19 +61,7 @@ def tables_of(markdown: str) -> list[list[list[str]]]:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
-    words = [
-        "--quick",
-        "--vertices",
-        "36",
-        "--ranks",
-        "1,2",
-        "--steps",
-        "3",
-        "--seconds",
-        "0.2",
-        "--weak",
-        "50",
-    ]
+    words = shlex.split("--quick --vertices 36 --ranks 1,2 --steps 3 --seconds 0.2 --weak 50")
     peers = [
         "slow=for i in $(seq {steps}); do sleep 0.2; done",
         "idle=true",
