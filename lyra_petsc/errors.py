@@ -16,7 +16,7 @@ LONGEST_WORD = 250
 
 
 def with_short_words(text: str) -> str:
-    """``text`` with the beginnings of words that are longer than any that is meant."""
+    """``text`` with its longest words cut short."""
     return re.sub(rf"\S{{{LONGEST_WORD},}}", lambda word: word[0][:57] + "...", text)
 
 
@@ -108,7 +108,7 @@ def _words(text: str) -> str:
 
 @contextmanager
 def in_python() -> Iterator[None]:
-    """Within it errors speak of arguments, as of Python (``force=True``), not of options (``--force``)."""
+    """A context in which errors name Python's arguments (``force=True``), not options (``--force``)."""
     try:
         yield
     except LyraError as error:

@@ -29,7 +29,7 @@ def take_back_signals() -> None:
 
 
 def all_here(comm: MPI.Comm) -> bool:
-    """Whether all ranks come here within `GRACE`, each after its own failure.
+    """Whether all ranks call this within `GRACE` seconds, each after a failure of its own.
 
     If not, nothing collective may follow on this communicator.
     """

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,49 +36,36 @@ STARTS = (1.15, 0.85, 1.2, 0.9)
 CELLS = 5
 WATCHED = (7, 9, 14, 20, 21, 30, 33, 35)
 
-HANGING: dict[str, Any] = {
-    "material": {
-        "density": 0.2,
-        "membrane": {"c11": 60.0, "c22": 50.0, "c12": 10.0, "c33": 8.0},
-        "bending": 1e-3,
-        "damping": 0.05,
-    },
-    "wind": {"velocity": [0.5, 2.0, 1.0], "density": 1.2, "drag": 0.1},
-    "time": {"end": 0.4, "step": 0.05, "integrator": "bdf2"},
-}
 
+def scene(sigma: float) -> dict[str, Any]:
+    """The scene of the fits: a square held at two corners, and its block ``fit``, whose values are still 0.
 
-def hanging_cloth(
-    side: float,
-    cells: int,
-    watched: Sequence[int],
-    sought: Mapping[str, tuple[float, float]],
-    bounds: tuple[float, float],
-    sigma: float,
-    **content: Any,
-) -> dict[str, Any]:
-    """A square held at two corners, and its block ``fit``, whose values are still 0.
-
-    Vertices are ``watched`` at four or five times, every 0.1 s; ``sought`` has true values and starts over
-    them, ``bounds`` are over them, too.
+    Starts and bounds are over the true values.
     """
-    grid = {"width": side, "height": side, "nx": cells, "ny": cells, "pattern": "alternating"}
-    times = [round(0.1 * k, 1) for k in range(1, 1 + round(10.0 * content["time"]["end"]))]
-    low, high = bounds
-    return content | {
-        "mesh": {"grid": grid},
+    return {
+        "mesh": {
+            "grid": {"width": 0.5, "height": 0.5, "nx": CELLS, "ny": CELLS, "pattern": "alternating"},
+        },
+        "material": {
+            "density": 0.2,
+            "membrane": {"c11": 60.0, "c22": 50.0, "c12": 10.0, "c33": 8.0},
+            "bending": 1e-3,
+            "damping": 0.05,
+        },
         "gravity": [0.0, 0.0, -9.81],
-        "handles": [{"nodes": [0, cells]}],
-        "probes": {f"v{vertex}": {"nodes": [vertex]} for vertex in watched},
+        "wind": {"velocity": [0.5, 2.0, 1.0], "density": 1.2, "drag": 0.1},
+        "handles": [{"nodes": [0, CELLS]}],
+        "time": {"end": 0.4, "step": 0.05, "integrator": "bdf2"},
+        "probes": {f"v{vertex}": {"nodes": [vertex]} for vertex in WATCHED},
         "fit": {
             "parameters": {
-                key: {"start": factor * value, "bounds": [low * value, high * value]}
-                for key, (value, factor) in sought.items()
+                key: {"start": start * TRUE[key], "bounds": [0.05 * TRUE[key], 5.0 * TRUE[key]]}
+                for key, start in zip(TRUE, STARTS, strict=True)
             },
             "measurements": [
                 {"probe": f"v{vertex}", "at": at, "value": [0.0, 0.0, 0.0], "uncertainty": sigma}
-                for vertex in watched
-                for at in times
+                for vertex in WATCHED
+                for at in (0.1, 0.2, 0.3, 0.4)
             ],
         },
     }
@@ -90,12 +76,6 @@ def measured(model: Model, exact: NDArray[np.float64], sigma: float, seed: int) 
     lengths = np.cumsum([len(reading.parts) for reading in model.readings])[:-1]
     noise = np.random.default_rng(seed).standard_normal(len(exact))
     return np.split(exact + sigma * noise, lengths)
-
-
-def scene(sigma: float) -> dict[str, Any]:
-    """The scene of the fits."""
-    sought = {key: (value, start) for (key, value), start in zip(TRUE.items(), STARTS, strict=True)}
-    return hanging_cloth(0.5, CELLS, WATCHED, sought, (0.05, 5.0), sigma, **HANGING)
 
 
 def count(seeds: int, comm: MPI.Comm = MPI.COMM_WORLD) -> dict[str, int]:

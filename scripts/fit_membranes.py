@@ -14,14 +14,12 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.scene.materials.library import ShellMaterial, resolve
 from lyra_petsc.scene.schema import Material
 from lyra_petsc.terms.membrane_laws import measured
-
-Array = NDArray[np.float64]
 
 FILE = Path(measured.__file__).with_name("wang2011.json")
 ANGLES = np.radians([0.0, 22.5, 45.0, 67.5, 90.0])

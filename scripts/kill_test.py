@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as ElementTree
+import traceback
 from pathlib import Path
 
 os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
@@ -31,9 +31,12 @@ os.environ.setdefault("HDF5_USE_FILE_LOCKING", "FALSE")
 import h5py
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from lyra_petsc.api.mpirun import environment, find_launcher
-from lyra_petsc.output.read_run import StoredRun
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = map(str, (ROOT, ROOT / "tests" / "surviving", ROOT / "tests" / "cli"))
+from leftovers import announced, ranks_in  # noqa: E402
+
+from lyra_petsc.api.mpirun import environment, find_launcher  # noqa: E402
+from lyra_petsc.output.read_run import StoredRun  # noqa: E402
 
 PATIENCE = 20.0
 """Seconds within which the other ranks must be gone."""
@@ -88,20 +91,6 @@ def launch(arguments: list[str], folder: Path, ranks: int) -> subprocess.Popen[b
         )
 
 
-def ranks_of(folder: Path) -> list[int]:
-    """Processes of the program that work in ``folder``."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                words = (entry / "cmdline").read_bytes().split(b"\0")
-                if b"lyra_petsc" in words and b"-n" not in words and (entry / "cwd").readlink() == folder:
-                    found.append(int(entry.name))
-            except OSError:  # gone meanwhile
-                continue
-    return found
-
-
 def rows(path: Path) -> int:
     """Lines of a file; 0 if there is none."""
     try:
@@ -128,7 +117,7 @@ def wait_random_time(
 
 def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: random.Random) -> bool:
     """Kill; whether anything was still running."""
-    victims = ranks_of(folder)
+    victims = ranks_in(folder)
     if process.poll() is not None:
         return False
     if not target.startswith("launcher") and not victims:
@@ -150,9 +139,9 @@ def strike(process: subprocess.Popen[bytes], folder: Path, target: str, draw: ra
 
 def wait_until_gone(process: subprocess.Popen[bytes], folder: Path) -> None:
     deadline = time.monotonic() + PATIENCE
-    while process.poll() is None or ranks_of(folder):
+    while process.poll() is None or ranks_in(folder):
         if time.monotonic() > deadline:
-            left = ranks_of(folder)
+            left = ranks_in(folder)
             for victim in [*left, *([process.pid] if process.poll() is None else [])]:
                 os.kill(victim, signal.SIGKILL)
             raise Wrong(f"after {PATIENCE:g} s there are still ranks: {left}")
@@ -160,25 +149,16 @@ def wait_until_gone(process: subprocess.Popen[bytes], folder: Path) -> None:
 
 
 def check_announced(out: Path) -> int:
-    """Open every state that ``states.xdmf`` announces as ParaView would; their number."""
-    xdmf = out / "states.xdmf"
-    if not xdmf.exists():
+    """Read every state that ``states.xdmf`` announces as other programs would; their number."""
+    if not (out / "states.xdmf").exists():
         return 0
-    grids = ElementTree.parse(xdmf).findall(".//Grid[@GridType='Uniform']")
-    times = [float(grid.find("Time").attrib["Value"]) for grid in grids]
-    if times != sorted(set(times)):
-        raise Wrong(f"times {times}")
-    for grid in grids:
-        for item in grid.iter("DataItem"):
-            name, path = item.text.strip().split(":")
-            with h5py.File(out / name, "r") as file:
-                data = file[path]
-                if data.shape != tuple(map(int, item.attrib["Dimensions"].split())):
-                    raise Wrong(f"{name}: {path} has shape {data.shape}")
-                if not np.isfinite(data[()]).all():
-                    raise Wrong(f"{name}: {path} is not finite")
+    try:
+        times = announced(out)
+    except AssertionError:
+        traceback.print_exc()
+        raise Wrong("what states.xdmf announces is not whole") from None
     check_vtkhdf(out, times)
-    return len(grids)
+    return len(times)
 
 
 def check_vtkhdf(out: Path, times: list[float]) -> None:

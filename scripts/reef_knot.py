@@ -12,9 +12,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 FILE = Path(__file__).resolve().parent.parent / "meshes" / "reef-knot.obj"
 UNIT = 0.05  # m, of the points below

@@ -8,8 +8,8 @@ the rest length of the edge, as all unknowns are lengths.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
@@ -18,8 +18,6 @@ from lyra_petsc.terms.hinge import add_angle_hessian, angle, angle_slopes, point
 from lyra_petsc.terms.registry import REGISTRY, Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
 
 FIRST, SECOND = 3.0, 1.5
 """k₁ and k₂ over the stiffness of the hinge: 1/3 + 1/1.5 = 1."""
@@ -79,8 +77,7 @@ class EdgeAngle(Elastic):
         out[:, 12, 12] = (FIRST + SECOND) * k / length**2
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = (FIRST + SECOND) * self.elements.data["k"] * size / self.elements.data["height"] ** 2
-        return scale
+        return (FIRST + SECOND) * self.elements.data["k"] * size / self.elements.data["height"] ** 2
 
 
 def elements(rest: RestShape) -> Elements:

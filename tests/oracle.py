@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
@@ -19,7 +20,6 @@ from lyra_petsc.terms.midedge_shape import Frames, carried, fading_tangent, tang
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
 from lyra_petsc.terms.wind import Wind
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64] | NDArray[np.int32]
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.phases import Phases
@@ -22,8 +22,6 @@ from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
 
 CLOTH = {"density": 0.2, "membrane": {"c11": 1200.0, "c22": 800.0, "c12": 300.0, "c33": 250.0}}
 """The orthotropic cloth of reference A6, without bending."""
@@ -45,8 +43,7 @@ REFERENCE = Path(__file__).parent / "reference"
 
 def reference(name: str) -> dict[str, Any]:
     """A file of ``tests/reference``."""
-    content: dict[str, Any] = json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
-    return content
+    return json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def scene_of(content: dict[str, Any]) -> Scene:
@@ -95,11 +92,7 @@ def rotation(axis: Sequence[float], angle: float) -> Array:
 
 def gathered(layout: Layout, owned: Array) -> Array:
     """Rows of the owned vertices (n_vertices or more, …) in mesh order, on every rank; collective."""
-    pieces = layout.comm.allgather((layout.original, np.array(owned[: layout.n_vertices])))
-    out = np.empty((layout.n_vertices_global, *owned.shape[1:]))
-    for original, rows in pieces:
-        out[original] = rows
-    return out
+    return layout.gathered(owned)
 
 
 class Simulation:

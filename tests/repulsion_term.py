@@ -8,16 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.terms.registry import Registration, Role
 from lyra_petsc.terms.rest import RestShape
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 DISTANCE, STIFFNESS = 0.08, 4.0e3
 """d [m] and k [N/m²]."""

@@ -33,7 +33,9 @@ class Share:
 
 
 class Waiting:
-    """Compares the processor time of steps with their wall time; as MPI spins, they agree on a quiet machine.
+    """Compares the CPU time of steps with their wall time.
+
+    Waiting in MPI keeps a core busy, so that both are equal unless ranks share cores.
 
     Parameters
     ----------

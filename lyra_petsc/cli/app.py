@@ -33,7 +33,7 @@ RESERVE = 4 * 2**20
 
 
 def run_command_line(argv: Sequence[str]) -> int:
-    """Parse and run; the exit code. Starts PETSc with its part of the arguments."""
+    """Start PETSc with its part of the arguments and run the verb; returns the exit code."""
     if COMPLETION in os.environ:  # the shell asks at a press of the tab key: PETSc is not needed
         verbs.main([], prog_name=PROGRAM)
     ours, petsc = help_asked(*split(argv[1:]))
@@ -106,7 +106,7 @@ def _say(comm: Any, line: str, details: Sequence[str] = ()) -> None:
 
 
 def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()) -> int:
-    """Print why; the exit code if all ranks failed together, else end the whole job."""
+    """Print the message; returns the exit code if all ranks failed together, else ends the MPI job."""
     from lyra_petsc.parallel import all_here
 
     _say(comm, line, details)
@@ -119,7 +119,7 @@ def _leave_together(comm: Any, code: int, line: str, details: Sequence[str] = ()
 
 
 def _report_unexpected(comm: Any, error: BaseException) -> int:
-    """Print an unexpected error of this rank, perhaps of this one alone; the exit code."""
+    """Print an unexpected error, which this rank alone may have met; returns the exit code."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(frame.filename).name}:{frame.lineno}"
     what = f"{type(error).__name__}: {' '.join(str(error).split()) or 'no message'} ({where})"

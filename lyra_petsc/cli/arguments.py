@@ -64,26 +64,25 @@ def help_asked(ours: list[str], petsc: list[str]) -> tuple[list[str], list[str]]
 
 
 def petsc_cannot_start(words: Sequence[str]) -> str:
-    """Why PETSc would fail or crash while it reads these options, PETSC_OPTIONS and its files; or nothing."""
+    """Why PETSc would fail or crash as it reads these options, PETSC_OPTIONS and option files; else empty."""
     every = [*os.environ.get("PETSC_OPTIONS", "").split(), *words]
     files = [] if "-skip_petscrc" in every else [os.path.expanduser("~/.petscrc"), ".petscrc", "petscrc"]
     for path in filter(os.path.isfile, files):
-        with suppress(OSError, ValueError), open(path, encoding="utf-8") as file:
-            if why := _cannot_start(_words_of(file.read()), [os.path.realpath(path)]):
+        with suppress(OSError, ValueError):
+            if why := _cannot_start(_words_of(Path(path).read_text("utf-8")), [os.path.realpath(path)]):
                 return f"{path}: {why}"
     return _cannot_start(every, [])
 
 
 def _cannot_start(every: Sequence[str], files: list[str]) -> str:
-    """Why PETSc would not start with these options, in the last of ``files`` that include one another."""
+    """Why PETSc would not start with these options; ``files`` are those whose inclusion led here."""
     for option, value in itertools.pairwise([*every, ""]):
         if not option.startswith("-"):
             continue
         name = option.lstrip("-").lower()
         if name in ("options_file", "options_file_yaml"):
             try:
-                with open(value, encoding="utf-8") as file:
-                    text = file.read()
+                text = Path(value).read_text(encoding="utf-8")
             except (OSError, ValueError) as error:
                 why = getattr(error, "strerror", None) or "it is no text"
                 return f"-{name}: cannot read '{value}': {why}"

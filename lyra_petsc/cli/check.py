@@ -114,7 +114,7 @@ def _fences(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _contact(scene: Scene) -> list[tuple[str, str]]:
-    """What the sheets are in contact with, and the parameters; nothing without contact."""
+    """Rows of the plan about contact and obstacles; none without contact."""
     contact = scene.contact
     if contact is None:
         return []
@@ -141,12 +141,12 @@ def _friction(friction: float | Friction) -> str:
 
 
 def _count(ratio: float) -> float:
-    """Steps of which ``ratio`` make up the run; inf beyond all counting."""
+    """Whole steps in a run that is ``ratio`` steps long; inf where that overflows."""
     return math.ceil(ratio - 1e-9) if math.isfinite(ratio) else ratio
 
 
 def _rank_table(ranks: Ints) -> Table:
-    """What each rank has; ghosts are rows of vertices, and of edges three to a row."""
+    """Table of each rank's share; a ghost row is one vertex or three edges."""
     edges = ["owned edges"] if ranks[:, 5].any() else []
     heads = ["rank", "owned vertices", *edges, "ghosts", "ghost share", "blocks", "elements"]
     table = Table(*heads, box=None, header_style="")
@@ -162,7 +162,7 @@ def _rank_table(ranks: Ints) -> Table:
 
 
 def _megabytes(ranks: Ints) -> float:
-    """Matrix and preconditioner, their assembly buffers, and element constants, roughly."""
+    """Rough memory [MB] of the fullest rank: matrix, preconditioner, assembly buffers, element constants."""
     return float((ranks[:, 2] * 9 * 8 * 4 + ranks[:, 3] * 350 + ranks[:, :2].sum(axis=1) * 400).max() / 1e6)
 
 

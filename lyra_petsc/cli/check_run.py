@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.mesh.crossings import have_common_vertex, self_crossings
+from lyra_petsc.mesh.obstacles import Container, Solid
 from lyra_petsc.mesh.start_crossings import Overlaps, overlaps_of
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import StoredRun
@@ -37,33 +38,22 @@ class StateCrossings(NamedTuple):
     overlaps: Mapping[str, Overlaps]
 
 
-class RunCrossings:
-    """Finds the crossings in the states of a run, one state in memory at a time.
-
-    Parameters
-    ----------
-    run : StoredRun
+def crossings_of(run: StoredRun, obstacles: Sequence[Solid | Container], state: int) -> StateCrossings:
+    """The crossings in a state of a run with these obstacles.
 
     Raises
     ------
     InputError
-        Here and by `of`, if files of the run are gone or damaged.
+        If files of the run are gone or damaged.
     """
-
-    def __init__(self, run: StoredRun) -> None:
-        self._run, self._obstacles = run, run_obstacles(run)
-        self._boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
-
-    def of(self, state: int) -> StateCrossings:
-        """The crossings in a state."""
-        run, x, time = self._run, self._run.positions[state], float(self._run.times[state])
-        pairs = self_crossings(x, run.triangles)
-        at_corner = have_common_vertex(run.triangles, pairs)
-        overlaps = {
-            one.name: overlaps_of(one, x, run.triangles, time, is_box=one.name in self._boxes)
-            for one in self._obstacles
-        }
-        return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
+    x, time = run.positions[state], float(run.times[state])
+    pairs = self_crossings(x, run.triangles)
+    at_corner = have_common_vertex(run.triangles, pairs)
+    boxes = {name for name, each in (run.scene.obstacles or {}).items() if each.box is not None}
+    overlaps = {
+        one.name: overlaps_of(one, x, run.triangles, time, is_box=one.name in boxes) for one in obstacles
+    }
+    return StateCrossings(pairs[~at_corner], pairs[at_corner], overlaps)
 
 
 NAMED = 3
@@ -97,7 +87,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     """
     run = on_root(comm, lambda: StoredRun(folder))
     scene = on_root(comm, lambda: run.scene)
-    look = on_each(comm, lambda: RunCrossings(run))
+    obstacles = on_each(comm, lambda: run_obstacles(run))
     row = PAIRS + (INSIDE if scene.obstacles else "")
     time = "load factor" if scene.time.static else "time [s]"
     heads = ("no common vertex", "one common vertex", "vertices in", "edges in", "triangles in")
@@ -105,7 +95,7 @@ def check_run(comm: MPI.Comm, folder: Path, *, crossings: bool = False) -> int:
     _say(comm, row.format("state", time, *heads) + "first")
     rows = []
     for begin in range(0, len(run), comm.size):
-        found = on_each(comm, partial(_of_state, look, begin + comm.rank, len(run)))
+        found = on_each(comm, partial(_of_state, run, obstacles, begin + comm.rank))
         for state, one in enumerate(comm.allgather(found), start=begin):
             if one is not None:
                 rows.append(one.counts)
@@ -128,11 +118,11 @@ class _Found(NamedTuple):
     first: str
 
 
-def _of_state(look: RunCrossings, state: int, end: int) -> _Found | None:
+def _of_state(run: StoredRun, obstacles: Sequence[Solid | Container], state: int) -> _Found | None:
     """What crosses in a state; None beyond the last one."""
-    if state >= end:
+    if state >= len(run):
         return None
-    found = look.of(state)
+    found = crossings_of(run, obstacles, state)
     inside = [[len(part) for part in overlap] for overlap in found.overlaps.values()]
     in_all = np.sum(inside, axis=0, dtype=int).tolist() if inside else (0, 0, 0)
     pairs = np.concatenate([found.pairs[:NAMED], found.corner_pairs[:NAMED]])[:NAMED]

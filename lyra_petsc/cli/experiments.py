@@ -290,7 +290,7 @@ def fabric(
 def _run(
     comm: MPI.Comm, results: Results[Any], cases: Sequence[Any], run: Callable[[Any], Any], known: int
 ) -> int:
-    """Run cases, of so many that there are, and print what came of each; the exit code."""
+    """Run cases and print their outcomes; returns the exit code. ``known`` counts all that there are."""
     terminal = Terminal(comm, results.view, len(cases), known)
     note = results.run(cases, run, terminal)
     terminal.close(results, note)
@@ -300,7 +300,7 @@ def _run(
 def _list(
     comm: MPI.Comm, cases: Sequence[Any], count: str, heading: Callable[[Any], str] | None = None
 ) -> int:
-    """Print name and title of cases, below their headings, on rank 0; the exit code."""
+    """Print names and titles of cases below headings, on rank 0; returns the exit code."""
     if comm.rank > 0:
         return 0
     width, told = max(len(case.name) for case in cases), ""

@@ -26,7 +26,7 @@ from lyra_petsc.scene.schema import Scene
 
 
 class FitProgress(ProgressBar, Observer):
-    """The progress of a fit: the evaluation at work, and the sum of squares of those that have ended."""
+    """Shows the progress of a fit: the present evaluation, and the sum of squares of the one before."""
 
     def __init__(self, comm: MPI.Comm, *, plain: bool) -> None:
         super().__init__(comm, plain=plain)
@@ -112,6 +112,6 @@ def fit(
 
 
 def _launched(comm: MPI.Comm, ranks: int, words: list[str]) -> int:
-    """The same verb on so many ranks, whose words go where this one's would."""
+    """Run the same command on so many ranks, with this process's standard streams; returns the exit code."""
     program = [*on_root(comm, lambda: find_launcher(ranks)), sys.executable, "-m", "lyra_petsc", "fit"]
     return subprocess.call([*program, *words, *petsc_words()], env=environment())

@@ -81,16 +81,7 @@ def _source(name: str) -> str:
     return f"pip install {name}"
 
 
-EXTERNAL = (
-    "ptscotch",
-    "parmetis",
-    "hypre",
-    "ml",
-    "mumps",
-    "superlu_dist",
-    "suitesparse",
-    "hdf5",
-)
+EXTERNAL = ("ptscotch", "parmetis", "hypre", "ml", "mumps", "superlu_dist", "suitesparse", "hdf5")
 """Packages PETSc may have been built with that matter here (suitesparse brings CHOLMOD)."""
 
 
@@ -137,8 +128,7 @@ def info(comm: Any) -> str:
         else ["All fits together."]
     )
     # what rank 0 found counts: h5py and the libraries are the same files on every rank
-    shared: str = comm.bcast("\n".join(text), root=0)
-    return shared
+    return comm.bcast("\n".join(text), root=0)
 
 
 def launched_ranks(environment: Mapping[str, str]) -> int:

@@ -37,7 +37,7 @@ def new(comm: Any, name: str, mesh: Path | None, trust_mesh: bool) -> None:
 
 
 def ways_to_start() -> tuple[str, str]:
-    """What a reader types to start the program, on one rank and on two (the script's choice for ``run``)."""
+    """Commands that start the program on one and on two ranks; the script of a checkout chooses by itself."""
     script = Path(__file__).resolve().parents[2] / "scripts" / "lyra.sh"
     if shutil.which("lyra-petsc") is None and script.is_file():
         command = f"bash {shlex.quote(os.path.relpath(script))}"

@@ -1,4 +1,4 @@
-"""Runs the simulations of a case: counts steps; for exact answers, a direct solver and tight tolerances."""
+"""Runs the simulations of a case and counts steps; where answers are exact, with a direct solver."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ TIGHT = {"force_tolerance": 1e-10, "step_tolerance": 1e-10}
 def simulated(
     comm: MPI.Comm, scene: Scene, phases: Phases | None = None, **known: Any
 ) -> Iterator[SteppedScene]:
-    """A simulation, freed with the options it set when the block ends; ``known``: of it; collective."""
+    """A simulation that is freed at the end of the block, with the PETSc options it set; collective.
+
+    ``known`` are further arguments of `SteppedScene`.
+    """
     before = set(PETSc.Options().getAll())
     simulation, alone = None, False
     try:
@@ -92,12 +95,7 @@ class Trial:
 
     def gather(self, owned: Array) -> Array:
         """Rows of the owned vertices (n_vertices, …) in mesh order (V, …), on every rank; collective."""
-        points = self.simulation.problem.points
-        pieces = self._bench.comm.allgather((points.original, np.array(owned[: points.n_vertices])))
-        out = np.empty((points.n_vertices_global, *owned.shape[1:]))
-        for original, rows in pieces:
-            out[original] = rows
-        return out
+        return self.simulation.problem.points.gathered(owned)
 
     @property
     def x(self) -> Array:

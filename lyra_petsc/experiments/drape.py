@@ -35,8 +35,7 @@ def disc_of(angle: Array) -> tuple[Array, Ints]:
 
 def _middles(low: float, pixels: int) -> Array:
     half = MARGIN * CLOTH
-    middles: Array = half * (low + (1.0 - low) * (np.arange(pixels) + 0.5) / pixels)
-    return middles
+    return half * (low + (1.0 - low) * (np.arange(pixels) + 0.5) / pixels)
 
 
 def shadow(x: Array, faces: Ints, pixels: int, low: float = -1.0) -> Picture:

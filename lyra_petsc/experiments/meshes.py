@@ -68,8 +68,13 @@ def _halved(nx: int, column: Ints, row: Ints, flipped: Mask) -> Ints:
     other = flipped[:, None]
     first = np.where(other, np.column_stack([a, b, d]), np.column_stack([a, b, c]))
     second = np.where(other, np.column_stack([b, c, d]), np.column_stack([a, c, d]))
-    halves: Ints = np.concatenate([first, second])
-    return halves
+    return np.concatenate([first, second])
+
+
+def rounded(flat: Array) -> Array:
+    """Points (n, 3) of the square |x|, |y| ≤ 1, moved smoothly onto the disc of radius 1."""
+    x, y = flat[:, 0], flat[:, 1]
+    return np.column_stack([x * np.sqrt(1.0 - 0.5 * y**2), y * np.sqrt(1.0 - 0.5 * x**2), 0.0 * x])
 
 
 def quarter_disc(n: int, radius: float) -> tuple[Array, Ints]:
@@ -80,8 +85,5 @@ def quarter_disc(n: int, radius: float) -> tuple[Array, Ints]:
 
     Vertex j (n + 1) + i as in a grid: i = 0 and j = 0 are the straight sides, i = n and j = n the rim.
     """
-    i, j = (k.ravel() / n for k in np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0)))
-    x, y = i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2)
-    column, row = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n)))
-    vertices = radius * np.column_stack([x, y, 0.0 * x])
-    return vertices, _halved(n, column, row, (column + row) % 2 == 1)
+    flat, faces = rectangle(n, n, 1.0, 1.0)
+    return radius * rounded(flat), faces

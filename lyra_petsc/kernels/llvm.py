@@ -92,7 +92,7 @@ class Code:
         return reduce(self.plus, parts)
 
     def _unpacked(self, given: Value) -> list[Value]:
-        return cgutils.unpack_tuple(self.builder, given)  # type: ignore[no-any-return, no-untyped-call]
+        return cgutils.unpack_tuple(self.builder, given)  # type: ignore[no-untyped-call]
 
     def filled(self, numbers: list[Value], kind: Any = None) -> Value:
         """A vector, of four if nothing else is said, that begins with these numbers."""

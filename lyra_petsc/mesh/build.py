@@ -28,7 +28,7 @@ _FLATNESS = 1e-10
 
 
 def check_topology(sheet: Sheet, *, file: object | None, key: str | None = None) -> None:
-    """Refuse a mesh that is no surface, however it is scaled and moved.
+    """Refuse a mesh that is not a surface, whatever its scale and position.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def mesh_of(scene: Scene, tell: Callable[[str], None] | None = None) -> Mesh:
 def _surface(
     source: MeshSource, trust_scripts: bool, tell: Callable[[str], None] | None
 ) -> tuple[TriangleSurface, list[str]]:
-    """The surface of an obstacle at t = 0, without unused points, and the notes of the reader of its file."""
+    """The surface of an obstacle at t = 0 without unused points, and what the reader of its file noted."""
     try:
         sheet = _read(source, trust_scripts, tell)
         used, numbers = np.unique(sheet.triangles, return_inverse=True)
@@ -448,5 +448,4 @@ def _rotation_matrix(rotation: Rotation) -> Array:
         cosine, sine = math.cos(math.radians(rotation.degrees)), math.sin(math.radians(rotation.degrees))
     x, y, z = direction
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix: Array = cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)
-    return matrix
+    return cosine * np.eye(3) + sine * cross + (1.0 - cosine) * np.outer(direction, direction)

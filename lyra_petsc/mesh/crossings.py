@@ -275,7 +275,7 @@ def _curve(low: Array, high: Array) -> NDArray[np.uint64]:
 
 
 def _decides_crossing(side: Any) -> Callable[..., int]:
-    """The function that decides whether two triangles cross, by `side` or its like."""
+    """A function that decides whether two triangles cross, by an orientation predicate such as `side`."""
 
     def crossing(points: Any, a: int, b: int, c: int, d: int, e: int, f: int) -> int:
         """1 where the triangles a, b, c and d, e, f cross, 0 where not, or `UNDECIDED`."""

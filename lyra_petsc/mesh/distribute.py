@@ -223,8 +223,7 @@ def _pieces(whole: Whole, rows: Rows, n_ranks: int):  # type: ignore[no-untyped-
 def local_numbers(numbers: Ints, ghosts: Ints, lo: int, hi: int) -> Ints:
     """Local numbers of global ones: owned from 0, ghosts, which ascend, after them."""
     inside = (numbers >= lo) & (numbers < hi)
-    local: Ints = np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
-    return local
+    return np.where(inside, numbers - lo, (hi - lo) + np.searchsorted(ghosts, numbers))
 
 
 def _by_locality(stencil: Ints, n_owned: int) -> Ints:
@@ -232,5 +231,4 @@ def _by_locality(stencil: Ints, n_owned: int) -> Ints:
     if len(stencil) == 0:
         return np.empty(0, dtype=np.int64)
     points = np.sort(stencil, axis=1).T
-    order: Ints = np.lexsort((*points[::-1], np.arange(len(stencil)) >= n_owned))
-    return order
+    return np.lexsort((*points[::-1], np.arange(len(stencil)) >= n_owned))

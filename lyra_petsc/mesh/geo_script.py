@@ -105,7 +105,7 @@ class _Script:
                 self.partners |= {begin: number, number: begin}
 
     def refusal(self, line: int, words: str) -> InputError:
-        """What is wrong in a line."""
+        """The error for a line."""
         return InputError(f"line {line}: {words}", file=self.path)
 
     def closing(self, opening: int) -> int:
@@ -147,7 +147,7 @@ class ScriptFiles:
         return folder / next(iter(self.contents))
 
     def _read_script(self, path: Path, place: str) -> None:
-        """Take a file for a script."""
+        """Read and check a file as a script."""
         if place in self._places:
             return
         self._places.add(place)
@@ -167,7 +167,7 @@ class ScriptFiles:
         self._options(path, place)
 
     def _read_any(self, path: Path, place: str) -> None:
-        """Take a file for what its content says it is."""
+        """Read a file as a script or as data, whichever its content says."""
         if place in self.contents:
             if place not in self._places and not _is_data(path.name, self.contents[place]):
                 self._read_script(path, place)
@@ -305,7 +305,10 @@ def _without_comments(text: str) -> str:
 
 
 def _check_jumps(script: _Script, text: str) -> None:
-    """Refuse what gmsh may read otherwise than it looks where it skips and jumps."""
+    """Refuse scripts in which gmsh could find other words than we do.
+
+    At If, For and Macro it skips characters, not words.
+    """
     if not any(token.kind == "word" and token.text in JUMPS for token in script.tokens):
         return
     why = "where a script has If, For or Macro, gmsh may read on"
@@ -445,7 +448,7 @@ def _check_printf(script: _Script, number: int) -> None:
 
 
 def _check_format(script: _Script, number: int) -> None:
-    """Refuse formats by which gmsh would read or write memory that is not its own: all but numbers' own."""
+    """Refuse formats with which printf would read or write foreign memory: all but those of numbers."""
     token, following = script.tokens[number], script.tokens[number + 1 : number + 4]
     kinds = [(t.kind, t.text) for t in following]
     if len(kinds) < 3 or kinds[0][1] != "(" or kinds[1][0] != "text" or kinds[2][1] not in (",", ")"):

@@ -67,8 +67,7 @@ def mean_edge_length(mesh: Mesh) -> float:
 def edge_lengths(mesh: Mesh) -> Array:
     """Rest lengths (F, 3) [m] of the triangles' sides (interior edges are there twice)."""
     uv = mesh.triangle_uv
-    lengths: Array = np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
-    return lengths
+    return np.linalg.norm(uv - np.roll(uv, -1, axis=1), axis=2)
 
 
 def bounding_diagonal(points: Array) -> float:
@@ -105,8 +104,7 @@ def lay_out(rest: Array, triangles: Ints) -> Array:
     first[steep] = _projected(np.array([0.0, 1.0, 0.0]), normal[steep])
     first = _unit(first)
     second = np.cross(normal, first)
-    uv: Array = np.einsum("fci,fai->fca", corners, np.stack([first, second], axis=1))
-    return uv
+    return np.einsum("fci,fai->fca", corners, np.stack([first, second], axis=1))
 
 
 def _projected(direction: Array, normal: Array) -> Array:
@@ -116,5 +114,4 @@ def _projected(direction: Array, normal: Array) -> Array:
 def _unit(vectors: Array) -> Array:
     # scaled first: the cross product of two tiny sides would underflow when squared
     vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
-    unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

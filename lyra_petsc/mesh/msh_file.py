@@ -171,7 +171,7 @@ def _elements(content: _File, physical: dict[tuple[int, int], list[int]]) -> lis
 
 
 def _counted(content: _File, section: str) -> tuple[Values, int]:
-    """Values of a format 2 section after its count, which is text in binary files too."""
+    """Values of a format 2 section and their count, which precedes them as text in binary files too."""
     if not content.order:
         values = content.values(section)
         return values, one(values)
@@ -283,8 +283,7 @@ def one(values: Values, width: Width = "int") -> int:
 
 def several(values: Values, n: int, width: Width = "int") -> list[int]:
     """The next ``n`` whole numbers."""
-    found: list[int] = values.rows(n, 1, width=width)[0][:, 0].tolist()
-    return found
+    return values.rows(n, 1, width=width)[0][:, 0].tolist()
 
 
 def _whole(table: Array) -> Ints:
@@ -407,7 +406,7 @@ def _block_2(kind: int, rows: Ints, n_tags: int) -> ElementBlock:
 
 
 def _joined(blocks: list[ElementBlock]) -> list[ElementBlock]:
-    """Neighbouring blocks of one type made one: some writers give each element its own block."""
+    """Join neighbouring blocks of one type: some writers give each element a block."""
     joined = []
     for kind, same in groupby(blocks, key=lambda block: block.kind):
         run = list(same)
@@ -538,7 +537,7 @@ def _triangles(
 
 
 def _once(triangles: Ints, entity: Ints, members: dict[int, Ints]) -> tuple[Ints, dict[int, Ints]]:
-    """Drop the repetitions with which format 2 writes an element that is in several groups.
+    """Drop repeated triangles: format 2 writes an element once for each group that it is in.
 
     Only where the same triangle of the same entity stands once per group; any other repetition is left
     for the checks of the mesh to refuse.

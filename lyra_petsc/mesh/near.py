@@ -12,7 +12,7 @@ MOST_CELLS = 1 << 22
 
 @cached()
 def _cell(place, origin, size, n):  # type: ignore[no-untyped-def]
-    """Which of n cells a coordinate is in, or nearest to."""
+    """The number of the cell that holds a coordinate, or of the nearest one of n."""
     # of a plane that is one but for rounding, farther cells than whole numbers can count
     return int(min(max((place - origin) / size, 0.0), n - 1.0))
 
@@ -34,16 +34,6 @@ def swept_boxes(x: Array, way: Array, simplices: Ints) -> tuple[Array, Array]:
     low, high = np.empty((len(simplices), 3)), np.empty((len(simplices), 3))
     _swept(x, way, simplices, low, high)
     return low, high
-
-
-@cached()
-def _common(corners, other):  # type: ignore[no-untyped-def]
-    """Whether two simplices (n,) and (m,) have a vertex in common."""
-    for i in range(len(corners)):
-        for j in range(len(other)):
-            if corners[i] == other[j]:
-                return True
-    return False
 
 
 @cached()
@@ -73,8 +63,8 @@ def _sort(cells, n, first, items, fill):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
+def _pairs(low, high, others, reach, cells, other_cells, n, same, first, items, out):  # type: ignore[no-untyped-def]
+    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
 
     The others, low and high corners (2, k, 3), stand in cells of a grid: ``first`` (cells + 1,) and
     ``items``. A pair is found in the first cell that both have.
@@ -98,7 +88,7 @@ def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells,
                         for m in range(3):
                             apart = max(others[0, b, m] - high[a, m], low[a, m] - others[1, b, m], 0.0)
                             left -= apart * apart
-                        if left < 0.0 or _common(corners[a], other_corners[b]):
+                        if left < 0.0:
                             continue
                         if found < len(out):
                             out[found, 0], out[found, 1] = a, b
@@ -107,30 +97,20 @@ def _pairs(low, high, corners, others, other_corners, reach, cells, other_cells,
 
 
 def near(
-    boxes: tuple[Array, Array],
-    others: tuple[Array, Array] | None = None,
-    *,
-    reach: float = 0.0,
-    corners: Ints | None = None,
-    other_corners: Ints | None = None,
+    boxes: tuple[Array, Array], others: tuple[Array, Array] | None = None, *, reach: float = 0.0
 ) -> Ints:
-    """Pairs (m, 2) of boxes and other ones that are not farther from each other than ``reach`` [m].
+    """Pairs (m, 2) of boxes and other boxes at most ``reach`` [m] apart.
 
     Parameters
     ----------
     boxes, others : pairs of (n, 3), (k, 3)
         Their low and high corners [m]. Without others the boxes themselves; the lesser number is first.
-    corners, other_corners : (n, i), (k, j)
-        Numbers of which those of a pair have none in common.
     """
     same = others is None
     low, high = boxes
     other_low, other_high = boxes if others is None else others
     if not len(low) or not len(other_low):
         return np.empty((0, 2), dtype=np.int64)
-    mine = np.empty((len(low), 0), dtype=np.int64) if corners is None else corners
-    theirs = np.empty((len(other_low), 0), dtype=np.int64) if other_corners is None else other_corners
-    theirs = mine if same else theirs
     origin, end = other_low.min(axis=0), other_high.max(axis=0)
     extent = np.maximum(end - origin, 1e-300)
     size = np.maximum((other_high - other_low).mean(axis=0) + reach, extent * 1e-6)
@@ -149,7 +129,7 @@ def near(
     _sort(other_cells, n, at, items, True)
     out = np.empty((4 * len(low) + 64, 2), dtype=np.int64)
     stacked = np.stack([other_low, other_high])
-    given = low, high, mine, stacked, theirs, reach, cells, other_cells, n, same, first, items
+    given = low, high, stacked, reach, cells, other_cells, n, same, first, items
     found = _pairs(*given, out)
     if found > len(out):
         out = np.empty((found, 2), dtype=np.int64)
@@ -159,7 +139,7 @@ def near(
 
 @cached()
 def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
-    """Near pairs into out (m, 2), of which only as many are written as fit; how many there are.
+    """Write near pairs into out (m, 2) as far as there is room; returns how many there are.
 
     ``tree`` (2 k, 2, 3), k a power of 2 from len(low) on, takes boxes around pairs of boxes, pairs of these …
     """
@@ -198,8 +178,9 @@ def _of_tree(low, high, reach, tree, out):  # type: ignore[no-untyped-def]
 
 
 def near_in_order(low: Array, high: Array, reach: float) -> Ints:
-    """Pairs (m, 2) of boxes, given by their corners (n, 3) [m], that are not farther from each other than
-    ``reach`` [m], the lesser number first; fast where those next to each other in the order mostly are.
+    """Pairs (m, 2) of boxes with corners (n, 3) [m] at most ``reach`` [m] apart, the lesser number first.
+
+    Fast where boxes with neighbouring numbers are neighbours in space.
     """
     tree = np.empty((2 << max(len(low) - 1, 0).bit_length(), 2, 3))
     out = np.empty((8 * len(low), 2), dtype=np.int64)

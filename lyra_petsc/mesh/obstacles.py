@@ -63,8 +63,7 @@ class _Carried:
         if self.motion is None:
             return self.points
         rotation, translation = self.displacement(time)
-        carried: Array = self.points @ rotation.T + translation
-        return carried
+        return self.points @ rotation.T + translation
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +131,7 @@ class Container(_Carried):
         """Its normals (n, 3) at a time [s]; of what stands still ``normals`` itself."""
         if self.motion is None:
             return self.normals
-        turned: Array = self.normals @ self.displacement(time)[0].T
-        return turned
+        return self.normals @ self.displacement(time)[0].T
 
 
 def obstacles_of(
@@ -224,5 +222,4 @@ def axis_of(obstacle: Obstacle) -> tuple[Array, float]:
 def box_corners(box: Cuboid) -> Array:
     """(8, 3) corners [m], numbered as in `BOX_TRIANGLES`."""
     low, high = np.array(box.min), np.array(box.max)
-    corners: Array = np.where(_CORNERS > 0.5, high, low)
-    return corners
+    return np.where(_CORNERS > 0.5, high, low)

@@ -57,8 +57,7 @@ def connected(triangles: Ints, patch: Ints | None = None) -> Ints:
     at = np.column_stack([np.repeat(corner, 3), triangles.ravel()])
     node = np.unique(at, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([node[:, :2], node[:, 1:]])
-    piece: Ints = _pieces(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
-    return piece
+    return _pieces(int(node.max(initial=-1)) + 1, links)[node[:, 0]]
 
 
 class Flat(NamedTuple):
@@ -199,10 +198,7 @@ def _runs_through(a: Array, b: Array, low: Array, high: Array) -> Mask:
     still = way == 0.0
     enters = np.where(still, np.where((a > low) & (a < high), -np.inf, np.inf), np.minimum(one, two))
     leaves = np.where(still, np.inf, np.maximum(one, two))
-    through: Mask = np.maximum(enters.max(axis=1, initial=0.0), 0.0) < np.minimum(
-        leaves.min(axis=1, initial=1.0), 1.0
-    )
-    return through
+    return np.maximum(enters.max(axis=1, initial=0.0), 0.0) < np.minimum(leaves.min(axis=1, initial=1.0), 1.0)
 
 
 @cached(inline="always")

@@ -78,8 +78,7 @@ class Points:
         inside = (numbers >= self.start) & (numbers < end)
         found = np.searchsorted(self.ghosts, np.where(inside, -1, numbers), sorter=order)
         ghost = order[np.minimum(found, len(order) - 1)] if len(order) else found
-        local: Ints = np.where(inside, numbers - self.start, self.n_owned + ghost)
-        return local
+        return np.where(inside, numbers - self.start, self.n_owned + ghost)
 
     def update_ghosts(self, values: Array | NDArray[np.float32]) -> None:
         """Copy the owners' rows of ``values`` (n_local, 3) into the ghost rows; collective."""
@@ -114,8 +113,7 @@ class Points:
             return list(numbers)
         most = np.array(numbers, dtype=np.float64)
         self.comm.Allreduce(MPI.IN_PLACE, most, MPI.MAX)
-        found: list[float] = most.tolist()
-        return found
+        return most.tolist()
 
     def destroy(self) -> None:
         """Free the communication objects; collective."""
@@ -209,6 +207,16 @@ class Layout(Points):
         rows.ravel()[self.edge_places] = edges
         return rows
 
+    def gathered(self, owned: Array) -> Array:
+        """Rows of the owned vertices (n_vertices or more, …) in the mesh's order (V, …), on every rank;
+        collective.
+        """
+        pieces = self.comm.allgather((self.original, np.array(owned[: self.n_vertices])))
+        out = np.empty((self.n_vertices_global, *owned.shape[1:]))
+        for original, rows in pieces:
+            out[original] = rows
+        return out
+
     def in_mesh(self) -> Ints:
         """Position among the mesh's vertices of each local one, (n_local,), ghosts too; 0 of edges;
         collective.
@@ -216,14 +224,12 @@ class Layout(Points):
         known = np.zeros((self.n_local, 3))
         known[: self.n_vertices, 0] = self.original
         self.update_ghosts(known)
-        found: Ints = known[:, 0].astype(np.int64)
-        return found
+        return known[:, 0].astype(np.int64)
 
     def are_vertices(self, rows: Ints) -> Mask:
         """Which of these rows, given by global numbers, are vertices."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
-        vertices: Mask = rows - self.bounds[rank] < self.unknowns.n_vertices[rank]
-        return vertices
+        return rows - self.bounds[rank] < self.unknowns.n_vertices[rank]
 
     @property
     def vertex_bounds(self) -> Ints:
@@ -233,5 +239,4 @@ class Layout(Points):
     def vertex_numbers(self, rows: Ints) -> Ints:
         """Numbers among vertices alone of vertices given by the global numbers of their rows."""
         rank = np.searchsorted(self.bounds, rows, side="right") - 1
-        numbers: Ints = rows - self.bounds[rank] + self.vertex_bounds[rank]
-        return numbers
+        return rows - self.bounds[rank] + self.vertex_bounds[rank]

@@ -72,8 +72,7 @@ def split_quads(corners: Array) -> Ints:
     # equal lengths must not depend on round-off: a tie takes the first diagonal
     shorter = length_first <= length_second * (1 + 1e-9)
     take_first = np.where(inside_first == inside_second, shorter, inside_first)
-    split: Ints = np.where(take_first[:, None, None], _FIRST_DIAGONAL, _SECOND_DIAGONAL).astype(np.int64)
-    return split
+    return np.where(take_first[:, None, None], _FIRST_DIAGONAL, _SECOND_DIAGONAL).astype(np.int64)
 
 
 def split_polygon(corners: Array) -> Ints | None:
@@ -106,5 +105,4 @@ def _smallest_area(triangles: Array, normal: Array) -> Array:
     """Smallest area along ``normal`` (n, 3) over the triangles (n, m, 3, 3) of each polygon."""
     sides = triangles[:, :, 1:] - triangles[:, :, :1]
     areas = np.einsum("nmi,ni->nm", np.cross(sides[:, :, 0], sides[:, :, 1]), normal)
-    smallest: Array = areas.min(axis=1)
-    return smallest
+    return areas.min(axis=1)

@@ -33,8 +33,7 @@ def _velocity(problem: Problem) -> Array:
 def _displacement(problem: Problem) -> Array:
     """From the positions at t = 0."""
     assert problem.start is not None  # see `check_field`
-    moved: Array = problem.system.x[: problem.points.n_vertices] - problem.start
-    return moved
+    return problem.system.x[: problem.points.n_vertices] - problem.start
 
 
 def _green_strain(problem: Problem) -> Array:
@@ -51,8 +50,7 @@ def _stress(problem: Problem) -> Array:
 
 def _membrane_energy(problem: Problem) -> Array:
     membrane = problem.membrane
-    density: Array = membrane.energies(problem.system.x) / membrane.elements.data["area"][: membrane.n_owned]
-    return density
+    return membrane.energies(problem.system.x) / membrane.elements.data["area"][: membrane.n_owned]
 
 
 def _per_area(problem: Problem, rows: Ints, shares: Array) -> Array:
@@ -61,8 +59,7 @@ def _per_area(problem: Problem, rows: Ints, shares: Array) -> Array:
     membrane = problem.membrane
     thirds = np.repeat(membrane.elements.data["area"] / 3.0, 3)
     area = np.bincount(membrane.stencil.ravel(), thirds, n_local)
-    density: Array = np.bincount(rows, shares, n_local)[:n_owned] / area[:n_owned]
-    return density
+    return np.bincount(rows, shares, n_local)[:n_owned] / area[:n_owned]
 
 
 def _on_vertices(problem: Problem, of_hinges: OnHinges, of_triangles: OnTriangles) -> Array:

@@ -143,8 +143,7 @@ class Recorder:
 
         if not on_root(self._comm, readable):
             return otherwise
-        first: Array = order.from_slab(read_slab(file, name, order))
-        return first
+        return order.from_slab(read_slab(file, name, order))
 
     def _put(self, checkpoint: Checkpoint) -> None:
         """Put a checkpoint into the simulation."""

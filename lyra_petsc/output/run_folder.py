@@ -52,7 +52,7 @@ def present(name: str, folder: Path) -> list[Path]:
 
 
 def _check_resumable(folder: Path) -> None:
-    """Refuse a run whose files, some of which are written on, are links, or whose checkpoints are none."""
+    """Refuse to resume where files of the run are links or checkpoints take data from other files."""
     check_folder(folder)
     for file in checkpoint_files(folder):
         with suppress(*HDF5_ERRORS), open_own(file):  # a damaged one has one before it

@@ -30,7 +30,7 @@ def import_h5py() -> Any:
 
 
 def import_ahead() -> None:
-    """Let a thread import it while this one makes the mesh, which is gmsh's work and not Python's."""
+    """Import h5py in a thread, while this one waits for gmsh's process."""
 
     def work() -> None:
         with suppress(ImportError):  # told where it is needed
@@ -50,7 +50,7 @@ class OutsideFolderError(InputError):
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse results that stand elsewhere.
+    """Refuse results outside of the run's folder.
 
     Raises
     ------

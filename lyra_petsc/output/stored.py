@@ -34,7 +34,7 @@ STATE = re.compile(r"/?states/(\d+)/[^/]+")
 
 
 def check_sum(array: NDArray[Any]) -> int:
-    """Sum of all 64-bit words (of all bytes, where an element has not 8) modulo 2⁶⁴: sums of parts add up."""
+    """Sum modulo 2⁶⁴ of all 64-bit words (of bytes, where elements are shorter); sums of parts add up."""
     words = np.ascontiguousarray(array).reshape(-1).view(np.uint64 if array.dtype.itemsize == 8 else np.uint8)
     return int(words.sum(dtype=np.uint64))
 

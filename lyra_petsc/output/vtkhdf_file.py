@@ -62,7 +62,7 @@ def write_cells(folder: Path) -> None:
 def write_vtkhdf(
     folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int, mesh_file: str
 ) -> None:
-    """Announce states. Call on one rank.
+    """Write ``states.vtkhdf`` for these states. Call on one rank.
 
     A field that some states lack is NaN there (0 if it is of whole numbers).
 
@@ -109,7 +109,7 @@ def write_vtkhdf(
 
 
 def describe(file: Any, times: Sequence[float], n_vertices: int, n_triangles: int) -> Any:
-    """Create the group ``/VTKHDF`` with all that is not data of states; returns it.
+    """Create and return the group ``/VTKHDF`` with all metadata; the data of states come later.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ _UNIT = re.compile(r"\[([^\]]*)\]")
 
 
 class Block(BaseModel):
-    """A block of keys; attribute names are the keys, but for those that are no names in Python."""
+    """A block of a scene file; attributes are named as its keys, except keys that are no Python names."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

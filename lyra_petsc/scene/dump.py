@@ -67,8 +67,7 @@ def _float_node(representer: RoundTripRepresenter, value: float) -> ScalarNode:
     digits = repr(value)
     if "e" in digits and "." not in digits:
         digits = digits.replace("e", ".0e")
-    node: ScalarNode = representer.represent_scalar("tag:yaml.org,2002:float", digits)
-    return node
+    return representer.represent_scalar("tag:yaml.org,2002:float", digits)
 
 
 def _plain(value: Any) -> Any:

@@ -1462,7 +1462,7 @@ class Scene(Block):
 
     @property
     def trusts_meshes(self) -> bool:
-        """Whether gmsh is given this scene's scripts whatever they say; the caller's word, no part of it."""
+        """Whether gmsh gets this scene's scripts unchecked; the caller decides that, not the file."""
         return self._trusts_meshes
 
     @property

@@ -173,8 +173,7 @@ def _step_length(value: Any) -> float | str:
         return "auto"
     if isinstance(value, str) and not _reads_as_number(value):
         raise problem(f"must be a number or auto, not {shown(value)}")
-    step: float = _POSITIVE.check(value)
-    return step
+    return _POSITIVE.check(value)
 
 
 @dataclass(frozen=True, eq=False)

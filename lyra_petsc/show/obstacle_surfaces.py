@@ -114,8 +114,7 @@ def obstacle_surfaces(run: StoredRun, middle: Array, size: float) -> list[Obstac
 
 def _carried(obstacle: Solid | Container, points: Array, time: float) -> Array:
     rotation, translation = obstacle.displacement(time)
-    carried: Array = points @ rotation.T + translation
-    return carried
+    return points @ rotation.T + translation
 
 
 def _square(plane: Container, tangents: Array, middle: Array, half: float, time: float) -> Array:

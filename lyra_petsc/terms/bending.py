@@ -140,14 +140,12 @@ class Bending(Elastic):
         self._bent.forget()  # what comes next is a linear solve, which needs the room
 
     def force_scale(self, size: float) -> Array:
-        scale: Array = self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2
-        return scale
+        return self.elements.data["k"] * size / self.elements.data["rest_height"] ** 2
 
 
 def _corners_of(triangles: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Which corner (0, 1, 2) of each triangle (n, 3) each vertex (n,) is."""
-    corner: NDArray[np.int64] = np.argmax(triangles == vertices[:, None], axis=1)
-    return corner
+    return np.argmax(triangles == vertices[:, None], axis=1)
 
 
 def edge_in_material(
@@ -238,8 +236,7 @@ def mirrored_angles(rest: RestShape, corners: NDArray[np.int64], triangle: NDArr
     ee, nn, _ = _rest_curvature(rest, triangle, corners)
     edge, _ = edge_in_material(rest, triangle, corners[:, 0], corners[:, 1])
     along, height = _foot_and_height(rest, triangle, corners)
-    half: Array = -0.5 * (ee * along * (along - np.linalg.norm(edge, axis=1)) + nn * height**2) / height
-    return half
+    return -0.5 * (ee * along * (along - np.linalg.norm(edge, axis=1)) + nn * height**2) / height
 
 
 def elements(rest: RestShape, model: str = "hinge") -> Elements:

@@ -104,8 +104,7 @@ def _mirrored(tail: Array, head: Array, opposite: Array) -> Array:
     edge = head - tail
     square = (edge * edge).sum(axis=1)
     along = ((opposite - tail) * edge).sum(axis=1) / np.where(square > 0.0, square, 1.0)
-    mirrored: Array = 2.0 * (tail + along[:, None] * edge) - opposite
-    return mirrored
+    return 2.0 * (tail + along[:, None] * edge) - opposite
 
 
 class Clamp(Elastic):
@@ -164,8 +163,7 @@ class Clamp(Elastic):
 
     def force_scale(self, size: float) -> Array:
         # of the full stiffness: the scale is asked for before the first step
-        scale: Array = self.elements.data["k"] * size / self.elements.data["height"] ** 2
-        return scale
+        return self.elements.data["k"] * size / self.elements.data["height"] ** 2
 
 
 def elements(rest: RestShape) -> Elements:

@@ -48,5 +48,4 @@ class Friction(NamedTuple):
 
     def slid(self, u: Array) -> Array:
         """By how much q_p changes (E,) when the step is accepted."""
-        change: Array = np.copysign(np.maximum(np.abs(u) - self.give, 0.0), u)
-        return change
+        return np.copysign(np.maximum(np.abs(u) - self.give, 0.0), u)

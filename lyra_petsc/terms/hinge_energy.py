@@ -26,8 +26,7 @@ GONE = 1e-30
 
 def fading_limit(area: NDArray[np.float64]) -> NDArray[np.float64]:
     """|n|² [m⁴] of the normal n = 2A from which triangles of these rest areas [m²] count in full."""
-    limit: NDArray[np.float64] = (FADES_BELOW * 2.0 * area) ** 2
-    return limit
+    return (FADES_BELOW * 2.0 * area) ** 2
 
 
 @kernel()

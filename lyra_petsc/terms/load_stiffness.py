@@ -41,5 +41,4 @@ def following_stiffness(
                 force(apart, moved.reshape(-1, 3), forces)
                 change += sign * forces
             out[:, :, point, :, axis] = -change.reshape(n_elements, n, 3) / (2.0 * step)
-    symmetric: Array = 0.5 * (out + out.transpose(0, 2, 1, 4, 3))
-    return symmetric
+    return 0.5 * (out + out.transpose(0, 2, 1, 4, 3))

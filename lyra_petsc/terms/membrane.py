@@ -233,8 +233,7 @@ class Membrane(Elastic):
     def force_scale(self, size: float) -> Array:
         parameters, law = self.laws
         steepest = np.abs(self._inverse).max(axis=(1, 2))
-        scale: Array = self._stiffest(parameters)[law] * self._area * steepest**2 * size
-        return scale
+        return self._stiffest(parameters)[law] * self._area * steepest**2 * size
 
     def strain_and_stress(self, x: Array) -> tuple[Array, Array]:
         """Green strain (E_uu, E_vv, E_uv) and stress (S_uu, S_vv, S_uv) [N/m], each (E, 3)."""

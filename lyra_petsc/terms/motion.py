@@ -23,8 +23,7 @@ SAME_AXIS = 1e-12
 def _scaled(rotation: Rotation) -> Array:
     """Its axis, with a largest component of 1: the square of another may not be a number."""
     axis = np.asarray(rotation.axis, dtype=np.float64)
-    scaled: Array = axis / np.abs(axis).max()
-    return scaled
+    return axis / np.abs(axis).max()
 
 
 def _quaternion(keyframe: Keyframe) -> Array:
@@ -63,8 +62,7 @@ def _axis(keyframe: Keyframe) -> Array | None:
     if keyframe.rotate is None or keyframe.rotate.degrees == 0.0:
         return None
     axis = _scaled(keyframe.rotate)
-    unit: Array = axis / np.linalg.norm(axis)
-    return unit
+    return axis / np.linalg.norm(axis)
 
 
 def _turns(keyframes: Sequence[Keyframe], key: str, file: object) -> list[float | None]:
@@ -243,8 +241,7 @@ class Motion:
         if not self._linear:
             part = s * s * (3 - 2 * s) * angle + h * s * (1 - s) ** 2 * first - h * s * s * (1 - s) * last
         turn = np.concatenate([[math.cos(0.5 * part)], math.sin(0.5 * part) * axis])
-        matrix: Array = _rotation(turn) @ _rotation(self._values[i, 6:])
-        return matrix
+        return _rotation(turn) @ _rotation(self._values[i, 6:])
 
     def carried(self, points: Array, start: float, time: float) -> Array:
         """T(time) T(start)⁻¹ applied to ``points`` (n, 3) [m]."""
@@ -252,8 +249,7 @@ class Motion:
             return points.copy()
         a0, d0 = self.transform(start)
         a, d = self.transform(time)
-        moved: Array = (points - d0) @ (a @ np.linalg.inv(a0)).T + d
-        return moved
+        return (points - d0) @ (a @ np.linalg.inv(a0)).T + d
 
     def velocity(self, points: Array, start: float, time: float) -> Array:
         """Time derivative [m/s] of ``carried`` (n, 3), by differences of 1e-6 of the shortest interval."""
@@ -261,8 +257,7 @@ class Motion:
             return np.zeros_like(points)
         step = 1e-6 * float(np.diff(self._times).min())
         before, after = self.carried(points, start, time - step), self.carried(points, start, time + step)
-        rate: Array = (after - before) / (2 * step)
-        return rate
+        return (after - before) / (2 * step)
 
 
 @dataclass(frozen=True)

@@ -86,13 +86,11 @@ class RestShape:
     def per_triangle(self, attribute: str) -> NDArray[np.float64]:
         """A scalar attribute of ShellMaterial on each triangle, (F,)."""
         values = np.array([getattr(shell, attribute) for shell in self.shells], dtype=np.float64)
-        on_triangles: NDArray[np.float64] = values[self.shell_of]
-        return on_triangles
+        return values[self.shell_of]
 
     def bends_by(self, model: str) -> NDArray[np.bool_]:
         """Which triangles resist bending by this model, (F,)."""
-        bends: NDArray[np.bool_] = np.array([shell.bends_by(model) for shell in self.shells])[self.shell_of]
-        return bends
+        return np.array([shell.bends_by(model) for shell in self.shells])[self.shell_of]
 
     @cached_property
     def mass(self) -> NDArray[np.float64]:

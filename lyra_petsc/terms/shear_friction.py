@@ -52,8 +52,7 @@ class ShearFriction(Elastic):
 
     def energies(self, x: Array, frozen: Any = None) -> Array:
         k, change = self._friction.parabola(self._shear(x)[0] - self.sheared)
-        energy: Array = (k * change**2)[: self.n_owned]
-        return energy
+        return (k * change**2)[: self.n_owned]
 
     def add_gradient(self, x: Array, frozen: Any, out: Array) -> None:
         shear, slope = self._shear(x)
@@ -75,8 +74,7 @@ class ShearFriction(Elastic):
 
     def force_scale(self, size: float) -> Array:
         stiffness = self._friction.limit / self._friction.give
-        scale: Array = stiffness * size * np.sum(self._shape**2, axis=(1, 2))
-        return scale
+        return stiffness * size * np.sum(self._shape**2, axis=(1, 2))
 
     # -- state -------------------------------------------------------------------------------------
 

@@ -72,12 +72,10 @@ class Spring(Pulling):
         return Springs(target, stiffness)
 
     def _pull(self, x: Array, frozen: Springs) -> Array:
-        change: Array = x[self.stencil[:, 0]] - frozen.target
-        return change
+        return x[self.stencil[:, 0]] - frozen.target
 
     def energies(self, x: Array, frozen: Springs) -> Array:
-        energy: Array = 0.5 * (frozen.stiffness * self._pull(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
-        return energy
+        return 0.5 * (frozen.stiffness * self._pull(x, frozen) ** 2).sum(axis=1)[: self.n_owned]
 
     def handle_forces(self, x: Array, frozen: Springs, count: int) -> Array:
         forces = np.zeros((count, 3))
@@ -95,8 +93,7 @@ class Spring(Pulling):
 
     def force_scale(self, size: float) -> Array:
         # of the full stiffness: the scale is asked for before the first step
-        scale: Array = self.elements.data["stiffness"].max(axis=1) * size
-        return scale
+        return self.elements.data["stiffness"].max(axis=1) * size
 
 
 def elements(rest: RestShape) -> Elements:

@@ -8,7 +8,8 @@ import itertools
 import json
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -136,11 +137,11 @@ class Bench:
             "failures": [],
         }
 
-    def _attempt(self, what: str, work: Any) -> Any:
+    def _attempt(self, what: str, work: Callable[..., Any], *given: Any, **more: Any) -> Any:
         """Measure; None, and one line for the user, where it fails."""
         print(f"bench: {what}", file=sys.stderr, flush=True)
         try:
-            return work()
+            return work(*given, **more)
         except Failed as error:
             line = f"{what}: {error}"
             self.results["failures"].append(line)
@@ -162,9 +163,7 @@ class Bench:
         what = f"{vertices} vertices, {method}, {ranks} rank(s)" + (", plain numba" if plain else "")
         what += "".join(f", {name} {value:g}" for name, value in changes.items())
         words, limits = [*self._petsc, *petsc], self._asked.limits
-        return self._attempt(
-            what, lambda: measures.row(vertices, method, ranks, words, limits, plain, **changes)
-        )
+        return self._attempt(what, measures.row, vertices, method, ranks, words, limits, plain, **changes)
 
     def save(self) -> None:
         text = json.dumps(self.results, indent=1, ensure_ascii=False)
@@ -216,32 +215,18 @@ class Bench:
         few = Limits(1, 1.0, 600.0)
         for plain in ("", self._plain) if self._asked.plain else ("",):
             for method in measures.METHODS:
-                self._attempt(
-                    f"compiling, {method}",
-                    lambda method=method, plain=plain: measures.row(1024, method, 1, self._petsc, few, plain),
-                )
+                self._attempt(f"compiling, {method}", measures.row, 1024, method, 1, self._petsc, few, plain)
 
     def _peer(self, vertices: int, name: str, command: str) -> None:
-        self._add(
-            "rows",
-            self._attempt(
-                f"{vertices} vertices, peer {name}",
-                lambda: measures.peer_row(name, command, vertices, self._folder, self._asked.limits),
-            ),
-        )
+        what, given = f"{vertices} vertices, peer {name}", (name, command, vertices)
+        self._add("rows", self._attempt(what, measures.peer_row, *given, self._folder, self._asked.limits))
 
     def _meshes(self) -> None:
         asked = self._asked
         for vertices in asked.vertices:
-            self._add(
-                "meshes",
-                self._attempt(
-                    f"{vertices} vertices, other meshes, {asked.ranks[0]} rank(s)",
-                    lambda vertices=vertices: measures.meshes(
-                        vertices, asked.ranks[0], self._petsc, self._folder, asked.limits
-                    ),
-                ),
-            )
+            what = f"{vertices} vertices, other meshes, {asked.ranks[0]} rank(s)"
+            given = vertices, asked.ranks[0], self._petsc, self._folder, asked.limits
+            self._add("meshes", self._attempt(what, measures.meshes, *given))
 
     def _bending(self) -> None:
         asked = self._asked
@@ -249,8 +234,8 @@ class Bench:
             asked.bending, measures.METHODS, asked.ranks, asked.vertices
         ):
             what = f"{vertices} vertices, {kind}, hinge and midedge, {method}, {ranks} rank(s)"
-            row = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits
-            self._add("bending", self._attempt(what, lambda row=row: measures.bending(*row)))
+            given = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits
+            self._add("bending", self._attempt(what, measures.bending, *given))
 
     def _against(self) -> None:
         asked = self._asked
@@ -258,22 +243,15 @@ class Bench:
             asked.ranks, asked.vertices, PLAIN_MESHES, measures.METHODS
         ):
             what = f"{vertices} vertices, {kind}, {method}, {ranks} rank(s), here and in {asked.against}"
-            row = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits, asked.against
-            self._add("against", self._attempt(what, lambda row=row: measures.against(*row)))
+            given = kind, vertices, method, ranks, self._petsc, self._folder, asked.limits, asked.against
+            self._add("against", self._attempt(what, measures.against, *given))
 
     def _contact(self) -> None:
         asked = self._asked
-        for vertices in asked.vertices:
-            for ranks in asked.ranks:
-                self._add(
-                    "contact",
-                    self._attempt(
-                        f"{vertices} vertices in contact, {ranks} rank(s)",
-                        lambda vertices=vertices, ranks=ranks: measures.contact(
-                            vertices, ranks, self._petsc, asked.limits, asked.settle, asked.scenes
-                        ),
-                    ),
-                )
+        for vertices, ranks in itertools.product(asked.vertices, asked.ranks):
+            what = f"{vertices} vertices in contact, {ranks} rank(s)"
+            given = vertices, ranks, self._petsc, asked.limits, asked.settle, asked.scenes
+            self._add("contact", self._attempt(what, measures.contact, *given))
 
     def _growth(self) -> None:
         known = measures.first_method(self.results["rows"])
@@ -297,12 +275,9 @@ class Bench:
         asked = self._asked
         vertices = max(asked.vertices)
         for ranks in (ranks for ranks in asked.ranks if ranks > 1):
+            what = f"{ranks} sheets of {vertices // ranks} vertices at once"
             self._add(
-                "apart",
-                self._attempt(
-                    f"{ranks} sheets of {vertices // ranks} vertices at once",
-                    lambda ranks=ranks: measures.apart(vertices, ranks, self._petsc, asked.limits),
-                ),
+                "apart", self._attempt(what, measures.apart, vertices, ranks, self._petsc, asked.limits)
             )
 
     def _presets(self) -> None:
@@ -319,16 +294,13 @@ class Bench:
                     self._add("presets", found | {"preset": name, "problem_class": title})
 
     def _rest(self) -> None:
-        asked, folder = self._asked, self._folder
+        asked, folder, petsc, limits = self._asked, self._folder, self._petsc, self._asked.limits
+        ranks, vertices = asked.ranks[-1], asked.output_vertices
         single = {
-            "overhead": lambda: measures.overhead(self._petsc, asked.limits),
-            "output": lambda: measures.output(
-                asked.output_vertices, asked.ranks[-1], self._petsc, folder, asked.limits
-            ),
-            "default_scene": lambda: measures.default_scene(
-                asked.ranks[-1], self._petsc, folder, asked.limits, short=asked.quick
-            ),
-            "start_up": lambda: measures.start_up(self._petsc, folder, asked.limits),
+            "overhead": partial(measures.overhead, petsc, limits),
+            "output": partial(measures.output, vertices, ranks, petsc, folder, limits),
+            "default_scene": partial(measures.default_scene, ranks, petsc, folder, limits, short=asked.quick),
+            "start_up": partial(measures.start_up, petsc, folder, limits),
         }
         for name, work in single.items():
             found = self._attempt(name.replace("_", " "), work)

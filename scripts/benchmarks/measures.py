@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import platform
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -30,6 +29,7 @@ from tables import growth
 
 from lyra_petsc.api.mpirun import find_launcher
 from lyra_petsc.errors import InputError, nearest
+from lyra_petsc.experiments.study.study_report import processor
 from lyra_petsc.linear.presets import PRESETS
 
 __all__ = ["METHODS", "growth", "square_number"]
@@ -55,13 +55,7 @@ Result = dict[str, Any]
 
 def machine() -> Result:
     """What the numbers were measured on."""
-    processor = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        processor = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass
-    return {"processor": processor, "cores": os.cpu_count(), "load": os.getloadavg()[0]}
+    return {"processor": processor(), "cores": os.cpu_count(), "load": os.getloadavg()[0]}
 
 
 def row(

@@ -7,8 +7,9 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import numpy as np
 from cases import BENDING_MODELS, METHODS
+
+from lyra_petsc.show.report.plots import fitted_slope
 
 Result = dict[str, Any]
 
@@ -16,30 +17,9 @@ COUNTS_FROM = 4500
 """Vertices from which a size counts for the exponent of growth."""
 
 PARTS = ("residual", "jacobian", "frozen", "energy", "preconditioner", "solve", "rest")
-COLUMNS = (
-    "vertices",
-    "who",
-    "ranks",
-    "ms a step",
-    "CPU ms",
-    "times the first",
-    "residual ms",
-    "Jacobian ms",
-    "frozen ms",
-    "energy ms",
-    "preconditioner ms",
-    "solve ms",
-    "rest ms",
-    "MatMult ms",
-    "assembly, MatMults",
-    "PETSc's MatMult ms",
-    "assembly, PETSc's MatMults",
-    "CG iterations",
-    "Newton iterations",
-    "preset",
-    "KB a vertex",
-    "set-up s",
-)
+
+Row = dict[str, str]
+"""Cells of a row of a table by their columns."""
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -58,10 +38,10 @@ def spread(values: Sequence[float], factor: float = 1.0) -> str:
     return f"{number(middle)} ({number(low)}-{number(high)})"
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    names = list(head)
-    lines = [names, ["---"] * len(names), *(list(row) for row in rows)]
+def table(rows: Sequence[Row]) -> list[str]:
+    """Lines of a Markdown table with the columns of the first row; cells that others lack are dashes."""
+    names = list(rows[0])
+    lines = [names, ["---"] * len(names), *([row.get(name, "–") for name in names] for row in rows)]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]
 
 
@@ -82,36 +62,41 @@ def main_table(rows: Sequence[Result]) -> list[str]:
         if row["who"] == METHODS[0]:
             first.setdefault(row["vertices"], row)
     ordered = sorted(rows, key=lambda row: row["vertices"])
-    return table(COLUMNS, (_cells(row, first.get(row["vertices"])) for row in ordered))
+    cells = [_main_row(row, first.get(row["vertices"])) for row in ordered]
+    # with all columns, where the first row is a peer's
+    columns: Row = dict.fromkeys(max(cells, key=len), "–")
+    return table([columns | each for each in cells])
 
 
-def _cells(row: Result, first: Result | None) -> list[str]:
+def _main_row(row: Result, first: Result | None) -> Row:
     times = step_seconds(row)
     ratio = math.nan
     if first is not None and median_of(first, "seconds") > 0.0:
         ratio = statistics.median(times) / median_of(first, "seconds")
     cpu = statistics.median(row["cpu_seconds"]) if "cpu_seconds" in row else median_of(row, "cpu")
-    cells = [str(row["vertices"]), row["who"], str(row["ranks"])]
-    cells += [spread(times, 1e3), number(1e3 * cpu), number(ratio)]
+    cells = {
+        "vertices": str(row["vertices"]),
+        "who": row["who"],
+        "ranks": str(row["ranks"]),
+        "ms a step": spread(times, 1e3),
+        "CPU ms": number(1e3 * cpu),
+        "times the first": number(ratio),
+    }
     if "step_seconds" in row:
-        return cells + ["–"] * (len(COLUMNS) - len(cells))
-    products = [row["matmult_seconds"], row["petsc_matmult_seconds"]]
+        return cells
+    for part in PARTS:
+        cells[f"{part.replace('jacobian', 'Jacobian')} ms"] = number(1e3 * median_of(row, part))
     assembly = [step["assembly"] for step in row["steps"]]
-    compared = [
-        cell
-        for times in products
-        for cell in (spread(times, 1e3), spread([each / statistics.median(times) for each in assembly]))
-    ]
-    return [
-        *cells,
-        *(number(1e3 * median_of(row, part)) for part in PARTS),
-        *compared,
-        number(median_of(row, "cg")),
-        number(median_of(row, "newton")),
-        row["preset"],
-        number(sum(row["peak_bytes"]) / row["vertices"] / 1000),
-        number(row["set_up_seconds"]),
-    ]
+    for whose, times in (("", row["matmult_seconds"]), ("PETSc's ", row["petsc_matmult_seconds"])):
+        cells[f"{whose}MatMult ms"] = spread(times, 1e3)
+        cells[f"assembly, {whose}MatMults"] = spread([each / statistics.median(times) for each in assembly])
+    return cells | {
+        "CG iterations": number(median_of(row, "cg")),
+        "Newton iterations": number(median_of(row, "newton")),
+        "preset": row["preset"],
+        "KB a vertex": number(sum(row["peak_bytes"]) / row["vertices"] / 1000),
+        "set-up s": number(row["set_up_seconds"]),
+    }
 
 
 def of_vertex(found: Result) -> float:
@@ -128,40 +113,27 @@ def contact_table(results: Sequence[Result]) -> list[str]:
         base: Result = {}
         for name, found in result["meshes"].items():
             base = found if "swing" in name and "near" not in name else base
-            cells = ["", "", ""]
+            row = {
+                "vertices": str(found["vertices"]),
+                "ranks": str(result["ranks"]),
+                "sheets": name,
+                "CPU ms a step": spread([step["cpu"] for step in found["steps"]], 1e3),
+                "wall ms a step": spread([step["seconds"] for step in found["steps"]], 1e3),
+                "CPU, times those that swing": "",
+                "the whole run": "",
+                "Newton iterations": number(median_of(found, "newton")),
+                "CG iterations": number(median_of(found, "cg")),
+                "times those that swing": "",
+                "preset": found["preset"],
+            }
             if base and base["all_cpu"] > 0.0:
                 ratios = [a["cpu"] / b["cpu"] for a, b in zip(found["steps"], base["steps"], strict=False)]
-                cells = [spread(ratios), number(found["all_cpu"] / base["all_cpu"])]
-                cells.append(number(median_of(found, "cg") / max(1.0, median_of(base, "cg"))))
-            rows.append(
-                [
-                    str(found["vertices"]),
-                    str(result["ranks"]),
-                    name,
-                    spread([step["cpu"] for step in found["steps"]], 1e3),
-                    spread([step["seconds"] for step in found["steps"]], 1e3),
-                    cells[0],
-                    cells[1],
-                    number(median_of(found, "newton")),
-                    number(median_of(found, "cg")),
-                    cells[2],
-                    found["preset"],
-                ]
-            )
-    head = (
-        "vertices",
-        "ranks",
-        "sheets",
-        "CPU ms a step",
-        "wall ms a step",
-        "CPU, times those that swing",
-        "the whole run",
-        "Newton iterations",
-        "CG iterations",
-        "times those that swing",
-        "preset",
-    )
-    return [*table(head, rows), *_growth_of_contact(results)]
+                row["CPU, times those that swing"] = spread(ratios)
+                row["the whole run"] = number(found["all_cpu"] / base["all_cpu"])
+                cg = median_of(found, "cg") / max(1.0, median_of(base, "cg"))
+                row["times those that swing"] = number(cg)
+            rows.append(row)
+    return [*table(rows), *_growth_of_contact(results)]
 
 
 def _growth_of_contact(results: Sequence[Result]) -> list[str]:
@@ -194,75 +166,52 @@ def meshes_table(results: Sequence[Result]) -> list[str]:
         for kind, found in result["meshes"].items():
             ratio = of_vertex(found) / base
             slowest = max(slowest, (ratio, f"{kind}, {found['vertices']} vertices"))
-            cpu = [step["cpu"] for step in found["steps"]]
             rows.append(
-                [
-                    str(found["vertices"]),
-                    kind,
-                    spread(cpu, 1e3),
-                    number(1e6 * of_vertex(found)),
-                    number(ratio),
-                    number(median_of(found, "cg")),
-                    found["preset"],
-                    number(found["set_up_cpu"]),
-                ]
+                {
+                    "vertices": str(found["vertices"]),
+                    "mesh": kind,
+                    "CPU ms a step": spread([step["cpu"] for step in found["steps"]], 1e3),
+                    "µs a vertex": number(1e6 * of_vertex(found)),
+                    f"times {first}": number(ratio),
+                    "CG iterations": number(median_of(found, "cg")),
+                    "preset": found["preset"],
+                    "set-up CPU s": number(found["set_up_cpu"]),
+                }
             )
-    head = (
-        "vertices",
-        "mesh",
-        "CPU ms a step",
-        "µs a vertex",
-        f"times {first}",
-        "CG iterations",
-        "preset",
-        "set-up CPU s",
-    )
     ratio, where = slowest
-    return [*table(head, rows), "", f"Worst: {where}, {number(ratio)} times the time a vertex of {first}."]
+    return [*table(rows), "", f"Worst: {where}, {number(ratio)} times the time a vertex of {first}."]
 
 
 def bending_table(results: Sequence[Result]) -> list[str]:
     """Directors on edges over hinges, in time and memory; CG iterations of a step, and their growth."""
-    rows: list[list[str]] = []
+    rows: list[Row] = []
     least: dict[tuple[str, str, int], float] = {}
     for result in results:
         hinge, midedge = (result["meshes"][model] for model in BENDING_MODELS)
         pairs = list(zip(hinge["steps"], midedge["steps"], strict=True))
+        cpu, wall = (
+            statistics.median(two[key] / one[key] for one, two in pairs) for key in ("cpu", "seconds")
+        )
         cg = [statistics.mean(step["cg"] for step in found["steps"]) for found in (hinge, midedge)]
         first = least.setdefault((result["mesh"], result["who"], result["ranks"]), cg[1])
+        newton = [median_of(found, "newton") for found in (hinge, midedge)]
         rows.append(
-            [
-                str(midedge["vertices"]),
-                result["mesh"],
-                result["who"],
-                str(result["ranks"]),
-                spread([1e3 * step["cpu"] for step in midedge["steps"]]),
-                *(
-                    number(statistics.median(two[key] / one[key] for one, two in pairs))
-                    for key in ("cpu", "seconds")
-                ),
-                ", ".join(number(each) for each in cg),
-                number(cg[1] / first),
-                ", ".join(number(median_of(found, "newton")) for found in (hinge, midedge)),
-                number(midedge["peak_bytes"] / hinge["peak_bytes"]),
-                f"{hinge['preset']}, {midedge['preset']}",
-            ]
+            {
+                "vertices": str(midedge["vertices"]),
+                "mesh": result["mesh"],
+                "who": result["who"],
+                "ranks": str(result["ranks"]),
+                "CPU ms a step, midedge": spread([1e3 * step["cpu"] for step in midedge["steps"]]),
+                "CPU, times hinge": number(cpu),
+                "wall, times hinge": number(wall),
+                "CG iterations of both": ", ".join(map(number, cg)),
+                "growth": number(cg[1] / first),
+                "Newton iterations of both": ", ".join(map(number, newton)),
+                "memory, times hinge": number(midedge["peak_bytes"] / hinge["peak_bytes"]),
+                "presets": f"{hinge['preset']}, {midedge['preset']}",
+            }
         )
-    head = (
-        "vertices",
-        "mesh",
-        "who",
-        "ranks",
-        "CPU ms a step, midedge",
-        "CPU, times hinge",
-        "wall, times hinge",
-        "CG iterations of both",
-        "growth",
-        "Newton iterations of both",
-        "memory, times hinge",
-        "presets",
-    )
-    return table(head, rows)
+    return table(rows)
 
 
 def against_table(results: Sequence[Result]) -> list[str]:
@@ -272,44 +221,32 @@ def against_table(results: Sequence[Result]) -> list[str]:
         pairs = list(zip(result["here"], result["other"], strict=True))
         cpu = [median_of(here, "cpu") / median_of(other, "cpu") for here, other in pairs]
         medians.append(statistics.median(cpu))
-        ratios = [
-            [here[key] / other[key] for here, other in pairs] for key in ("peak_bytes", "set_up_seconds")
-        ]
+        memory, set_up = (
+            statistics.median(here[key] / other[key] for here, other in pairs)
+            for key in ("peak_bytes", "set_up_seconds")
+        )
         cg = [
             statistics.mean(s["cg"] for run in result[who] for s in run["steps"]) for who in ("here", "other")
         ]
         rows.append(
-            [
-                str(result["here"][0]["vertices"]),
-                result["mesh"],
-                result["who"],
-                str(result["ranks"]),
-                spread(cpu),
-                ", ".join(number(each) for each in cg),
-                *(number(statistics.median(each)) for each in ratios),
-            ]
+            {
+                "vertices": str(result["here"][0]["vertices"]),
+                "mesh": result["mesh"],
+                "who": result["who"],
+                "ranks": str(result["ranks"]),
+                "CPU of a step, times the other's": spread(cpu),
+                "CG iterations of both": ", ".join(map(number, cg)),
+                "memory": number(memory),
+                "set-up": number(set_up),
+            }
         )
-    head = (
-        "vertices",
-        "mesh",
-        "who",
-        "ranks",
-        "CPU of a step, times the other's",
-        "CG iterations of both",
-        "memory",
-        "set-up",
-    )
     most = f"Median of the rows {number(statistics.median(medians))}, largest {number(max(medians))}."
-    return [*table(head, rows), "", most]
+    return [*table(rows), "", most]
 
 
 def exponent(rows: Sequence[Result], cost: Callable[[Result], float]) -> float:
     """Slope of log cost over log vertices by least squares; NaN with fewer than two sizes."""
-    x = np.log([row["vertices"] for row in rows])
-    y = np.log([cost(row) for row in rows])
-    if len(np.unique(x)) < 2 or not np.isfinite(y).all():
-        return math.nan
-    return float(np.polyfit(x, y, 1)[0])
+    return fitted_slope([row["vertices"] for row in rows], [cost(row) for row in rows])
 
 
 def growth(rows: Sequence[Result]) -> Result:
@@ -341,34 +278,26 @@ def growth_words(found: Result) -> list[str]:
 def weak_table(rows: Sequence[Result]) -> list[str]:
     """Weak scaling: vertices per rank stay the same."""
     base = median_of(rows[0], "seconds")
-
-    def cells(row: Result) -> list[str]:
-        return [
-            str(row["ranks"]),
-            str(row["vertices"]),
-            spread(step_seconds(row), 1e3),
-            number(base / median_of(row, "seconds")),
-            number(median_of(row, "cg")),
-            number(max(row["peak_bytes"]) / 2**20),
-            number(row["set_up_seconds"]),
+    return table(
+        [
+            {
+                "ranks": str(row["ranks"]),
+                "vertices": str(row["vertices"]),
+                "ms a step": spread(step_seconds(row), 1e3),
+                "efficiency": number(base / median_of(row, "seconds")),
+                "CG iterations": number(median_of(row, "cg")),
+                "MiB on the fullest rank": number(max(row["peak_bytes"]) / 2**20),
+                "set-up s": number(row["set_up_seconds"]),
+            }
+            for row in rows
         ]
-
-    head = (
-        "ranks",
-        "vertices",
-        "ms a step",
-        "efficiency",
-        "CG iterations",
-        "MiB on the fullest rank",
-        "set-up s",
     )
-    return table(head, map(cells, rows))
 
 
 def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
     """What ranks bring, beside what they could bring if they had nothing to tell each other."""
 
-    def cells(found: Result) -> list[str]:
+    def cells(found: Result) -> Row:
         same = [
             row for row in rows if row["who"] == METHODS[0] and row["vertices"] == found["whole_vertices"]
         ]
@@ -377,42 +306,35 @@ def apart_table(rows: Sequence[Result], apart: Sequence[Result]) -> list[str]:
             for ranks in (1, found["ranks"])
         )
         best = statistics.median(found["step_seconds"])
-        return [
-            str(found["whole_vertices"]),
-            str(found["ranks"]),
-            *(number(1e3 * seconds) for seconds in (alone, together)),
-            number(alone / together),
-            f"{found['ranks']} × {found['vertices']}",
-            spread(found["step_seconds"], 1e3),
-            number(alone / best),
-        ]
+        return {
+            "vertices": str(found["whole_vertices"]),
+            "ranks": str(found["ranks"]),
+            "ms a step, one rank": number(1e3 * alone),
+            "all ranks": number(1e3 * together),
+            "times as fast": number(alone / together),
+            "sheets apart": f"{found['ranks']} × {found['vertices']}",
+            "ms a step": spread(found["step_seconds"], 1e3),
+            "times as fast, at best": number(alone / best),
+        }
 
-    head = (
-        "vertices",
-        "ranks",
-        "ms a step, one rank",
-        "all ranks",
-        "times as fast",
-        "sheets apart",
-        "ms a step",
-        "times as fast, at best",
-    )
-    return table(head, map(cells, apart))
+    return table([cells(found) for found in apart])
 
 
 def presets_table(rows: Sequence[Result]) -> list[str]:
     """CG iterations of one solve, and time, of each preset, cloth and Δt against size."""
     sizes = sorted({row["vertices"] for row in rows})
-    cells: dict[tuple[str, str], dict[int, str]] = {}
+    lines: dict[tuple[str, str], Row] = {}
     for row in rows:
         if "problem" in row:
             shown = row["problem"]
         else:
             solves = [step["cg"] / max(1, step["solves"]) for step in row["steps"]]
             shown = f"{number(statistics.median(solves))}, {number(1e3 * median_of(row, 'seconds'))} ms"
-        cells.setdefault((row["preset"], row["problem_class"]), {})[row["vertices"]] = shown
-    head = ("preset", "cloth and Δt", *(f"{size} vertices" for size in sizes))
-    return table(head, ([*key, *(found.get(size, "–") for size in sizes)] for key, found in cells.items()))
+        key = row["preset"], row["problem_class"]
+        empty = dict.fromkeys((f"{size} vertices" for size in sizes), "–")
+        line = lines.setdefault(key, {"preset": key[0], "cloth and Δt": key[1], **empty})
+        line[f"{row['vertices']} vertices"] = shown
+    return table(list(lines.values()))
 
 
 def document(results: Result) -> str:
@@ -429,25 +351,22 @@ def document(results: Result) -> str:
     ]
     if results["rows"]:
         lines += [*main_table(results["rows"]), ""]
-    if results.get("meshes"):
-        lines += ["## Other meshes, and directors on edges", "", *meshes_table(results["meshes"]), ""]
-    if results.get("bending"):
-        lines += ["## Directors on edges beside hinges", "", *bending_table(results["bending"]), ""]
-    if results.get("against"):
-        lines += ["## Beside another checkout", "", *against_table(results["against"]), ""]
-    if results.get("contact"):
-        lines += ["## Contact", "", *contact_table(results["contact"]), ""]
-    if "growth" in results:
-        lines += [*growth_words(results["growth"]), ""]
-    if results.get("weak"):
-        lines += ["## Weak scaling", "", *weak_table(results["weak"]), ""]
-    if results.get("apart"):
-        lines += ["## What ranks bring", "", *apart_table(results["rows"], results["apart"]), ""]
-    if results.get("presets"):
-        lines += ["## CG iterations a solve, and time per step", "", *presets_table(results["presets"]), ""]
-    single = list(_single_numbers(results))
+    sections: tuple[tuple[str, str, Callable[[Any], list[str]]], ...] = (
+        ("meshes", "## Other meshes, and directors on edges", meshes_table),
+        ("bending", "## Directors on edges beside hinges", bending_table),
+        ("against", "## Beside another checkout", against_table),
+        ("contact", "## Contact", contact_table),
+        ("growth", "", growth_words),
+        ("weak", "## Weak scaling", weak_table),
+        ("apart", "## What ranks bring", lambda apart: apart_table(results["rows"], apart)),
+        ("presets", "## CG iterations a solve, and time per step", presets_table),
+    )
+    for name, title, words in sections:
+        if results.get(name):
+            lines += [*([title, ""] if title else []), *words(results[name]), ""]
+    single = [{"what": what, "measured": measured} for what, measured in _single_numbers(results)]
     if single:
-        lines += ["## Single numbers", "", *table(("what", "measured"), single), ""]
+        lines += ["## Single numbers", "", *table(single), ""]
     if results["failures"]:
         lines += ["## What failed", "", *(f"- {line}" for line in results["failures"]), ""]
     return "\n".join(lines)

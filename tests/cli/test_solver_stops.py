@@ -57,28 +57,14 @@ def test_gives_up_with_words_and_keeps_the_last_good_state(tmp_path: Path, ranks
 
 def test_a_run_resumed_with_success_leaves_no_failure(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, STIFF)
-    left = lyra(
-        ["run", scene, "--out", "out", "--set", "solver.max_iterations=1", "-ts_adapt_dt_min", "1"], tmp_path
-    )
+    fails = "--set", "solver.max_iterations=1", "-ts_adapt_dt_min", "1"
+    left = lyra(["run", scene, "--out", "out", *fails], tmp_path)
     assert left.code == 3, left.err
     assert (tmp_path / "out/failure.xdmf").exists()
     done(["run", scene, "--out", "out", "--resume", *DIRECT], tmp_path)
     assert not list((tmp_path / "out").glob("failure*"))
     assert "failure" not in read_json(tmp_path / "out/summary.json")
-    lyra(
-        [
-            "run",
-            scene,
-            "--out",
-            "out",
-            "--force",
-            "--set",
-            "solver.max_iterations=1",
-            "-ts_adapt_dt_min",
-            "1",
-        ],
-        tmp_path,
-    )
+    lyra(["run", scene, "--out", "out", "--force", *fails], tmp_path)
     assert (tmp_path / "out/failure.xdmf").exists()
     done(["run", scene, "--out", "out", "--force", *DIRECT], tmp_path)
     assert not list((tmp_path / "out").glob("failure*"))

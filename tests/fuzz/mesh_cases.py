@@ -7,6 +7,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
+from odd_values import listed
 from text_damage import damaged
 
 SCENE = """\
@@ -21,103 +22,58 @@ TRIANGLES = [(1, 2, 5), (2, 3, 5), (3, 4, 5), (4, 1, 5)]
 EDGES = [(1, 2), (2, 3)]
 NAMES = '$PhysicalNames\n2\n1 7 "edge"\n2 3 "sheet"\n$EndPhysicalNames\n'
 
-INTEGERS = [
-    0,
-    -1,
-    1,
-    2,
-    3,
-    6,
-    15,
-    99,
-    255,
-    2**15,
-    2**31 - 1,
-    -(2**31),
-    2**31,
-    2**32,
-    2**53,
-    2**62,
-    2**63 - 1,
-    2**63,
-]
-REALS = [
-    "nan",
-    "inf",
-    "-inf",
-    "1e308",
-    "-1e308",
-    "1e309",
-    "5e-324",
-    "1e-160",
-    "0",
-    "-0.0",
-    "1e16",
-    "abc",
-    "1,5",
-    "0x1p3",
-]
+POWERS = (15, 31, 32, 53, 62, 63)
+INTEGERS = [0, -1, 1, 2, 3, 6, 15, 99, 255, *(2**k for k in POWERS), 2**31 - 1, 2**63 - 1, -(2**31)]
+REALS = listed("nan inf -inf 1e308 -1e308 1e309 5e-324 1e-160 0 -0.0 1e16 abc 1,5 0x1p3")
 
 Draw = Any
 
 
-def _lines(*rows: Any) -> str:
-    return (
-        "\n".join(" ".join(map(str, row)) if isinstance(row, (list, tuple)) else str(row) for row in rows)
-        + "\n"
+def _rows(binary: bool, *rows: Any) -> bytes:
+    """Rows of numbers, each behind its format for `struct`."""
+    if binary:
+        return b"".join(struct.pack(f"<{form}", *numbers) for form, *numbers in rows) + b"\n"
+    return "".join(" ".join(map(str, numbers)) + "\n" for _, *numbers in rows).encode()
+
+
+def _msh(version: str, binary: bool, sections: dict[str, bytes]) -> bytes:
+    mark = struct.pack("<i", 1) + b"\n" if binary else b""
+    data = f"$MeshFormat\n{version} {int(binary)} 8\n".encode() + mark + b"$EndMeshFormat\n" + NAMES.encode()
+    return data + b"".join(
+        b"$%b\n%b$End%b\n" % (name.encode(), body, name.encode()) for name, body in sections.items()
     )
 
 
 def msh_2(*, binary: bool) -> bytes:
     """The sheet in format 2.2."""
-    elements = [(1, 2, 7, 1, edge) for edge in EDGES] + [(2, 2, 3, 1, triangle) for triangle in TRIANGLES]
-    if not binary:
-        nodes = [(tag, *point) for tag, point in enumerate(POINTS, 1)]
-        rows = [(i, kind, n, p, e, *nodes_) for i, (kind, n, p, e, nodes_) in enumerate(elements, 1)]
-        text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n" + NAMES + "$Nodes\n" + _lines(len(nodes), *nodes)
-        return (text + "$EndNodes\n$Elements\n" + _lines(len(rows), *rows) + "$EndElements\n").encode()
-    data = b"$MeshFormat\n2.2 1 8\n" + struct.pack("<i", 1) + b"\n$EndMeshFormat\n" + NAMES.encode()
-    data += f"$Nodes\n{len(POINTS)}\n".encode()
-    data += b"".join(struct.pack("<iddd", tag, *point) for tag, point in enumerate(POINTS, 1))
-    data += f"\n$EndNodes\n$Elements\n{len(elements)}\n".encode()
-    for number, (kind, n, p, e, nodes_) in enumerate(elements, 1):
-        data += struct.pack(f"<{6 + len(nodes_)}i", kind, 1, n, number, p, e, *nodes_)
-    return data + b"\n$EndElements\n"
+    nodes = [("i3d", tag, *point) for tag, point in enumerate(POINTS, 1)]
+    elements: list[Any] = []
+    parts = [(1, 7, edge) for edge in EDGES] + [(2, 3, triangle) for triangle in TRIANGLES]
+    for number, (kind, group, corners) in enumerate(parts, 1):
+        head = (kind, 1, 2, number) if binary else (number, kind, 2)
+        elements.append((f"{6 + len(corners)}i", *head, group, 1, *corners))
+    sections = {"Nodes": nodes, "Elements": elements}
+    return _msh(
+        "2.2", binary, {n: b"%d\n" % len(rows) + _rows(binary, *rows) for n, rows in sections.items()}
+    )
 
 
 def msh_4(*, binary: bool) -> bytes:
     """The sheet in format 4.1."""
     n, curve, surface = len(POINTS), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, 0.1)
-    if not binary:
-        text = "$MeshFormat\n4.1 0 8\n$EndMeshFormat\n" + NAMES
-        text += (
-            "$Entities\n"
-            + _lines((0, 1, 1, 0), (1, *curve, 1, 7, 0), (1, *surface, 1, 3, 1, 1))
-            + "$EndEntities\n"
-        )
-        text += "$Nodes\n" + _lines((1, n, 1, n), (2, 1, 0, n), *range(1, n + 1), *POINTS) + "$EndNodes\n"
-        edges = [(i, *edge) for i, edge in enumerate(EDGES, 1)]
-        faces = [(i, *triangle) for i, triangle in enumerate(TRIANGLES, 3)]
-        text += (
-            "$Elements\n"
-            + _lines((2, 6, 1, 6), (1, 1, 1, 2), *edges, (2, 1, 2, 4), *faces)
-            + "$EndElements\n"
-        )
-        return text.encode()
-    data = b"$MeshFormat\n4.1 1 8\n" + struct.pack("<i", 1) + b"\n$EndMeshFormat\n" + NAMES.encode()
-    data += b"$Entities\n" + struct.pack("<4Q", 0, 1, 1, 0)
-    data += struct.pack("<i6dQiQ", 1, *curve, 1, 7, 0)
-    data += struct.pack("<i6dQiQi", 1, *surface, 1, 3, 1, 1) + b"\n$EndEntities\n"
-    data += b"$Nodes\n" + struct.pack("<4Q", 1, n, 1, n) + struct.pack("<3iQ", 2, 1, 0, n)
-    data += struct.pack(f"<{n}Q", *range(1, n + 1)) + b"".join(struct.pack("<3d", *point) for point in POINTS)
-    data += b"\n$EndNodes\n$Elements\n" + struct.pack("<4Q", 2, 6, 1, 6)
-    data += struct.pack("<3iQ", 1, 1, 1, 2) + b"".join(
-        struct.pack("<3Q", i, *e) for i, e in enumerate(EDGES, 1)
-    )
-    data += struct.pack("<3iQ", 2, 1, 2, 4) + b"".join(
-        struct.pack("<4Q", i, *t) for i, t in enumerate(TRIANGLES, 3)
-    )
-    return data + b"\n$EndElements\n"
+    places = [*(("Q", tag) for tag in range(1, n + 1)), *(("3d", *point) for point in POINTS)]
+    edges = [("3Q", i, *edge) for i, edge in enumerate(EDGES, 1)]
+    faces = [("4Q", i, *triangle) for i, triangle in enumerate(TRIANGLES, 3)]
+    sections: dict[str, list[Any]] = {
+        "Entities": [
+            ("4Q", 0, 1, 1, 0),
+            ("i6dQiQ", 1, *curve, 1, 7, 0),
+            ("i6dQiQi", 1, *surface, 1, 3, 1, 1),
+        ],
+        "Nodes": [("4Q", 1, n, 1, n), ("3iQ", 2, 1, 0, n), *places],
+        "Elements": [("4Q", 2, 6, 1, 6), ("3iQ", 1, 1, 1, 2), *edges, ("3iQ", 2, 1, 2, 4), *faces],
+    }
+    return _msh("4.1", binary, {name: _rows(binary, *rows) for name, rows in sections.items()})
 
 
 OBJ = b"""# a sheet

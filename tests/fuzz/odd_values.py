@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import or_
 from typing import Any
 
 from hypothesis import strategies as st
@@ -11,110 +13,33 @@ class Raw(str):
     """A piece of YAML that is written as it stands."""
 
 
-NUMBERS = [
-    "0",
-    "-0.0",
-    "1",
-    "-1",
-    "2",
-    "3",
-    "0.5",
-    "1e-3",
-    "1e3",
-    "1e308",
-    "-1e308",
-    "1.7976931348623157e308",
-    "1e309",
-    "-1e309",
-    "5e-324",
-    "2.2e-308",
-    "1e-320",
-    "1e-160",
-    "1e160",
-    "1e-30",
-    "1e30",
-    "1e15",
-    "1e-15",
-    ".nan",
-    ".NaN",
-    ".inf",
-    "-.inf",
-    "2147483647",
-    "2147483648",
-    "-2147483648",
-    "4294967296",
-    "9223372036854775807",
-    "9223372036854775808",
-    "18446744073709551616",
-    "1" + "0" * 400,
-    "1" + "0" * 5000,
-    "0x10",
-    "0o17",
-    "017",
-    "0b11",
-    "1_000",
-    "1:30:00",
-    "190:20:30.15",
-    "12e03",
-    "+1",
-    "+.5",
-    "1.",
-    "1e",
-    "0.1e-4000",
-]
+def listed(text: str) -> list[str]:
+    """The pieces of a text between white space."""
+    return text.split()
 
-WORDS = [
-    "~",
-    "null",
-    "true",
-    "false",
-    "yes",
-    "no",
-    "on",
-    "auto",
-    "static",
+
+NUMBERS = listed("""
+0 -0.0 1 -1 2 3 0.5 1e-3 1e3 1e308 -1e308 1.7976931348623157e308 1e309 -1e309 5e-324 2.2e-308 1e-320 1e-160
+1e160 1e-30 1e30 1e15 1e-15 .nan .NaN .inf -.inf 2147483647 2147483648 -2147483648 4294967296
+9223372036854775807 9223372036854775808 18446744073709551616 0x10 0o17 017 0b11 1_000 1:30:00 190:20:30.15
+12e03 +1 +.5 1. 1e 0.1e-4000
+""")
+NUMBERS += ["1" + "0" * 400, "1" + "0" * 5000]
+
+WORDS = listed(r"""
+~ null true false yes no on auto static '' abc gravity "1.0" 'nan' "\0" "a\0b" "\n" "a\nb" "\r\n" "\u202e"
+"\ud83d\ude00" "\x07" "\e[31m" ünïcödé 日本語 2001-01-01 2001-12-14t21:59:43.10-05:00 2001-13-45 12:30
+../../etc/passwd /etc/passwd /dev/zero / mesh.obj none.geo - ? % @a `a` * *nowhere &anchor
+""")
+WORDS += [
     "",
-    "''",
     '" "',
-    "abc",
-    "gravity",
-    '"1.0"',
-    "'nan'",
-    '"\\0"',
-    '"a\\0b"',
-    '"\\n"',
-    '"a\\nb"',
-    '"\\r\\n"',
-    '"\\u202e"',
-    '"\\ud83d\\ude00"',
-    '"\\x07"',
-    '"\\e[31m"',
-    "ünïcödé",
-    "日本語",
     "'" + "x" * 3000 + "'",
     "|\n  a\n  b",
     ">\n  a\n  b",
-    "2001-01-01",
-    "2001-12-14t21:59:43.10-05:00",
-    "2001-13-45",
-    "12:30",
-    "../../etc/passwd",
-    "/etc/passwd",
-    "/dev/zero",
-    "/",
-    "mesh.obj",
-    "none.geo",
     "a: b",
     "- a",
-    "-",
-    "?",
-    "%",
-    "@a",
-    "`a`",
-    "*",
-    "*nowhere",
     "&anchor 1",
-    "&anchor",
     "!!str 1",
     "!!int 1.5",
     "!!int abc",
@@ -184,11 +109,14 @@ def magnitude() -> st.SearchStrategy[float]:
     return st.floats(-323.0, 308.0).map(lambda power: max(10.0**power, 5e-324))
 
 
+def rarely(odd: st.SearchStrategy[Any], else_: st.SearchStrategy[Any], one_in: int) -> st.SearchStrategy[Any]:
+    """One in so many odd values among others."""
+    return st.integers(0, one_in - 1).flatmap(lambda which: odd if which == one_in - 1 else else_)
+
+
 def usual(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
     """A number of a usual size; one in ``wild`` of any size."""
-    return st.integers(0, wild - 1).flatmap(
-        lambda which: magnitude() if which == wild - 1 else st.floats(low, high)
-    )
+    return rarely(magnitude(), st.floats(low, high), wild)
 
 
 def signed(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float]:
@@ -201,6 +129,17 @@ def signed(low: float, high: float, *, wild: int = 6) -> st.SearchStrategy[float
 def vector(low: float = 0.0, high: float = 10.0, *, wild: int = 10) -> st.SearchStrategy[list[float]]:
     """Three numbers."""
     return st.lists(signed(low, high, wild=wild), min_size=3, max_size=3)
+
+
+@st.composite
+def sometimes(draw: Any, one_in: int, entries: dict[str, st.SearchStrategy[Any]]) -> dict[str, Any]:
+    """A block in which each entry stands once in so many times."""
+    return {key: draw(value) for key, value in entries.items() if draw(st.integers(0, one_in - 1)) == 0}
+
+
+def joined(*blocks: st.SearchStrategy[dict[str, Any]]) -> st.SearchStrategy[dict[str, Any]]:
+    """A block with the entries of all of these."""
+    return st.tuples(*blocks).map(lambda parts: reduce(or_, parts))
 
 
 def emit(value: Any) -> str:

@@ -7,52 +7,17 @@ from typing import Any
 
 from hypothesis import strategies as st
 from judge import Case
-from odd_values import Raw, magnitude, places_of, signed, usual, vector
+from odd_values import Raw, joined, listed, magnitude, places_of, signed, sometimes, usual, vector
 from scene_cases import SHEET
 from text_damage import damaged
 
-ODD = [
-    "0",
-    "-1",
-    "1e308",
-    "1e309",
-    "-1e-320",
-    "NaN",
-    "Infinity",
-    "-Infinity",
-    "null",
-    "true",
-    "false",
-    '""',
-    '"a"',
-    "[]",
-    "{}",
-    "[[]]",
-    "[0,0,0]",
-    "[1,2]",
-    "[1e308,1e308,1e308]",
-    "1" + "0" * 400,
-    "1" + "0" * 5000,
-    "1.5",
-    '"\\u0000"',
-    '"\\ud800"',
-    '"../../../etc/passwd"',
-    '"/etc/passwd"',
-    "[" * 2000 + "]" * 2000,
-    '{"a":' * 500 + "1" + "}" * 500,
-    '"' + "x" * 3000 + '"',
-    "2147483647",
-    "99999999999999999999",
-    "// comment\n1",
-    "/* a */ 2",
-    "01",
-    "+1",
-    ".5",
-    "1.",
-    "'a'",
-    "undefined",
-    '{"a":1,"a":2}',
-]
+ODD = listed(r"""
+0 -1 1e308 1e309 -1e-320 NaN Infinity -Infinity null true false "" "a" [] {} [[]] [0,0,0] [1,2]
+[1e308,1e308,1e308] 1.5 "\u0000" "\ud800" "../../../etc/passwd" "/etc/passwd" 2147483647 99999999999999999999
+01 +1 .5 1. 'a' undefined {"a":1,"a":2}
+""")
+ODD += ["1" + "0" * 400, "1" + "0" * 5000, '"' + "x" * 3000 + '"', "// comment\n1", "/* a */ 2"]
+ODD += ["[" * 2000 + "]" * 2000, '{"a":' * 500 + "1" + "}" * 500]
 TABLE = {
     "density": 0.2,
     "stretching": [[60.0, 10.0, 60.0, 20.0]] * 6,
@@ -71,61 +36,59 @@ def _json(value: Any) -> str:
     return json.dumps(value)
 
 
-def _placement(draw: Draw) -> dict[str, Any]:
-    return {
-        "translate": draw(vector(0.0, 1.0)),
-        "scale": draw(st.just(1.0) | usual(0.5, 2.0)),
-        "rotate": [draw(signed(0.0, 360.0)), *draw(vector(0.1, 1.0))],
+PLACEMENT = st.fixed_dictionaries(
+    {
+        "translate": vector(0.0, 1.0),
+        "scale": st.just(1.0) | usual(0.5, 2.0),
+        "rotate": st.tuples(signed(0.0, 360.0), vector(0.1, 1.0)).map(lambda two: [two[0], *two[1]]),
     }
-
-
-@st.composite
-def originals(draw: Draw) -> dict[str, Any]:
-    """A conf.json that is meant to be sound."""
-    data: dict[str, Any] = {
-        "frame_time": draw(usual(0.01, 0.1)),
-        "frame_steps": draw(st.integers(1, 10)),
-        "end_time": draw(usual(0.1, 10.0)),
-        "cloths": [
-            {
-                "mesh": "sheet.obj",
-                "transform": _placement(draw),
-                "materials": [
-                    {
-                        "data": draw(
-                            st.sampled_from(["materials/gray-interlock.json", "paper", "table.json"])
-                        ),
-                        "damping": draw(usual(0.0, 0.1)),
-                        "thicken": draw(usual(0.5, 2.0)),
-                        "bending_mult": draw(usual(0.0, 10.0)),
-                    }
-                ],
-            }
-            for _ in range(draw(st.integers(1, 2)))
-        ],
-        "handles": [
-            {
-                "nodes": [draw(st.integers(0, 5))],
-                "end_time": draw(usual(0.1, 10.0)),
-                "motion": draw(st.integers(-1, 1)),
-            }
-            for _ in range(draw(st.integers(0, 2)))
-        ],
-        "gravity": draw(vector(0.0, 10.0)),
-    }
-    if draw(st.booleans()):
-        data["motions"] = [
-            [{"time": 0, "transform": _placement(draw)}, {"time": draw(magnitude()), "transform": {}}]
-        ]
-    if draw(st.booleans()):
-        data["wind"] = {"velocity": draw(vector(0.0, 10.0)), "density": draw(usual(0.0, 2.0))}
-    return data
+)
+CLOTH = {
+    "mesh": st.just("sheet.obj"),
+    "transform": PLACEMENT,
+    "materials": st.fixed_dictionaries(
+        {
+            "data": st.sampled_from(["materials/gray-interlock.json", "paper", "table.json"]),
+            "damping": usual(0.0, 0.1),
+            "thicken": usual(0.5, 2.0),
+            "bending_mult": usual(0.0, 10.0),
+        }
+    ).map(lambda material: [material]),
+}
+HANDLE = {
+    "nodes": st.lists(st.integers(0, 5), min_size=1, max_size=1),
+    "end_time": usual(0.1, 10.0),
+    "motion": st.integers(-1, 1),
+}
+MOTION = st.tuples(PLACEMENT, magnitude()).map(
+    lambda two: [{"time": 0, "transform": two[0]}, {"time": two[1], "transform": {}}]
+)
+ORIGINALS = joined(
+    st.fixed_dictionaries(
+        {
+            "frame_time": usual(0.01, 0.1),
+            "frame_steps": st.integers(1, 10),
+            "end_time": usual(0.1, 10.0),
+            "cloths": st.lists(st.fixed_dictionaries(CLOTH), min_size=1, max_size=2),
+            "handles": st.lists(st.fixed_dictionaries(HANDLE), max_size=2),
+            "gravity": vector(0.0, 10.0),
+        }
+    ),
+    sometimes(
+        2,
+        {
+            "motions": MOTION.map(lambda motion: [motion]),
+            "wind": st.fixed_dictionaries({"velocity": vector(0.0, 10.0), "density": usual(0.0, 2.0)}),
+        },
+    ),
+)
+"""A conf.json that is meant to be sound."""
 
 
 @st.composite
 def original_cases(draw: Draw) -> Case:
     """A conf.json with its mesh and a material table."""
-    data = draw(originals())
+    data = draw(ORIGINALS)
     kind = draw(st.sampled_from(["sound", "mutated", "mutated", "damaged"]))
     if kind == "mutated":
         for _ in range(draw(st.integers(1, 2))):

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from oracle import blocks_of, expanded, summed
 from petsc4py import PETSc
 from physics import CLOTH, Simulation, grid, rotation
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix, Matrix
 from lyra_petsc.terms.membrane import Membrane
-
-Array = NDArray[np.float64]
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 

@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from lyra_petsc.arrays import Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.build import grid_sheet
 from lyra_petsc.mesh.distribute import Part, Whole, distribute, split_elements
@@ -18,8 +18,6 @@ from lyra_petsc.mesh.partitioner import bisection, locality_order, partition, ve
 from lyra_petsc.mesh.points import Numbering, Points
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.scene.schema import Grid
-
-Ints = NDArray[np.int64]
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
 

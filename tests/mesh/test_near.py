@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.near import near, near_in_order, swept_boxes
-
-Array = NDArray[np.float64]
 
 SIZES: dict[str, float | list[float]] = {
     "small": 0.05,
@@ -84,25 +83,17 @@ def test_none(n: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.05, 0.4])
-def test_boxes_within_reach_that_have_no_corner_in_common(reach: float) -> None:
+def test_boxes_within_reach(reach: float) -> None:
     rng = np.random.default_rng(3)
     low, high = boxes(rng, 80, 1.0)
     other_low, other_high = boxes(rng, 90, 0.8)
-    corners, other_corners = rng.integers(0, 60, (80, 2)), rng.integers(0, 60, (90, 3))
     way = np.maximum(np.maximum(other_low - high[:, None], low[:, None] - other_high), 0.0)
     close = np.linalg.norm(way, axis=2) <= reach
-    common = (corners[:, None, :, None] == other_corners[None, :, None, :]).any(axis=(2, 3))
-    found = near(
-        (low, high), (other_low, other_high), reach=reach, corners=corners, other_corners=other_corners
-    )
-    assert as_set(found) == as_set(np.argwhere(close & ~common))
-    assert (close & common).any()
+    found = near((low, high), (other_low, other_high), reach=reach)
+    assert as_set(found) == as_set(np.argwhere(close))
     way = np.maximum(low[:, None] - high, 0.0)
     close = np.linalg.norm(np.maximum(way, way.transpose(1, 0, 2)), axis=2) <= reach
-    common = (corners[:, None, :, None] == corners[None, :, None, :]).any(axis=(2, 3))
-    assert as_set(near((low, high), reach=reach, corners=corners)) == as_set(
-        np.argwhere(np.triu(close & ~common, 1))
-    )
+    assert as_set(near((low, high), reach=reach)) == as_set(np.argwhere(np.triu(close, 1)))
 
 
 def test_boxes_of_what_simplices_pass() -> None:

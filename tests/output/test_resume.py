@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, direct_solver, grid, scene_of
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import Interrupted
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import stored_states
-
-Array = NDArray[np.float64]
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),
@@ -87,8 +85,7 @@ def journey(
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return content
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
 
 
 def last(folder: Path) -> tuple[int, float]:

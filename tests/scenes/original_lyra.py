@@ -9,9 +9,9 @@ Facts: the Lyra paper and its sources.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
+
 HANDLE = 1000.0  # N/m
 
 

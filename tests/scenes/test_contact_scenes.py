@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from lyra_petsc.api.run_loop import ProgressCallbacks, simulate
-from lyra_petsc.cli.check_run import RunCrossings
+from lyra_petsc.arrays import Array
+from lyra_petsc.cli.check_run import crossings_of
 from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.run_folder import FolderChoice
 from lyra_petsc.scene.load import load_scene
-
-Array = NDArray[np.float64]
+from lyra_petsc.show.obstacle_surfaces import run_obstacles
 
 pytestmark = pytest.mark.parallel
 
@@ -30,9 +29,9 @@ def run_of(comm: MPI.Comm, folder: Path, name: str, *settings: str) -> StoredRun
     if comm.rank > 0:
         return None
     run = StoredRun(folder / "run")
-    look = RunCrossings(run)
+    obstacles = run_obstacles(run)
     for state in range(len(run)):
-        pairs, at_corners, overlaps = look.of(state)
+        pairs, at_corners, overlaps = crossings_of(run, obstacles, state)
         inside = [part for overlap in overlaps.values() for part in overlap]
         assert not any(len(found) for found in (pairs, at_corners, *inside))
     assert np.median(np.asarray(run.history["newton_iterations"])[1:]) <= 12

@@ -34,8 +34,7 @@ def simulated(name: str, *settings: str) -> Iterator[SteppedScene]:
 
 
 def mean_of(simulation: SteppedScene, probe: str) -> NDArray[np.float64]:
-    mean: NDArray[np.float64] = simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
-    return mean
+    return simulation.problem.system.x[simulation.problem.probes[probe]].mean(axis=0)
 
 
 def test_a_turning_ball_takes_its_cloth_along() -> None:

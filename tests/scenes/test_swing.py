@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from module_of import module_of
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import Simulation, grid, reference
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 GRAVITY = 9.81
 CELLS = 40

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 import subprocess
 import sys
 import time
@@ -14,7 +15,6 @@ from cases import GRADED, MESHES, corners, hanging_square, on_mesh, small_sheet,
 from peers import write_files, write_scene
 from processes import Failed, Limits, run
 from tables import (
-    COLUMNS,
     against_table,
     bending_table,
     document,
@@ -61,19 +61,7 @@ def tables_of(markdown: str) -> list[list[list[str]]]:
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bench")
-    words = [
-        "--quick",
-        "--vertices",
-        "36",
-        "--ranks",
-        "1,2",
-        "--steps",
-        "3",
-        "--seconds",
-        "0.2",
-        "--weak",
-        "50",
-    ]
+    words = shlex.split("--quick --vertices 36 --ranks 1,2 --steps 3 --seconds 0.2 --weak 50")
     peers = [
         "slow=for i in $(seq {steps}); do sleep 0.2; done",
         "idle=true",
@@ -143,7 +131,10 @@ def test_markdown_shows_them(measured):
         assert {len(line) for line in lines} == {len(lines[0])}
         assert all(cell for line in lines for cell in line)
     rows, meshes, weak, apart, presets, single = tables_of(text)
-    assert tuple(rows[0]) == COLUMNS
+    assert rows[0][:7] == [
+        "vertices", "who", "ranks", "ms a step", "CPU ms", "times the first", "residual ms"
+    ]  # fmt: skip
+    assert len(rows[0]) == 22
     assert [line[1] for line in rows[1:]] == [*["semi-implicit"] * 2, *["beuler"] * 2, "slow", "idle"]
     assert rows[1][5] == "1.00"
     assert [line[1] for line in meshes[1:]] == list(MESHES)

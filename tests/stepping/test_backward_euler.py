@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, Simulation, equilateral, grid, reference
 
-Array = NDArray[np.float64]
+from lyra_petsc.arrays import Array
 
 EXACT = reference("backward_euler")
 

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, gathered, grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.step_control import StepControl
 from lyra_petsc.terms.term import UpcomingStep
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel(2)
 

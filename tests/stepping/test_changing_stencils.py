@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, SOLVERS, gathered, grid, scene_of
 from repulsion_term import DISTANCE, REPULSION, Repulsion
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms import registry
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, direct_solver, gathered, grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.failure_diagnosis import worst
@@ -22,7 +22,6 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel(2)
 
-Array = NDArray[np.float64]
 Spoil = Callable[[SteppedScene, Array], None]
 
 SCENE: dict[str, Any] = {

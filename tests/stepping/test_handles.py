@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, Simulation, grid, rotation
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Keyframe
 from lyra_petsc.terms.motion import Motion, Window, motion_of
 from lyra_petsc.terms.spring import Spring
-
-Array = NDArray[np.float64]
 
 DT = 0.05
 MESH = grid(1.0, 0.6, 4, 3)

@@ -7,12 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import Simulation, gathered, grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel(2)
 

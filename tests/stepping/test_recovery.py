@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 SCENE: dict[str, Any] = {
     "mesh": grid(0.6, 0.4, 5, 4, "alternating"),

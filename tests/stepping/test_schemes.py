@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, Simulation, equilateral, grid
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.scene.schema import INTEGRATORS
 from lyra_petsc.stepping.integrators.alpha2 import GeneralisedAlpha
 from lyra_petsc.stepping.integrators.bdf2 import Bdf2
-
-Array = NDArray[np.float64]
 
 SECOND_ORDER = ("midpoint", "alpha2", "bdf2")
 

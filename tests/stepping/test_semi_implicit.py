@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from oracle import blocks_of, gradient, summed
 from physics import CLOTH, Simulation, grid
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.stage_equations import StageEquations
-
-Array = NDArray[np.float64]
 
 DT, GAMMA = 0.01, 0.03
 

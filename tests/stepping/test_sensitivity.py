@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import grid
 
 import lyra_petsc
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 STEP = 2e-4
 """Relative change of a number to both sides."""
@@ -191,8 +189,7 @@ def difference(scene: Scene, direction: Mapping[str, float], step: float) -> Arr
         changes = {key: value * (1.0 + factor * step) for key, value in direction.items()}
         return end(scene.changed(changes))
 
-    slope: Array = (at(1.0) - at(-1.0)) / (2.0 * step)
-    return slope
+    return (at(1.0) - at(-1.0)) / (2.0 * step)
 
 
 @pytest.mark.slow

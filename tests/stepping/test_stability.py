@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, gathered, grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping import equilibrium
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.stepping.stability import Examination
 from lyra_petsc.terms import registry
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel(2)
 

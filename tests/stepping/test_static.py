@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, gathered, grid, obj_file, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import SolverError
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.linear import presets
 from lyra_petsc.stepping.simulation import SteppedScene
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel(2)
 

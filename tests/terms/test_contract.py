@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from examples import FRAGMENTS, example
-from numpy.typing import NDArray
 from oracle import (
     blocks_of,
     differences,
@@ -23,6 +22,7 @@ from oracle import (
 )
 from physics import Simulation, rotation
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.terms.midedge import MidEdge
 from lyra_petsc.terms.midedge_shape import Frames
 from lyra_petsc.terms.registry import REGISTRY, Role
@@ -30,7 +30,6 @@ from lyra_petsc.terms.term import Elastic, Load, Pulling, Term, UpcomingStep, Vi
 
 pytestmark = pytest.mark.quick
 
-Array = NDArray[np.float64]
 
 #: anchored in space: neither invariant under rigid motion nor free of resultants
 ANCHORED = {"clamp", "spring"}

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from edge_angle_term import IN_PLACE_OF_HINGES
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import CLOTH, SOLVERS, end_on_one_rank, gathered, grid, rotation, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms import registry
 from lyra_petsc.terms.term import Elastic
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel
 

@@ -7,13 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, Simulation, grid
 
 from lyra_petsc.terms.edge_turns import EdgeTurns
 from lyra_petsc.terms.midedge import MidEdge
-
-Array = NDArray[np.float64]
 
 pytestmark = pytest.mark.parallel
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from oracle import bending_blocks, summed
 from oracle import gradient as gradient_of
 from oracle import hessian as hessian_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.clamp import Clamp
@@ -19,8 +19,6 @@ from lyra_petsc.terms.hinge_energy import FADES_BELOW, fading_limit
 from lyra_petsc.terms.motion import STILL, Window
 from lyra_petsc.terms.registry import registered
 from lyra_petsc.terms.term import Elastic, UpcomingStep
-
-Array = NDArray[np.float64]
 
 EDGE = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
 FULL = np.array([[0.3, 0.8, 0.1], [0.6, -0.7, 0.3]])

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from oracle import bending_blocks, expanded, gradient, summed
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.linear.pattern import BlockPattern
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.topology import hinges
 from lyra_petsc.terms.bending import Bending
 from lyra_petsc.terms.hinge_triangles import triangles_of
 from lyra_petsc.terms.registry import registered
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def strip(n: int, *, twisted: bool) -> Ints:

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from oracle import frozen_by, gradient
 from physics import Simulation, grid, rotation
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.terms.term import Load, Viscous
-
-Array = NDArray[np.float64]
 
 #: a unit square of two triangles with a curve group of unequal edges, a surface and a point group
 GEO = """

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from oracle import differences, gradient, hessian
 from physics import Simulation, obj_file
 from scipy.optimize import brentq
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.scene.dump import dump_scene
@@ -27,7 +27,6 @@ from lyra_petsc.terms.membrane_laws.measured import fit_errors
 
 pytestmark = pytest.mark.quick
 
-Array = NDArray[np.float64]
 
 GRID = {"width": 1.0, "height": 1.0, "nx": 2, "ny": 2}
 SCENE = {"time": {"end": 1.0, "step": 0.1}}

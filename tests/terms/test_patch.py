@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from oracle import hessian
 from physics import Simulation, obj_file, reference, rotation
 
@@ -16,7 +15,6 @@ from lyra_petsc.mesh.topology import boundary_edges
 
 pytestmark = pytest.mark.quick
 
-Array = NDArray[np.float64]
 
 PATCH = reference("stvk_patch")
 ROWS = PATCH["rows"]

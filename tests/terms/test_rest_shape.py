@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 from examples import BENDING, curved_sheet
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import CLOTH, Simulation, grid, obj_file
 
 from lyra_petsc.terms.bending import Bending
-
-Array = NDArray[np.float64]
 
 
 def bending_of(simulation: Simulation) -> Bending:

@@ -197,12 +197,12 @@ def _suffix(record: Record, curve: Curve) -> str:
     return "" if len(record.curves) == 1 else f"-{record.curves.index(curve) + 1}"
 
 
-def pictures(outcome: FabricOutcome, *, small: bool = False) -> list[Drawing]:
+def pictures(outcome: FabricOutcome) -> list[Drawing]:
     """The curves and the shadow of a test."""
     record, name, found = outcome.record, outcome.case.name, []
     if record.curves:
         lines = [Series(c.name, c.x, c.y) for c in record.curves]
-        figure = empty_figure((0.45 if small else 0.8) * HEIGHT)
+        figure = empty_figure(0.8 * HEIGHT)
         axes = figure.add_subplot(xlabel=record.curves[0].x_label, ylabel=record.curves[0].y_label)
         for number, line in enumerate(lines):
             axes.plot(line.x, line.y, color=colour(number), label=line.name, lw=1.4, marker=".", ms=3)

@@ -44,7 +44,7 @@ from lyra_petsc.experiments.fabric.records import (
     restore,
 )
 from lyra_petsc.experiments.fabric.specimens import GF_PER_CM, Fabric, G
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rounded
 from lyra_petsc.scene.materials.curves import force_at
 from lyra_petsc.scene.materials.library import ShellMaterial
 from lyra_petsc.scene.schema import KES_ANGLE, KES_CURVATURE
@@ -400,26 +400,19 @@ def _shot(slope: float, pull: float, weight: float) -> Ends:
 
     θ'' = Γ (1 − s) cos θ + H sin θ from the clamp, where θ = 90°, by Runge and Kutta.
     """
-    h, state, s = 1.0 / SHOTS, (0.5 * math.pi, slope, 0.0, 0.0), 0.0
+    h, y = 1.0 / SHOTS, np.array([0.5 * math.pi, slope, 0.0, 0.0])
 
-    def rates(at: float, y: Sequence[float]) -> tuple[float, ...]:
+    def rates(at: float, y: Array) -> Array:
         cosine, sine = math.cos(y[0]), math.sin(y[0])
-        return y[1], weight * (1.0 - at) * cosine + pull * sine, cosine, sine
+        return np.array([y[1], weight * (1.0 - at) * cosine + pull * sine, cosine, sine])
 
-    def ahead(part: float, by: Sequence[float]) -> list[float]:
-        return [y + part * h * r for y, r in zip(state, by, strict=True)]
-
-    for _ in range(SHOTS):
-        one = rates(s, state)
-        two = rates(s + 0.5 * h, ahead(0.5, one))
-        three = rates(s + 0.5 * h, ahead(0.5, two))
-        four = rates(s + h, ahead(1.0, three))
-        angle, turn, x, z = (
-            y + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-            for y, a, b, c, d in zip(state, one, two, three, four, strict=True)
-        )
-        state, s = (angle, turn, x, z), s + h
-    return state[0] + math.pi, state[2], state[3]
+    for s in h * np.arange(SHOTS):
+        one = rates(s, y)
+        two = rates(s + 0.5 * h, y + 0.5 * h * one)
+        three = rates(s + 0.5 * h, y + 0.5 * h * two)
+        four = rates(s + h, y + h * three)
+        y = y + h / 6.0 * (one + 2.0 * two + 2.0 * three + four)
+    return float(y[0]) + math.pi, float(y[2]), float(y[3])
 
 
 def loop_height(bending_length: float, strip: float) -> float:
@@ -524,8 +517,7 @@ PIXELS = 240
 def _disc(cells: int, seed: int) -> tuple[Array, Ints]:
     """A disc of radius 1, a square of irregular cells mapped smoothly: no direction has more folds for it."""
     flat, faces = irregular_rectangle(cells, cells, 2.0, 2.0, seed)
-    i, j = flat[:, 0] - 1.0, flat[:, 1] - 1.0
-    return np.column_stack([i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2), 0.0 * i]), faces
+    return rounded(flat - [1.0, 1.0, 0.0]), faces
 
 
 def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:

@@ -296,10 +296,7 @@ def _step(trial: Trial, low: Array, high: Array) -> float:
 def _held(numbers: Any, gradient: Any, low: Array, high: Array) -> Mask:
     """Which numbers lie at a bound that the cost drives them against."""
     slack = 1e-9 * (high - low)
-    held: Mask = ((numbers <= low + slack) & (gradient > 0.0)) | (
-        (numbers >= high - slack) & (gradient < 0.0)
-    )
-    return held
+    return ((numbers <= low + slack) & (gradient > 0.0)) | ((numbers >= high - slack) & (gradient < 0.0))
 
 
 def refuse_idle(unknowns: Sequence[Unknown], trial: Trial, file: object = None) -> None:

@@ -23,7 +23,6 @@ from lyra_petsc.parallel import on_root
 from lyra_petsc.scene.materials.library import resolve
 from lyra_petsc.scene.schema import Scene
 from lyra_petsc.stepping.sensitivity import Number, Sensitivities
-from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.registry import active
 
 ROOTS = ("material", "gravity", "wind", "handles", "loads", "initial")
@@ -181,7 +180,8 @@ class Model:
                 raise InputError(
                     f"is at {left[0].time:g}, where the run has ended before", key=left[0].readings[0].key
                 )
-            self._keep_shape(simulation)
+            shape = simulation.problem.points.gathered(simulation.problem.system.x)
+            self.shape = shape if self.comm.rank == 0 else None
             if beside is not None:
                 beside.destroy()
         return Evaluation(numbers, np.concatenate(values), np.concatenate(slopes) if slopes else None)
@@ -201,15 +201,6 @@ class Model:
             columns.append((pair[0] - pair[1]) / (2.0 * WHOLE_RUNS * size))
         found = self._evaluate(numbers, False, partial(_scaled, progress, count - 1, count))
         return Evaluation(numbers, found.values, np.stack(columns, axis=1))
-
-    def _keep_shape(self, simulation: SteppedScene) -> None:
-        points = simulation.problem.points
-        x = simulation.problem.system.x[: points.n_vertices].copy()
-        pieces = self.comm.gather((points.original, x), root=0)
-        if pieces is not None:
-            self.shape = np.empty((points.n_vertices_global, 3))
-            for original, rows in pieces:
-                self.shape[original] = rows
 
 
 def _scaled(progress: Progress, done: int, count: int, part: float) -> None:

@@ -104,8 +104,7 @@ class Places(Reading):
     def means(self, total: Array) -> Array:
         """Mean positions (n, 3) [m]."""
         sums = total.reshape(-1, 4)
-        means: Array = sums[:, :3] / sums[:, 3:]
-        return means
+        return sums[:, :3] / sums[:, 3:]
 
     def values(self, total: Array) -> Array:
         means = self.means(total)
@@ -228,7 +227,7 @@ def _refuse_times(scene: Scene, readings: Sequence[Reading]) -> None:
             )
 
 
-def readings_without_values(scene: Scene, quantity: Quantity, key: str = "quantity") -> list[Reading]:
+def readings_without_values(scene: Scene, quantity: Quantity) -> list[Reading]:
     """A quantity that was not measured, at one time, or at those of its table (one rank).
 
     Raises
@@ -237,9 +236,9 @@ def readings_without_values(scene: Scene, quantity: Quantity, key: str = "quanti
         As `readings_of`.
     """
     if quantity.points is not None:
-        found = _points(scene, _Table(quantity.points), key, quantity.at, 1.0)
+        found = _points(scene, _Table(quantity.points), "quantity", quantity.at, 1.0)
     else:
-        found = [_made(scene, quantity, key, quantity.at or scene.time.end)]
+        found = [_made(scene, quantity, "quantity", quantity.at or scene.time.end)]
     _refuse_times(scene, found)
     return found
 

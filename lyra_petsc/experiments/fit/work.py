@@ -142,8 +142,7 @@ class Fitted:
         """(m, n) of each value, in its uncertainties, to a change of each number by its size."""
         size = np.array([unknown.size for unknown in self.unknowns])
         best = min(self.trials, key=lambda trial: trial.cost)
-        scaled: Array = best.jacobian * size
-        return scaled
+        return best.jacobian * size
 
 
 def unknowns_of(scene: Scene) -> list[Unknown]:

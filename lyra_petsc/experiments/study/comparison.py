@@ -124,8 +124,7 @@ class Samples:
                 stored = opened[dataset]
                 if wanted is not None:
                     return _picked(stored, wanted)
-                rows: Array = stored[slice(*slab(comm, self.n_vertices))]
-                return rows
+                return stored[slice(*slab(comm, self.n_vertices))]
 
         return on_each(comm, read)
 
@@ -260,8 +259,7 @@ class Transfer:
     def rows(self, comm: MPI.Comm, samples: Samples, sample: int) -> Array:
         """Positions (n, 3) [m] of the other mesh's surface at this rank's points; collective."""
         found = samples.rows(comm, sample, self.wanted)
-        interpolated: Array = np.einsum("nc,nci->ni", self.weight, found[self.corner])
-        return interpolated
+        return np.einsum("nc,nci->ni", self.weight, found[self.corner])
 
 
 def make_transfer(

@@ -652,10 +652,15 @@ def busy(ranks: int) -> list[str]:
     return [note] if load + ranks > cores + 0.5 else []
 
 
-def machine() -> str:
-    """Processor and cores, in words."""
-    model = platform.machine()
+def processor() -> str:
+    """Model of this machine's processor."""
     with suppress(OSError):
         named = re.search(r"^model name[^:]*:(.*)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)
-        model = named[1].strip() if named else model
-    return f"{model}, {os.cpu_count() or 1} cores"
+        if named:
+            return named[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine() -> str:
+    """Processor and cores, in words."""
+    return f"{processor()}, {os.cpu_count() or 1} cores"

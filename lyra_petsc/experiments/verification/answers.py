@@ -214,8 +214,7 @@ def case(title: str, **more: Any) -> Callable[[Measure], VerificationCase]:
 def data(name: str) -> dict[str, Any]:
     """A file of ``verification/data``, without ``.json``."""
     path = files("lyra_petsc.experiments.verification").joinpath("data", f"{name}.json")
-    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return content
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 STATIC: dict[str, Any] = {"analysis": "static"}

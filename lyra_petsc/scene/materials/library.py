@@ -160,8 +160,7 @@ class IsotropicSheet:
 
 def _read(library: str) -> dict[str, Any]:
     text = files(__package__).joinpath(library).read_text(encoding="utf-8")
-    data: dict[str, Any] = json.loads(text)
-    return data
+    return json.loads(text)
 
 
 @cache

@@ -82,7 +82,7 @@ def line_of_sight(scene: Scene, up: Array, shapes: Iterable[Array], triangles: I
 
 
 def _seen(up: Array, azimuths: Array, normals: Sequence[Array]) -> Array:
-    """(azimuths, elevations) how well states with triangles of such normals (F, 3) are seen.
+    """How well triangles with normals (F, 3) are seen from each direction, (azimuths, elevations).
 
     A mean of the shares of their areas that they show, in which one state seen from its edge weighs more
     than many that are seen a little better; the first one, with which films begin, counts as three. Where
@@ -152,7 +152,7 @@ class Fit:
         self.normals = np.array([*sides, sight, -sight])
 
     def most(self, reaches: Array) -> Array:
-        """(6,) how far most states reach; ``reaches`` (n, 6) is each one's `view` argument [m]."""
+        """The reach (6,) [m] of most states, as `view` takes it; ``reaches`` (n, 6) has that of each."""
         framed = FRAMED if self._camera.frame is None else self._camera.frame
         return np.asarray(np.percentile(reaches, framed, axis=0, method="higher"))
 
@@ -188,5 +188,4 @@ def _camera(scene: Scene) -> Camera:
 
 def _unit(vector: Array) -> Array:
     scaled = vector / np.abs(vector).max()
-    unit: Array = scaled / np.linalg.norm(scaled)
-    return unit
+    return scaled / np.linalg.norm(scaled)

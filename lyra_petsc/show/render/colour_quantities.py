@@ -228,8 +228,7 @@ def _edges(corners: Array) -> Array:
 def _largest_principal(symmetric: Array) -> Array:
     """(F,) larger eigenvalue in the plane of tensors uu, vv, uv (F, 3), or with six components (F, 6)."""
     uu, vv, uv = plane_components(symmetric).T
-    largest: Array = (uu + vv) / 2.0 + np.hypot((uu - vv) / 2.0, uv)
-    return largest
+    return (uu + vv) / 2.0 + np.hypot((uu - vv) / 2.0, uv)
 
 
 def _magnitude(values: Array) -> Array:

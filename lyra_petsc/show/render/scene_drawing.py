@@ -69,8 +69,7 @@ class Bounds:
     @property
     def middle(self) -> Array:
         """(3,) its centre [m], along x, y and z."""
-        centre: Array = (self.low + self.high) / 2.0 @ self.axes
-        return centre
+        return (self.low + self.high) / 2.0 @ self.axes
 
     def around(self, points: Array) -> Bounds:
         """A box that holds points (n, 3) along its axes [m], too."""
@@ -92,8 +91,7 @@ def near_points(obstacles: Iterable[ObstacleSurface], bounds: Bounds, times: Arr
                 found.append(np.array([x.min(axis=0), x.max(axis=0)]))
     corners = np.clip(np.concatenate(found), bounds.low - reach, bounds.high + reach).reshape(-1, 2, 3)
     which = np.array(list(np.ndindex(2, 2, 2)))
-    points: Array = corners[:, which, np.arange(3)].reshape(-1, 3)
-    return points
+    return corners[:, which, np.arange(3)].reshape(-1, 3)
 
 
 class SceneDrawing:
@@ -380,5 +378,4 @@ def _arrow_mesh(pyvista: Any, feet: Array, arrow: Array) -> Any:
 def _over_whole_sheet(corner_uv: Array) -> Array:
     """Texture coordinates scaled so that a picture covers the sheet once."""
     low, high = corner_uv.min(axis=(0, 1)), corner_uv.max(axis=(0, 1))
-    scaled: Array = (corner_uv - low) / np.where(high > low, high - low, 1.0)
-    return scaled
+    return (corner_uv - low) / np.where(high > low, high - low, 1.0)

@@ -29,7 +29,7 @@ from lyra_petsc.output.agreement import reason, replace_text
 
 
 def short(value: float, digits: int = 3) -> str:
-    """So many significant digits, without needless zeros; ``–`` for what is not finite."""
+    """A number with this many significant digits and no trailing zeros; ``–`` if it is not finite."""
     if not math.isfinite(value):
         return "–"
     if value == 0.0:
@@ -100,7 +100,7 @@ class Drawing:
 
 @dataclass
 class ReportBlock:
-    """One piece of a report; which fields count depends on ``kind``."""
+    """One piece of a report; ``kind`` says which fields it uses."""
 
     kind: str
     text: str = ""
@@ -267,7 +267,7 @@ PACKAGES = ("matplotlib", "jinja2")
 
 
 def lacking() -> list[str]:
-    """Packages that pictures and ``report.html`` need and that are not there."""
+    """The packages for pictures and ``report.html`` that are not installed."""
     return missing(PACKAGES)
 
 

@@ -148,15 +148,10 @@ def work_precision(
 
 def fitted_slope(x: Sequence[float], y: Sequence[float]) -> float:
     """Least-squares slope of log y over log x; NaN for fewer than two different x."""
-    points = [(math.log(a), math.log(b)) for a, b in zip(x, y, strict=True) if _visible(a) and _visible(b)]
-    if len(points) < 2:
+    points = np.log([point for point in zip(x, y, strict=True) if all(map(_visible, point))])
+    if len(points) < 2 or np.ptp(points[:, 0]) < 1e-12:
         return math.nan
-    mean_x = math.fsum(a for a, _ in points) / len(points)
-    mean_y = math.fsum(b for _, b in points) / len(points)
-    width = math.fsum((a - mean_x) ** 2 for a, _ in points)
-    if width < 1e-24:
-        return math.nan
-    return math.fsum((a - mean_x) * (b - mean_y) for a, b in points) / width
+    return float(np.polyfit(points[:, 0], points[:, 1], 1)[0])
 
 
 def _visible(value: float) -> bool:
@@ -192,8 +187,7 @@ def _axes(x_label: str, y_label: str) -> tuple[Any, Any]:
     axes.grid(True, which="minor", color="#eef0f3", lw=0.5)
     axes.set_axisbelow(True)
     axes.margins(x=0.09, y=0.07)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
 

@@ -85,7 +85,7 @@ class Facts:
 
     @cached_property
     def scheme_loss(self) -> Array:
-        """(n,) energy [J] that neither loads nor damping account for: what the time scheme took away."""
+        """(n,) numerical dissipation [J] so far: what neither loads nor damping account for."""
         gain = self.columns["external_work"] - self.columns["dissipation"]
         return np.asarray(self.total_energy[0] + gain - self.total_energy)
 
@@ -202,14 +202,13 @@ def phases(wall: Mapping[str, float]) -> Drawing:
 
 
 def _axes(facts: Facts, labels: Sequence[str], height: float) -> tuple[Any, Any]:
-    """A figure of panels above each other that share the time axis."""
+    """A figure of stacked panels with a common time axis."""
     figure = empty_figure(height)
     axes = figure.subplots(len(labels), 1, sharex=True, squeeze=False)[:, 0]
     for panel, label in zip(axes, labels, strict=True):
         panel.set_ylabel(label)
         panel.grid(True, color="#dfe3e8", lw=0.8)
-        for side in ("top", "right"):
-            panel.spines[side].set_visible(False)
+        panel.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("load factor" if facts.static else "time [s]")
     return figure, axes
 
@@ -257,7 +256,7 @@ Rule = Callable[[Facts], Iterator[str]]
 
 
 def advice(facts: Facts) -> list[str]:
-    """Sentences, each with what was seen and what to change; empty if nothing stands out."""
+    """Sentences on what was slow or inaccurate and what to change; empty if nothing stands out."""
     return [words for rule in RULES for words in rule(facts)]
 
 

@@ -338,7 +338,7 @@ def open_browser(address: str) -> bool:
 
 
 def find_run(folder: Path) -> StoredRun:
-    """The run in a folder, of which all that the page needs can be read.
+    """The run in a folder, after checking that all that the page needs can be read.
 
     Raises
     ------

@@ -105,5 +105,4 @@ def parameters(shell: ShellMaterial) -> list[float]:
 
 def stiffest(c: Array) -> Array:
     """Largest stiffness [N/m] of each law (n_laws, n) at rest."""
-    largest: Array = c[:, 0] / compression.PART
-    return largest
+    return c[:, 0] / compression.PART

@@ -109,8 +109,7 @@ def tangent(e0, e1, e2, c, m):  # type: ignore[no-untyped-def]
 def tables() -> dict[str, Any]:
     """Of each cloth ``strained`` rows (5, 4), the fitted ``stiffening`` a_k (6,) [N/m], and its errors."""
     text = files(__package__).joinpath("wang2011.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)["cloths"]
-    return found
+    return json.loads(text)["cloths"]
 
 
 def fit_errors() -> dict[str, tuple[float, float]]:
@@ -131,5 +130,4 @@ def parameters(shell: ShellMaterial) -> list[float]:
 
 def stiffest(c: Array) -> Array:
     """Largest stiffness [N/m] of each law (n_laws, 11) at rest."""
-    largest: Array = np.abs(c[:, :4]).max(axis=1)
-    return largest
+    return np.abs(c[:, :4]).max(axis=1)

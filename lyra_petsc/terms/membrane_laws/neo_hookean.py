@@ -72,5 +72,4 @@ def parameters(shell: ShellMaterial) -> list[float]:
 
 def stiffest(c: Array) -> Array:
     """Largest stiffness [N/m] of each law (n_laws, 2) at rest."""
-    largest: Array = 2.0 * c[:, 0] * (1.0 + np.maximum(c[:, 1], 0.0))
-    return largest
+    return 2.0 * c[:, 0] * (1.0 + np.maximum(c[:, 1], 0.0))

@@ -40,5 +40,4 @@ def parameters(shell: ShellMaterial) -> list[float]:
 
 def stiffest(c: Array) -> Array:
     """Largest stiffness [N/m] of each law (n_laws, 4)."""
-    largest: Array = np.abs(c).max(axis=1)
-    return largest
+    return np.abs(c).max(axis=1)

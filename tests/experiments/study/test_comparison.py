@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
-from numpy.typing import NDArray
 from physics import grid, scene_of
 
+from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import Energies, ExactMotion
 from lyra_petsc.experiments.study import comparison
@@ -31,7 +31,6 @@ from lyra_petsc.mesh.mesh import Mesh
 
 pytest.importorskip("scipy")
 
-Array = NDArray[np.float64]
 TIMES = (0.0, 0.1, 0.2)
 QUANTITIES = [*POSITION, ENERGY, probe_quantity("tip")]
 SHEET = grid(0.3, 0.4, 3, 4)  # diagonal 0.5 m

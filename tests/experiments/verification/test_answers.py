@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.experiments.meshes import irregular_rectangle, quarter_disc, rectangle
 from lyra_petsc.experiments.verification.answers import data
 from lyra_petsc.experiments.verification.cases.hanging import middle
 from lyra_petsc.experiments.verification.cases.motions import level_fall
 from lyra_petsc.experiments.verification.flat_plates import arc
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def test_the_level_fall_is_the_tabulated_one() -> None:

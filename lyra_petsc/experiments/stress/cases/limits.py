@@ -223,8 +223,7 @@ SOFTER, FINER, SHARPER = 1e-3, 4, "bdf2"
 def _paper(bench: Bench, integrator: str) -> Content:
     def read() -> Content:
         scene = load_scene(default_scene().with_name("paper.yaml"), (f"time.integrator={integrator}",))
-        understood: Content = parse_yaml(dump_scene(scene), file=None)
-        return understood
+        return parse_yaml(dump_scene(scene), file=None)
 
     content = on_root(bench.comm, read)
     content.pop("output")

@@ -22,7 +22,7 @@ from lyra_petsc.experiments.drape import (
     drape_coefficient,
     quarter_shadow,
 )
-from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle
+from lyra_petsc.experiments.meshes import irregular_rectangle, rectangle, rounded
 from lyra_petsc.experiments.verification.answers import (
     STATIC,
     Converges,
@@ -610,8 +610,7 @@ def _quarter(kind: str, n: int) -> tuple[Array, Ints]:
         flat, faces = irregular_rectangle(n, n, 1.0, 1.0)
     else:
         flat, faces = rectangle(n, n, 1.0, 1.0, alternating=kind == "alternating")
-    i, j = flat[:, 0], flat[:, 1]
-    return np.column_stack([i * np.sqrt(1.0 - 0.5 * j**2), j * np.sqrt(1.0 - 0.5 * i**2), 0.0 * i]), faces
+    return rounded(flat), faces
 
 
 @case(

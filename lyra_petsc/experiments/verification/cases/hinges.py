@@ -119,8 +119,7 @@ class Stiffness:
         size = len(self.held)
         full = np.zeros((size, size))
         full[self.rows, self.columns] = self.values
-        free: Array = full[np.ix_(~self.held, ~self.held)]
-        return free
+        return full[np.ix_(~self.held, ~self.held)]
 
     def solve(self, force: Array) -> Array:
         """Heights [m] (V,) under forces [N] (V,), by a direct solve on every rank."""
@@ -206,9 +205,7 @@ def strip_stiffness(hinges: HingeBlocks, points: Array, start: float, period: fl
     return float(bent / (period * width))
 
 
-def sheet_stiffness(
-    hinges: HingeBlocks, points: Array, start: Sequence[float], lattice: Array, relaxed: bool = True
-) -> Array:
+def sheet_stiffness(hinges: HingeBlocks, points: Array, start: Sequence[float], lattice: Array) -> Array:
     """D (3, 3) [N·m] of an endless sheet: energy per area ½ κᵀ D κ with κ = (κ11, κ22, 2 κ12).
 
     Parameters
@@ -220,19 +217,14 @@ def sheet_stiffness(
         Where the cell begins, in lattice coordinates.
     lattice : (2, 2) float64
         The two periods [m], as columns.
-    relaxed : bool
-        False leaves the vertices on the quadratic.
     """
     x, y = points.T
     shapes = np.stack([0.5 * x**2, 0.5 * y**2, 0.5 * x * y], axis=1)
-    energy = _relaxed(hinges, points, shapes, np.linalg.inv(lattice), np.asarray(start), relaxed)
-    area: float = abs(float(np.linalg.det(lattice)))
-    return energy / area
+    energy = _relaxed(hinges, points, shapes, np.linalg.inv(lattice), np.asarray(start))
+    return energy / abs(float(np.linalg.det(lattice)))
 
 
-def _relaxed(
-    hinges: HingeBlocks, points: Array, shapes: Array, to_cell: Array, start: Array, relaxed: bool = True
-) -> Array:
+def _relaxed(hinges: HingeBlocks, points: Array, shapes: Array, to_cell: Array, start: Array) -> Array:
     """Quadratic form (m, m) of a cell's energy in the amplitudes of ``shapes`` (V, m).
 
     ``to_cell`` (d, 2) maps positions to lattice coordinates.
@@ -254,11 +246,8 @@ def _relaxed(
         heights[:, :size] = shapes[vertices]
         np.add.at(heights, (np.arange(4), size + kind[vertices]), 1.0)
         form += heights.T @ block @ heights
-    if not relaxed:
-        return form[:size, :size]
     coupling, periodic = form[:size, size:], form[size:, size:]
-    energy: Array = form[:size, :size] - coupling @ np.linalg.pinv(periodic, rcond=1e-9) @ coupling.T
-    return energy
+    return form[:size, :size] - coupling @ np.linalg.pinv(periodic, rcond=1e-9) @ coupling.T
 
 
 PATTERNS = ("diagonal", "alternating", "criss-cross")

@@ -467,5 +467,4 @@ def _distance(points: Array, line: Array) -> Array:
     start, way = line[:-1], np.diff(line, axis=0)
     along = np.sum((points[:, None] - start) * way, axis=2) / np.sum(way**2, axis=1)
     foot = start + np.clip(along, 0.0, 1.0)[:, :, None] * way
-    distance: Array = np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1)
-    return distance
+    return np.linalg.norm(points[:, None] - foot, axis=2).min(axis=1)
