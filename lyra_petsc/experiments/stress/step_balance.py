@@ -237,6 +237,11 @@ class Accountant:
         self._energy = energy(self._shell, system.x)
         self._frames: Terms = {term: term.frames for term in self._elastic if isinstance(term, MidEdge)}
 
+    @property
+    def _solved(self) -> Array:
+        """Velocities (n_local, 3) [m/s] that the step's equations led to, before dashpots of impacts."""
+        return self._system.v if self._system.damped is None else self._system.evaluated[1]
+
     def _fit(self) -> None:
         """Give the positions in which the step began the ghosts that contact needs now; collective."""
         layout = self._system.points
@@ -254,11 +259,14 @@ class Accountant:
         system, comm = self._system, self._system.points.comm
         n, dt = system.points.n_owned, report.dt
         self._fit()
-        x0, v0, x1, v1 = self._x, self._v, system.x, system.v
+        x0, v0, x1, v1 = self._x, self._v, system.x, self._solved
         dx, dv = x1 - x0, v1[:n] - v0[:n]
         free = ~system.prescribed.mask[:n]
         parts = self._parts(report, dv / dt)
         reaction = self._simulation.ledger.reaction
+        if system.damped is not None:  # after the equations were solved
+            at = system.prescribed.at
+            reaction.put(at, reaction.take(at) - system.damped.held)
         weight = self._gravity(report)
         moved = dx[:n]
         outside = -parts["loads"] + reaction
@@ -341,7 +349,7 @@ class Accountant:
     def _parts(self, report: StepReport, rate: Array) -> dict[str, Array]:
         """The summands of F, each (n_owned, 3) [N], evaluated anew; loads with their sign in F."""
         system = self._system
-        n, x1, v1 = system.points.n_owned, system.x, system.v
+        n, x1, v1 = system.points.n_owned, system.x, self._solved
         force = np.zeros((system.points.n_local, 3))
         for load in system.active.loads:
             load.add_force(self._x, report.time - report.dt, report.time, force)
