@@ -11,7 +11,7 @@ or of n_blocks blocks compares them with ``layout`` and ``rows``.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,28 +44,12 @@ def _far(x, origin, i, square):  # type: ignore[no-untyped-def]
 
 
 @cached()
-def _leaves(x, start, end, reach):  # type: ignore[no-untyped-def]
-    """Whether some of x are farther than ``reach`` from start, and from end."""
-    square, s, e = reach * reach, 0, 0
+def _leaves(x, place, reach):  # type: ignore[no-untyped-def]
+    """Whether some of x are farther than ``reach`` from a place."""
+    square, far = reach * reach, 0
     for row in range(len(x)):  # without a way out, so that several are looked at together
-        i = Index(row)
-        s |= _far(x, start, i, square)
-        e |= _far(x, end, i, square)
-    return s != 0, e != 0
-
-
-@cached()
-def _leaves_on(x, way, start, end, reach):  # type: ignore[no-untyped-def]
-    """Whether some of x are farther than ``reach`` from start, and from end; and x + way from end."""
-    square, s, e, then = reach * reach, 0, 0, 0
-    for row in range(len(x)):
-        i = Index(row)
-        s |= _far(x, start, i, square)
-        e |= _far(x, end, i, square)
-        a, b, c = x[i, 0] + way[i, 0], x[i, 1] + way[i, 1], x[i, 2] + way[i, 2]
-        a, b, c = a - end[i, 0], b - end[i, 1], c - end[i, 2]
-        then |= 0 if a * a + b * b + c * c <= square else 1
-    return s != 0, e != 0, then != 0
+        far |= _far(x, place, Index(row), square)
+    return far != 0
 
 
 @cached()
@@ -109,6 +93,8 @@ class Discretisation:
         Of the couplings by fixed stencils, and of all; one and the same where stencils do not change.
     place : (n,) int64 or None
         Where the blocks of ``fixed`` stand among those of ``rows``; None: they are the same.
+    near : bool
+        Whether there are elements of changing stencils, on any rank.
     """
 
     def __init__(self, layout: Layout, terms: Iterable[Term]) -> None:
@@ -123,10 +109,12 @@ class Discretisation:
         self.fixed = BlockRows(BlockPattern(couplings, layout.n_owned, layout.n_local))
         self.rows = self.fixed
         self.place: Ints | None = None
+        self.near = False
         self._rows_of = layout  # that ``rows`` were made for
         self._located: set[str] = set()  # terms of whose present stencils the pattern has the offsets
         self._searching = [term for term in self._changing if term.search_distance > 0.0]
-        self._way: tuple[Array, Array] | None = None  # along which what is near is known
+        self._places: list[Array] = []  # on the way along which what is near is known
+        self._at = 0  # of these, where points were last
         self._reach = 0.0  # how far from it points may be [m]
         self._searched = 1.0  # part of the way that was asked for
         self._triangles: dict[Elastic, Ints] = {}  # where a rank has them all
@@ -138,10 +126,11 @@ class Discretisation:
         """Whether any stencils depend on the positions."""
         return bool(self._changing)
 
-    def follow(self, x: Array, ahead: Array | None = None) -> bool:
+    def follow(self, x: Array, ahead: Array | None = None, stops: Sequence[float] = ()) -> bool:
         """Let stencils be those at positions x (n_local, 3) [m]; whether ghosts are others; collective.
 
-        ``ahead`` (n_local, 3) [m] is the way that points are expected to go together from there.
+        ``ahead`` (n_local, 3) [m] is the way that points are expected to go together from there. Where it is
+        that of a step, ``stops`` are the parts of it after which they are asked for.
         """
         if not self._changing:
             return False
@@ -152,8 +141,11 @@ class Discretisation:
             return False
         layout, had = self.layout, [term.n_elements for term in asked]
         if self._searching and asked[0] is self._searching[0]:
-            way = self._search(x, np.zeros_like(x) if ahead is None else ahead)
-            self._way = here.copy(), here + way[: len(here)]
+            way = np.zeros_like(x) if ahead is None else ahead
+            part = self._search(x, way)
+            parts = stops if stops and part == 1.0 else (part,)
+            self._places = [here + part * way[: len(here)] for part in (0.0, *parts)]
+            self._at = 0
             self._reach = 0.5 * min(term.skin for term in self._searching)
         for term in asked:
             if term.search_distance == 0.0:
@@ -165,7 +157,8 @@ class Discretisation:
             beyond = [stencil[(stencil < layout.start) | (stencil >= end)] for stencil in stencils]
             more = np.setdiff1d(np.concatenate(beyond), fixed)
         lacking = len(more) > 0 and not np.isin(more, layout.ghosts[len(fixed) :]).all()
-        others = any(layout.largest(lacking))
+        any_here = any(len(stencil) for stencil, _ in self._found.values())
+        others, self.near = (flag > 0.0 for flag in layout.largest(lacking, any_here))
         if others:
             if layout is not self._fixed_layout:
                 layout.destroy()
@@ -184,14 +177,8 @@ class Discretisation:
 
         If any that search, then all that do, and they come first.
         """
-        flags = True, True, True
-        if self._way is not None:
-            # all are at one and the same part of the way that was searched
-            start, end = _leaves(here, *self._way, self._reach)
-            along, back = (start, end) if to is here else _leaves(to, *self._way, self._reach)
-            flags = start or along, end or back, start or back
-        left, right, apart, *told = self.layout.largest(*flags, *(term.stale for term in self._changing))
-        leaves = bool(left and right and apart)
+        told = self.layout.largest(*(term.stale for term in self._changing))
+        leaves = not (self._is_known(here, self._reach) and (to is here or self._is_known(to, self._reach)))
         if self._found and not leaves and not any(told):
             return []
         searches = leaves and bool(self._searching)
@@ -210,36 +197,46 @@ class Discretisation:
         """Fraction, up to 1, of the way (n_owned, 3) [m] from x that vertices may go until stencils are
         looked for again; collective.
         """
-        if not self.guards or self._way is None:
+        if not self.guards or not self._places:
             return 1.0
         n = self.layout.n_vertices
         reach = 0.5 * min(term.unseen for term in self._searching)
         x, way = x[:n], way[:n]
-        start, end = self._way
-        for part in (1.0, self._searched) if 0.0 < self._searched < 1.0 else (1.0,):
-            from_start, back, from_end = _leaves_on(x, part * way, start, end, reach)
-            *left, apart = self.layout.largest(from_start, back, from_start or from_end)
-            if not apart:
-                return part
-        # near both ends of a short way there may be no room left at the one, and all at the other
-        places = zip(left, (start, end), strict=True)
+        if self._is_known(x, reach):
+            for part in (1.0, self._searched) if 0.0 < self._searched < 1.0 else (1.0,):
+                if self._is_known(x + part * way, reach):
+                    return part
+        # near several places there may be no room left at the one, and all at the other
+        gone = self.layout.largest(*(_leaves(x, place, reach) for place in self._places))
+        rooms = zip(gone, self._places, strict=True)
         less = self.layout.largest(
-            *(-_free_part(x, way, at, reach) if not gone else 0.0 for gone, at in places)
+            *(-_free_part(x, way, place, reach) if not left else 0.0 for left, place in rooms)
         )
         return -min(less)
 
-    def _search(self, x: Array, way: Array) -> Array:
+    def _is_known(self, x: Array, reach: float) -> bool:
+        """Whether all owned vertices x (n, 3) are within ``reach`` [m] of one and the same place of the way
+        that was searched; collective.
+        """
+        if not self._places:
+            return False
+        if not any(self.layout.largest(_leaves(x, self._places[self._at], reach))):
+            return True
+        left = self.layout.largest(*(_leaves(x, place, reach) for place in self._places))
+        self._at = left.index(min(left))
+        return not left[self._at]
+
+    def _search(self, x: Array, way: Array) -> float:
         """Find the elements of all terms that search, along ways (n_local, 3) [m] that are shortened where
-        there would be too many; these ways; collective.
+        there would be too many; to what part of them; collective.
         """
         for part in SHORTER:
-            less = part * way
-            found = {term: self._near(term, x, less) for term in self._searching}
+            found = {term: self._near(term, x, part * way) for term in self._searching}
             if not any(self.layout.largest(any(each is None for each in found.values()))):
                 break
         self._searched = part
         self._found |= {term: each for term, each in found.items() if each is not None}
-        return less
+        return part
 
     def _near(self, term: Elastic, x: Array, way: Array) -> tuple[Ints, Ints] | None:
         """Stencils (E, n) in global numbers, and what goes with them (E, m), that touch owned vertices on
@@ -360,7 +357,7 @@ class Discretisation:
         Blocks of earlier ones stay while they are `FEW`; other elements have an offset where there is one.
         Collective.
         """
-        if not self._changing:
+        if not self._changing or (not self.near and self._rows_of is self.layout):
             return False
         n_local = self.layout.n_local
         stencils = {term.name: term.stencil for term in self._changing}

@@ -83,8 +83,9 @@ class Damping:
         # residual, objective and works ask at the same velocities
         self.product = Remembered(self._product)
         factors = np.concatenate([np.empty(0), *(t.elements.data["damping"] for t in self._terms)])
-        uniform = len(factors) > 0 and factors.min() == factors.max() and len(self._terms) == len(elastic)
+        uniform = len(factors) > 0 and factors.min() == factors.max()
         self._gamma = float(factors[0]) if uniform else 0.0
+        self._undamped = [term for term in elastic if term not in self._terms]
 
     @property
     def _blocks(self) -> BlockRows:
@@ -140,12 +141,15 @@ class Damping:
     ) -> bool:
         """Let ``values`` be D + weight · K⁺(x) + ``diagonal`` (n_owned,) · I, if K⁺ is a multiple of D.
 
-        It is where all elements have one γ, and D was frozen at x: half the assembly of a semi-implicit step,
-        and D need not be stored beside it. Else False. The caller may change ``changing`` (n,), in the
-        flat form, afterwards.
+        It is where all elements that there are have one γ, and D was frozen at x: half the assembly of a
+        semi-implicit step, and D need not be stored beside it. Else False. The caller may change ``changing``
+        (n,), in the flat form, afterwards.
         """
         self.let_go()
-        if not self._gamma or self._at is None or not np.array_equal(x, self._at):
+        other = self._discretisation.place is not None or any(term.n_elements for term in self._undamped)
+        if not self._gamma or other:
+            return False
+        if self._at is None or not np.array_equal(x, self._at):
             return False
         factor = 1.0 + weight / self._gamma
         if self._once and not self._stored:

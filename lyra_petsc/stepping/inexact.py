@@ -12,21 +12,21 @@ LOOSEST, TIGHTEST = 1e-2, 1e-6
 """Relative tolerances of the linear solver."""
 
 LOOSEST_IN_CONTACT = 1e-3
-"""With contact, but for multigrid, whose iterations are dear: looser solves cost more Newton iterations,
-each of which evaluates all pairs."""
+"""Where parts are near, but for multigrid, whose iterations are dear: looser solves cost more Newton
+iterations, each of which evaluates all pairs."""
 
 STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
 ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Of the one linear solve of a semi-implicit step. An impact magnifies what a solve leaves, which depends
-on the number of ranks, thirty to a hundred times."""
+"""Of the one linear solve of a semi-implicit step, and where parts are near. An impact magnifies what a solve
+leaves, which depends on the number of ranks, thirty to a hundred times."""
 
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
 
 SLOW_IN_CONTACT = 0.7
-"""The same with contact, where residuals also fall slowly as pairs meet and part."""
+"""The same where parts are near: residuals also fall slowly as pairs meet and part."""
 
 FAST = 0.03
 """Fraction below which a looser one would have done."""
@@ -40,20 +40,19 @@ class Forcing:
     ksp : PETSc.KSP
     fixed : bool
         Leave it alone.
-    contact : bool
-        Whether parts may touch.
     cycles : bool
         Whether the preconditioner is a cycle of multigrid.
     """
 
-    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, contact: bool, cycles: bool) -> None:
-        self._ksp, self._fixed = ksp, fixed
-        self._slow = SLOW_IN_CONTACT if contact else SLOW
-        self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact and not cycles else LOOSEST
-        self._norm = 0.0
+    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool) -> None:
+        self._ksp, self._fixed, self._cycles = ksp, fixed, cycles
+        self.tolerance = LOOSEST
+        self.begin(near=False)
 
-    def begin(self) -> None:
-        """A new solve: begin a little looser than the last one ended."""
+    def begin(self, *, near: bool) -> None:
+        """A new solve: begin a little looser than the last one ended; ``near``: parts may touch in it."""
+        self._slow = SLOW_IN_CONTACT if near else SLOW
+        self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = 0.0
 

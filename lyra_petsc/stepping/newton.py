@@ -87,9 +87,7 @@ class Newton:
         still = not (equations.integrator.moves or equations.discretisation.guards)
         self._corrects = still and linear.factors and bool(equations.active.edged)
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
-        self.forcing = Forcing(
-            self._ksp, fixed=fixed, contact=equations.discretisation.guards, cycles=linear.cycles
-        )
+        self.forcing = Forcing(self._ksp, fixed=fixed, cycles=linear.cycles)
 
     def begin_step(self) -> None:
         """Forget the step before."""
@@ -101,7 +99,7 @@ class Newton:
         self._linear.shift.begin()
         self.convergence.begin()
         self.globalisation.begin()
-        self.forcing.begin()
+        self.forcing.begin(near=self._equations.discretisation.near)
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:

@@ -216,11 +216,12 @@ class StageEquations:
         after = self.integrator.stage_after(self.dt)
         changed = self.prescribed.begin_step(t0, t1, self.x)
         ahead = self._expected() if self.discretisation.guards else None
-        self._follow(self.x, ahead)
+        stops = () if ahead is None else (after / self.dt, 1.0) if after < self.dt else (1.0,)
+        self._follow(self.x, ahead, stops)
         self._freeze(t0 + after)
         if self.active.pushing:  # obstacles may have come near
             ahead = None if ahead is None else self._expected()  # with the ghosts that there are now
-            self._follow(self.x, ahead)
+            self._follow(self.x, ahead, stops)
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
             for follower in self.followers:
@@ -360,6 +361,9 @@ class StageEquations:
         if self.active.limiting and self.integrator.moves:
             from lyra_petsc.stepping import impacts  # of no use elsewhere
 
+            if not self.discretisation.near:
+                self.integrator.surplus = max(self.integrator.surplus, 0.0)
+                return
             if self.watches_impacts:
                 left = self.integrator.surplus
                 self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
@@ -503,9 +507,10 @@ class StageEquations:
             if seen < FEW:
                 x, ahead = self._look(v + gone * way, (most - gone) * way)
                 seen = fraction = self.discretisation.largest_step(x, ahead)
-            for term in self.active.limiting:
-                fraction = min(fraction, term.largest_step(x, ahead, self.active.frozen[term]))
-            fraction = self._least_of(fraction)
+            if self.discretisation.near:
+                frozen = self.active.frozen
+                parts = [term.largest_step(x, ahead, frozen[term]) for term in self.active.limiting]
+                fraction = self._least_of(min([fraction, *parts]))
             if fraction == 1.0:
                 return most
             gone += fraction * (most - gone)
@@ -532,6 +537,8 @@ class StageEquations:
         x, ahead = self._ahead(v, way)
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
+        if not self.discretisation.near:
+            return None
         n, frozen, pushed = len(way), self.active.frozen, False
         aims = {term: term.aims(x, ahead, frozen[term]) for term in self.active.limiting}
         for _ in range(PUSHES):
@@ -593,6 +600,9 @@ class StageEquations:
         what obstacles take along.
         """
         here = self.velocity_of_staying()
+        goes = self.prescribed.velocity != here.take(self.prescribed.at)
+        if not any(self.points.largest(bool(self.active.pushing) or bool(goes.any()))):
+            return True
         rests, refused = self.integrator.starts_at_rest, None
         ways = [here] if rests else [here, self.v[: len(here)]]
         tried = [(v, False) for v in ways]
@@ -652,16 +662,19 @@ class StageEquations:
             return True
         n = self.points.n_owned
         end = self.integrator.end(self.x[:n], self.v[:n], v, self.dt)[0]
-        if not self.integrator.iterates:  # one linear solve has found it
-            v = self.velocity_of_staying()
-        way = (end - self.evaluate_at(v)[0][:n]) / self.stage.reach
-        return self._may_go(v, way, after=True)
+        # one linear solve has found it, or Newton's method has looked at the way to the stage
+        x = self.evaluate_at(v)[0] if self.integrator.iterates else self.x
+        way = end - x[:n]
+        if not self.discretisation.near and self.discretisation.largest_step(x, way) == 1.0:
+            return True
+        v = v if self.integrator.iterates else self.velocity_of_staying()
+        return self._may_go(v, way / self.stage.reach, after=True)
 
     # -- what Newton asks for ----------------------------------------------------------------------
 
-    def _follow(self, x: Array, ahead: Array | None = None) -> None:
+    def _follow(self, x: Array, ahead: Array | None = None, stops: Sequence[float] = ()) -> None:
         """Let stencils be those at positions x (n_local, 3), and make room for their ghosts."""
-        if not self.discretisation.changes or not self.discretisation.follow(x, ahead):
+        if not self.discretisation.changes or not self.discretisation.follow(x, ahead, stops):
             return
         layout = self.points
         n, n_local = layout.n_owned, layout.n_local
@@ -745,6 +758,9 @@ class StageEquations:
         others; collective.
         """
         x, frozen = self._xs, self.active.frozen
+        if not self.discretisation.near:
+            self.touches = False
+            return self.discretisation.renew_pattern({})
         acting = {term: term.acting(x, frozen.get(term)) for term in self.active.near}
         if acting:
             number = sum(int(np.count_nonzero(acts)) for acts in acting.values())
@@ -757,13 +773,13 @@ class StageEquations:
         collective.
         """
         terms = [term for term in self.active.near if term.slips]
-        return bool(terms) and any(self.points.largest(sum(term.n_elements for term in terms)))
+        return self.discretisation.near and any(self.points.largest(sum(term.n_elements for term in terms)))
 
     @property
     def may_impact(self) -> bool:
         """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
         limiting, reach = self.active.limiting, self.stage.reach
-        if not limiting:
+        if not (limiting and self.discretisation.near):
             return False
         far = IMPACT * min(term.skin for term in limiting)
         near = any(term.n_elements for term in limiting)

@@ -204,7 +204,7 @@ class Stepper:
             ksp.setTolerances(rtol=LOOSEST if equations.integrator.moves else STATIC, max_it=5000)
         else:
             snes.setType(PETSc.SNES.Type.KSPONLY)
-            ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.discretisation.guards else ONCE, max_it=5000)
+            ksp.setTolerances(rtol=ONCE, max_it=5000)
             ksp.setInitialGuessNonzero(True)
         # what PETSc frees when Python is gone must not call it
         self._at_exit = weakref.finalize(self, _forget_python, ksp)
@@ -295,7 +295,7 @@ class Stepper:
         outcome = self._newton.convergence
         ended = outcome.norm, outcome.left, outcome.at_roundoff
         if velocity is not None:
-            if not self._iterates:
+            if not self._iterates and equations.active.edged:
                 staying = equations.velocity_of_staying()
                 way = velocity - staying
                 if equations.follow_triangles(staying, way):
@@ -360,6 +360,8 @@ class Stepper:
         self.ts.setTime(t0 + stage.after - theta * length)
         self.ts.setTimeStep(length)
         self._newton.begin_step()
+        if not self._iterates and not is_set("ksp_rtol"):
+            self.ksp.setTolerances(rtol=ONCE_IN_CONTACT if equations.discretisation.near else ONCE)
         self._trace.begin()
         try:
             self.ts.step()

@@ -36,6 +36,7 @@ class Margins:
 
     def __init__(self, pairs: Ints, first: Ints) -> None:
         self._pairs, self._first = pairs, first
+        self._begins = np.searchsorted(pairs[:, 0], np.arange(len(first)))  # of pairs by their first patch
         self.left = np.zeros((len(pairs), 2))
         self._at: Array | None = None
 
@@ -59,8 +60,7 @@ class Margins:
         Pairs of other patches than those in the table's are known to be of no interest.
         """
         out, row, known = np.empty_like(met), np.empty(len(met), dtype=np.int64), np.empty((len(met), 2))
-        own = len(self._first) - 1
-        n = _among(met, own, lasting, self._pairs, reach, edges, out, row, known)
+        n = _among(met, lasting, self._pairs, self._begins, reach, edges, out, row, known)
         return out[:n], row[:n], known[:n]
 
     def learn(self, row: Ints, known: Array) -> None:
@@ -172,13 +172,17 @@ def _spend(pairs, moves, left, lasting):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _among(met, n, lasting, pairs, reach, edges, out, row, known):  # type: ignore[no-untyped-def]
+def _among(met, lasting, pairs, begins, reach, edges, out, row, known):  # type: ignore[no-untyped-def]
     found = 0
     for m in range(len(met)):
         i, j = met[m]
-        if i >= n:
+        if i >= len(begins) - 1:
             continue
-        at = patches.place(pairs, i, j)
+        at = begins[i]  # few are beside one
+        while at < begins[i + 1] and pairs[at, 1] != j:
+            at += 1
+        if at == begins[i + 1]:
+            at = -1
         known[found] = 0.0
         if at >= 0:
             if lasting[at, 0] >= reach and lasting[at, 1] >= edges:

@@ -120,8 +120,8 @@ SHEETS = 5
 
 def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     """Scenes by name with about so many vertices in all: a sheet that swings, held by an edge, then the same
-    with contact and nothing near, and one that falls over a ball; sheets that swing, and as many in a stack
-    on a plane, of the cloth as it is and a thousand times stiffer.
+    with contact and nothing near (by ``semi-implicit`` steps, too), and one that falls over a ball; sheets
+    that swing, and as many in a stack on a plane, of the cloth as it is and a thousand times stiffer.
     """
 
     def sheets(number: int, apart: float) -> list[dict[str, Any]]:
@@ -140,10 +140,14 @@ def in_contact(vertices: int) -> dict[str, dict[str, Any]]:
     gap = 0.2 / cells_of(vertices // SHEETS)
     one, several = sheets(1, 0.0), sheets(SHEETS, gap)
     far = {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}}
+    alone, near = {"mesh": one}, {"mesh": one, "contact": {"friction": 0.4}}
+    once = held | {"time": common["time"] | {"integrator": "semi-implicit"}}
     scenes = {
-        "swings": common | held | {"mesh": one},
-        "swings, nothing near": common | held | {"mesh": one, "contact": {"friction": 0.4}, "obstacles": far},
-        "over a ball": common | free | ball | {"mesh": one, "contact": {"friction": 0.4}},
+        "swings, semi-implicit": common | once | alone,
+        "swings, semi-implicit, nothing near": common | once | near | {"obstacles": far},
+        "swings": common | held | alone,
+        "swings, nothing near": common | held | near | {"obstacles": far},
+        "over a ball": common | free | ball | near,
     }
     for factor in (1.0, 1000.0):
         stiffer = common | {"material": common["material"] | {"stretching_scale": factor}, "mesh": several}

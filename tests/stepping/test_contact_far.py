@@ -1,0 +1,79 @@
+"""What contact costs where nothing is near: the same solves as without, and one search a step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import CLOTH, Simulation, gathered, grid, scene_of
+
+from lyra_petsc.stepping.impacts import damp_bounces
+from lyra_petsc.stepping.simulation import SteppedScene
+from lyra_petsc.terms.contact import ContactBarrier
+
+SCENE: dict[str, Any] = {
+    "mesh": grid(0.5, 0.5, 12, 12),
+    "material": CLOTH | {"damping": 0.01},
+    "handles": [{"nodes": [0, 12]}],
+    "gravity": [0.0, 0.0, -9.81],
+}
+FAR = {
+    "contact": {"friction": 0.3},
+    "obstacles": {"ball": {"sphere": {"center": [0.0, 0.0, -9.0], "radius": 0.3}}},
+}
+STEPS = 8
+
+
+def timed(integrator: str) -> dict[str, Any]:
+    return {"time": {"end": 1.0, "step": 0.005, "integrator": integrator}, "solver": {}}
+
+
+def test_a_linear_solve_is_that_of_a_step_without_contact() -> None:
+    found = []
+    for more in ({}, FAR):
+        simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | more | timed("semi-implicit")))
+        linear = sum(simulation.step().linear_iterations for _ in range(STEPS))
+        found.append((linear, gathered(simulation.problem.points, simulation.problem.system.x)))
+        simulation.destroy()
+    assert found[1][0] == found[0][0]
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["semi-implicit", "midpoint", "alpha2"])
+def test_a_step_is_searched_once(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, integrator: str) -> None:
+    """Also where vertices go farther than the gap, and equations are asked for in the middle of the way."""
+    searches, search = 0, ContactBarrier.neighbours
+
+    def counted(*given: Any) -> Any:
+        nonlocal searches
+        searches += 1
+        return search(*given)
+
+    monkeypatch.setattr(ContactBarrier, "neighbours", counted)
+    thrown = {"handles": [], "initial": {"velocity": [0.0, 0.0, -6.0]}}
+    simulation = SteppedScene(comm, scene_of(SCENE | FAR | thrown | timed(integrator)))
+    searches = 0
+    for _ in range(STEPS):
+        simulation.step()
+    simulation.destroy()
+    assert searches == STEPS
+
+
+def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> None:
+    with Simulation(SCENE | FAR, MPI.COMM_SELF) as simulation:
+        system = simulation.problem.system
+        values, none = system.discretisation.rows.zeros(), np.empty(0, dtype=np.int64)
+        system.damping.freeze(system.x, system.active.frozen)
+        assert system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert not system.discretisation.near
+        assert not damp_bounces(system).any()
+    floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
+    with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
+        system = simulation.problem.system
+        values = system.discretisation.rows.zeros()
+        system.damping.freeze(system.x, system.active.frozen)
+        assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
+        assert system.discretisation.near
