@@ -19,8 +19,12 @@ STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
 ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Of the one linear solve of a semi-implicit step. An impact magnifies what a solve leaves, which depends
-on the number of ranks, thirty to a hundred times."""
+"""Of the one linear solve of a semi-implicit step; the latter also of the solves of a collision. An impact
+magnifies what a solve leaves, which depends on the number of ranks, thirty to a hundred times."""
+
+COLLISION = 1.0
+"""How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then
+buckle in one of many ways, and the first directions of Newton's method tell in which."""
 
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
@@ -50,12 +54,17 @@ class Forcing:
         self._ksp, self._fixed = ksp, fixed
         self._slow = SLOW_IN_CONTACT if contact else SLOW
         self.tolerance = self._loosest = LOOSEST_IN_CONTACT if contact and not cycles else LOOSEST
-        self._norm = 0.0
+        self._norm, self._collides = 0.0, False
 
-    def begin(self) -> None:
-        """A new solve: begin a little looser than the last one ended."""
+    def begin(self, *, collides: bool) -> None:
+        """A new solve: begin a little looser than the last one ended, unless parts collide in the step."""
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm = 0.0
+        self._norm, self._collides = 0.0, collides
+
+    @property
+    def in_use(self) -> float:
+        """The tolerance of the present solves."""
+        return ONCE_IN_CONTACT if self._collides and not self._fixed else self.tolerance
 
     def before_solve(self, norm: float) -> None:
         """``norm`` [N] is the residual at the present iterate."""
@@ -66,4 +75,4 @@ class Forcing:
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = norm
-        self._ksp.setTolerances(rtol=self.tolerance)
+        self._ksp.setTolerances(rtol=self.in_use)
