@@ -19,8 +19,13 @@ STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
 ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Of the one linear solve of a semi-implicit step, and where parts are near. An impact magnifies what a solve
-leaves, which depends on the number of ranks, thirty to a hundred times."""
+"""Of the one linear solve of a semi-implicit step, and where parts are near; the latter also of the solves of a
+collision. An impact magnifies what a solve leaves, which depends on the number of ranks, thirty to a hundred
+times."""
+
+COLLISION = 1.0
+"""How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then
+buckle in one of many ways, and the first directions of Newton's method tell in which."""
 
 SLOW = 0.3
 """Fraction of the residual left by an iteration above which the linear solve was too loose."""
@@ -47,14 +52,21 @@ class Forcing:
     def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool) -> None:
         self._ksp, self._fixed, self._cycles = ksp, fixed, cycles
         self.tolerance = LOOSEST
-        self.begin(near=False)
+        self.begin(near=False, collides=False)
 
-    def begin(self, *, near: bool) -> None:
-        """A new solve: begin a little looser than the last one ended; ``near``: parts may touch in it."""
+    def begin(self, *, near: bool, collides: bool) -> None:
+        """A new solve: begin a little looser than the last one ended. In it parts may touch where they are
+        ``near``, or collide.
+        """
         self._slow = SLOW_IN_CONTACT if near else SLOW
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm = 0.0
+        self._norm, self._collides = 0.0, collides
+
+    @property
+    def in_use(self) -> float:
+        """The tolerance of the present solves."""
+        return ONCE_IN_CONTACT if self._collides and not self._fixed else self.tolerance
 
     def before_solve(self, norm: float) -> None:
         """``norm`` [N] is the residual at the present iterate."""
@@ -65,4 +77,4 @@ class Forcing:
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
         self._norm = norm
-        self._ksp.setTolerances(rtol=self.tolerance)
+        self._ksp.setTolerances(rtol=self.in_use)

@@ -16,7 +16,7 @@ from lyra_petsc.phases import JACOBIAN, logged
 from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.globalisation import Globalisation
-from lyra_petsc.stepping.inexact import Forcing
+from lyra_petsc.stepping.inexact import COLLISION, Forcing
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -95,11 +95,12 @@ class Newton:
         self._length, self.allowed = 0.0, 1.0
         # a step begins as the one before did
         self._convex = self._began_convex
+        collides = self._iterates and self._equations.collides(COLLISION * self.convergence.spacing)
         self._linear.begin()
         self._linear.shift.begin()
         self.convergence.begin()
         self.globalisation.begin()
-        self.forcing.begin(near=self._equations.discretisation.near)
+        self.forcing.begin(near=self._equations.discretisation.near, collides=collides)
 
     @logged(JACOBIAN)
     def assemble(self, u: PETSc.Vec) -> None:
@@ -174,7 +175,7 @@ class Newton:
         def assemble() -> None:
             self._linear.set(v, self._blend.value, keep=False, convex=self._convex)
 
-        changed = self._contact.improve(v, residual, y, assemble, self.forcing.tolerance)
+        changed = self._contact.improve(v, residual, y, assemble, self.forcing.in_use)
         self.foreseen_linear += self._contact.linear_iterations
         return changed
 

@@ -362,7 +362,7 @@ class StageEquations:
             from lyra_petsc.stepping import impacts  # of no use elsewhere
 
             if not self.discretisation.near:
-                self.integrator.surplus = max(self.integrator.surplus, 0.0)
+                self.integrator.surplus, self.damped = max(self.integrator.surplus, 0.0), None
                 return
             if self.watches_impacts:
                 left = self.integrator.surplus
@@ -785,6 +785,14 @@ class StageEquations:
         near = any(term.n_elements for term in limiting)
         goes = reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0) > far
         return all(self.points.largest(near, bool(goes)))
+
+    def collides(self, far: float) -> bool:
+        """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""
+        limiting = self.active.limiting
+        if not self.discretisation.near or not self.integrator.moves or self._at_end:
+            return False
+        x, ahead, frozen = self.x, self._expected(), self.active.frozen
+        return any(self.points.largest(any(t.collides(x, ahead, frozen[t], far) for t in limiting)))
 
     def new_iterate(self, v: Array | None) -> None:
         """Let Jacobians be those of Newton's iterate v, linearised from the one before; None: of the first.

@@ -603,6 +603,10 @@ class ContactBarrier(Elastic):
         contact_pairs.free_ways(x, *_during(frozen, part, way), *pairs, KEPT, out)
         return out
 
+    def collides(self, x: Array, way: Array, frozen: Places, far: float) -> bool:
+        pairs = self.kind, self.points, self.offset, self.gap
+        return bool(contact_pairs.collide(x, *_during(frozen, Part(0.0, 1.0), way), *pairs, far))
+
     def pair(self, element: int) -> Pair:
         points, begins = self.points[element].tolist(), 2 if self.kind[element] == EDGE_EDGE else 1
         parts = (tuple(points[:begins]), tuple(points[begins:]))

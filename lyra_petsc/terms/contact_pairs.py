@@ -1101,6 +1101,23 @@ def _free_way(x, others, way, others_way, nearer, kind, points, offset, far, kee
     return most
 
 
+@kernel()
+def collide(x, others, way, others_way, kind, points, offset, gap, far):  # type: ignore[no-untyped-def]
+    """Whether any pair may come into its gap on ways (n_local, 3), (m, 3) [m] on which its parts come nearer
+    to each other by more than ``far`` [m].
+    """
+    if approach(way, others_way) <= far:
+        return False
+    p, w = np.empty((4, 3)), np.empty((4, 3))
+    for e in range(len(kind)):
+        _load(x, others, points, e, p)
+        _load(way, others_way, points, e, w)
+        pace = _plane_speed(p, w, 1.0) if kind[e] == VERTEX_PLANE else speed(kind[e], w)
+        if pace > far and distance(kind[e], p) - offset[e] < pace + gap[e]:
+            return True
+    return False
+
+
 @leaf()
 def _force(p, kind, delta, gap, stiffness, parallel, slope):  # type: ignore[no-untyped-def]
     """Normal force [N] of a pair; 0 out of the barrier's reach."""

@@ -29,6 +29,9 @@ from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 SLIP, SLID, BETA, NORMAL, START, FOOT, FORCE, COLUMNS = 6, 9, 10, 14, 17, 20, 23, 24
 """Where each begins in a row of what is known of pairs, `friction.Pairs`, and how long it is."""
 
+EQUAL = 1e-6
+"""Relative difference of squared lengths up to which which is longer is a matter of rounding."""
+
 
 @leaf()
 def way(x, e, stencil, beta, normal, start, slip, u):  # type: ignore[no-untyped-def]
@@ -213,7 +216,8 @@ def _alike(keys, a, among, b):  # type: ignore[no-untyped-def]
 def find(keys, among, what, place):  # type: ignore[no-untyped-def]
     """Which row of ``among`` (M, 10) goes on in each row of keys (N, 10), −1 where none does.
 
-    Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 24).
+    Of several that are as much alike the one with the longer elastic part, in their rows of ``what`` (M, 24);
+    of those that slide, whose elastic parts are equally long, the one with the larger normal force.
     """
     room = 1
     while room < 2 * len(among):
@@ -223,13 +227,15 @@ def find(keys, among, what, place):  # type: ignore[no-untyped-def]
         row = Index(among[b, 0] & (room - 1))
         following[b], first[row] = first[row], b
     for a in range(len(keys)):
-        place[a], best, longest = -1, -1, -1.0
+        place[a], best, longest, largest = -1, -1, 0.0, 0.0
         b = first[Index(keys[a, 0] & (room - 1))]
         while b >= 0:
             if among[b, 0] == keys[a, 0]:
                 fits, length = _alike(keys, a, among, b), 0.0
                 for k in range(3):
                     length += what[b, SLIP + k] * what[b, SLIP + k]
-                if fits >= 0 and (fits > best or (fits == best and length > longest)):
-                    place[a], best, longest = b, fits, length
+                force, longer = what[b, FORCE], length > longest * (1.0 + EQUAL)
+                longer = longer or (length >= longest * (1.0 - EQUAL) and force > largest)
+                if fits >= 0 and (fits > best or (fits == best and longer)):
+                    place[a], best, longest, largest = b, fits, length, force
             b = following[b]

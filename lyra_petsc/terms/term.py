@@ -340,6 +340,12 @@ class Elastic(Term):
         """
         return np.empty(0)
 
+    def collides(self, x: Array, way: Array, frozen: Any, far: float) -> bool:
+        """Whether any elements of this rank may meet in a step in which points go the way (n_local, 3) [m]
+        from x, and obstacles theirs, coming nearer to each other by more than ``far`` [m].
+        """
+        return False
+
     def pair(self, element: int) -> Pair:
         """What an element keeps apart."""
         raise NotImplementedError

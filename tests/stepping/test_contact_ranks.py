@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from physics import Simulation, direct_solver, gathered, grid, obj_file, scene_of
 
+from lyra_petsc.stepping.energy_balance import Ledger
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms import contact
 from lyra_petsc.terms.contact import ContactBarrier
@@ -142,6 +143,58 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
         simulation.destroy()
     assert contacts > 10.0
     np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
+
+
+def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
+    """They buckle in one of many ways. What the preconditioner, which depends on the ranks, leaves of the
+    first directions of Newton's method must not tell in which.
+    """
+    turned = TURNED | {"translate": [-0.05, 0.03, 0.06 + 0.14435478835021417]}
+    content = {
+        "mesh": [grid(0.5, 0.5, 12, 12), grid(0.5, 0.5, 12, 12) | {"transform": turned}],
+        "gravity": [0.0, 0.0, -9.81],
+        "material": {"cloth": "gray-interlock", "damping": 0.01},
+        "contact": {"friction": 0.3},
+        "time": {"end": 1.0, "step": 0.005},
+        "solver": {},
+    }
+    blocks = {"pc_type": "bjacobi", "pc_bjacobi_local_blocks": "3", "sub_pc_type": "ilu"}
+    ways, contacts = [], 0.0
+    for ranks, options in ((MPI.COMM_SELF, {}), (comm, blocks)):
+        for name, value in options.items():
+            PETSc.Options().setValue(name, value)
+        simulation = SteppedScene(ranks, scene_of(content))
+        system, points = simulation.problem.system, simulation.problem.points
+        n, v = points.n_owned, system.v[: points.n_owned].copy()
+        v[:, 2] = np.where(points.original < 13 * 13, 10.0, -10.0)
+        system.state.set(system.x[:n], v)
+        simulation.stepper.start(0.0, 0)
+        simulation.ledger = Ledger(system)
+        for _ in range(3):
+            simulation.step()
+            contacts = max(contacts, simulation.ledger.columns()["contacts"])
+        size = simulation.problem.outline.size
+        ways.append(gathered(simulation.problem.points, system.x))
+        simulation.destroy()
+    assert contacts > 10.0
+    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
+
+
+def test_only_what_is_near_and_fast_collides(comm: MPI.Comm) -> None:
+    """Towards the floor, and towards each other."""
+    with Simulation(falling(0.02), comm) as simulation:
+        system, n = simulation.problem.system, simulation.problem.points.n_owned
+        lower = (simulation.problem.points.original < 4)[:, None]
+
+        def collides(first: float, second: float) -> bool:
+            system.state.set(system.x[:n], np.where(lower, first, second) * [0.0, 0.0, 1.0])
+            system.begin_step(0.0, 0.004)
+            return system.collides(0.05)
+
+        assert collides(-15.0, -15.0)
+        assert not collides(-11.0, -11.0)
+        assert collides(8.0, -8.0)
+        assert not collides(5.0, -5.0)
 
 
 def test_there_is_room_near_the_start_of_a_way() -> None:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lyra_petsc.terms import friction_pairs
+from lyra_petsc.terms.contact_pairs import VERTEX_TRIANGLE
 
 Array = NDArray[np.float64]
 
@@ -100,3 +101,23 @@ def test_sliding_leaves_what_the_limit_stretches(x: Array, state: tuple[Array, .
     start = np.einsum("ei,eik->ek", state[1], x[state[0]])
     after = (*state[:3], start, *state[4:])
     np.testing.assert_allclose(gradient(x, after), force, atol=1e-12)
+
+
+def test_rounding_does_not_tell_which_of_two_sliding_pairs_goes_on() -> None:
+    """A vertex that comes over an edge goes on with the triangle that held it by more force."""
+    triangles, edge = [[7, 1, 2, 3], [7, 2, 1, 4]], [[7, 1, 2, 2]]
+    keys = np.zeros((3, 10), dtype=np.int64)
+    keys[:, :4], keys[:, 4], keys[:, 5] = [*triangles, *edge], VERTEX_TRIANGLE, -1
+    among, key = keys[:2], keys[2:]
+    what = np.zeros((2, friction_pairs.COLUMNS))
+    what[:, friction_pairs.SLIP], what[:, friction_pairs.FORCE] = 1e-5, (1.0, 2.0)
+    for order in ([0, 1], [1, 0]):
+        for longer in (0, 1):
+            old = what.copy()
+            old[longer, friction_pairs.SLIP] *= 1.0 + 1e-12
+            place = np.empty(1, dtype=np.int64)
+            friction_pairs.find(key, among[order], old[order], place)
+            assert order[place[0]] == 1
+    what[0, friction_pairs.SLIP] *= 1.01  # one that sticks still
+    friction_pairs.find(key, among, what, place)
+    assert place[0] == 0
