@@ -91,11 +91,12 @@ class Convergence:
 
     @property
     def judged(self) -> bool:
-        """Whether the solve ended by this test, or where it is good enough.
+        """Whether the solve ended by this test, or in a motion where it is good enough.
 
-        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual.
+        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual. In
+        statics small forces may lead far.
         """
-        return self._ended or self.balanced
+        return self._ended or (self._equations.integrator.moves and self.balanced)
 
     @property
     def balanced(self) -> bool:

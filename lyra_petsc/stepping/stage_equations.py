@@ -17,8 +17,8 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import cached_property, partial, reduce
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -144,10 +144,11 @@ class StageEquations:
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
         self._least = self._least_stiffness()
-        # moving targets change the forces at one and the same place
-        internal = partial(self._sum, active.sheet)
-        self._internal = internal if active.moving else Remembered(internal)
-        once = integrator.lagged_loads
+        # moving targets change the forces at one and the same place; where a step is one linear solve, and
+        # directors are measured anew in each, no forces are asked for twice
+        internal, once = partial(self._sum, active.sheet), integrator.lagged_loads
+        changes = bool(active.moving) or bool(active.edged and once and integrator.moves)
+        self._internal = internal if changes else Remembered(internal)
         self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
         last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
@@ -164,7 +165,7 @@ class StageEquations:
         self._predicted: tuple[Array, Array] | None = None
         self._leaps = False
         self._uncorrected: Array | None = None
-        self._last_parts: dict[str, Array] = {}
+        self._squares: list[float] = []
 
     @property
     def points(self) -> Layout:
@@ -232,7 +233,7 @@ class StageEquations:
         if self.watches_impacts:
             terms = self.active.limiting
             self._stored = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
-        self.history = self.v[:n].copy() if stage.v is None else stage.v
+        self.history = self.v[:n] if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
 
@@ -251,10 +252,10 @@ class StageEquations:
         x, turns = self._frozen_positions(at), bool(self.active.pushing)
         if turns:  # by the stage an obstacle may be where the sheet is yet
             self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
-        parts = self._parts(self.x, v, np.zeros_like(self.history))
+        total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
         if turns:
             self.active.turn_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
-        force, mass = np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.mass[:, None]
+        force, mass = np.where(self.prescribed.free, -total, 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
     def _freeze(self, at: float) -> None:
@@ -306,10 +307,10 @@ class StageEquations:
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
-        parts = self.forces_now()
-        return np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
+        total = self._total(self.x, self.v, np.zeros_like(self.history), np.empty_like(self.history))
+        return np.where(self.prescribed.free, -total, 0.0), self.largest_force()
 
-    def forces_now(self) -> dict[str, Array]:
+    def forces_now(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the start of the step, each (n_owned, 3) [N]; nothing is accelerated."""
         return self._parts(self.x, self.v, np.zeros_like(self.history))
 
@@ -686,39 +687,54 @@ class StageEquations:
         """What ``evaluate_at`` last returned."""
         return self._xs, self._vs
 
-    def forces_at_stage(self) -> dict[str, Array]:
+    def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
         rate = self.stage.sigma * (self._vs[: self.points.n_owned] - self.history)
-        parts, self._last_parts = self._parts(self._xs, self._vs, rate), {}
-        return parts
+        return self._parts(self._xs, self._vs, rate)
 
-    def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
-        self._last_parts = {}  # there is no room for both
-        parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
+    def _parts(self, x: Array, vs: Array, vdot: Array) -> Iterator[tuple[str, Array]]:
+        """One part of F after the other: there is no room for all of them. What the internal forces are
+        computed from is remembered, so that these come last.
+        """
+        self._squares = []
+        yield self._counted("inertia", self.mass[:, None] * vdot)
+        del vdot
         if self.active.constraints:
-            parts["springs"] = self._sum(self.active.constraints, x)
-        parts["loads"] = -self.applied.now
+            yield self._counted("springs", self._sum(self.active.constraints, x))
+        yield self._counted("loads", -self.applied.now)
         if self.damping.acts:
-            parts["damping"] = self.damping.product(vs)
+            yield self._counted("damping", self.damping.product(vs))
+            if self.integrator.lagged_loads:  # nobody asks again
+                self.damping.product.forget()
         if self.active.viscous and not self.integrator.lagged_loads:
-            parts["wind"] = self._sum(self.active.viscous, vs)
-        self._last_parts = parts
-        return parts
+            yield self._counted("wind", self._sum(self.active.viscous, vs))
+        yield self._counted("internal", self._internal(x))
+
+    def _counted(self, name: str, part: Array) -> tuple[str, Array]:
+        """A part of F, whose square goes into `largest_force`."""
+        self._squares.append(float(np.einsum("ij,ij,ij", part, part, self.prescribed.counted)))
+        return name, part
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
         return self.active.gradient(terms, at, self.points)
 
+    def _total(self, x: Array, vs: Array, vdot: Array, out: Array) -> Array:
+        """F (n_owned, 3) [N] into ``out``."""
+        out[:] = 0.0
+        for _, part in self._parts(x, vs, vdot):
+            out += part
+            del part
+        return out
+
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
-        parts = self._parts(*self.evaluate_at(v), vdot).values()
-        reduce(lambda total, part: np.add(total, part, out=out), parts)
+        self._total(*self.evaluate_at(v), vdot, out)
         at, velocity = self.prescribed.at, self.prescribed.velocity
         self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
-        parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
-        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
+        return float(np.sqrt(self.points.summed(*self._squares).max(initial=0.0)))
 
     def block_summary(self) -> list[str]:
         """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
@@ -814,7 +830,6 @@ class StageEquations:
         if predicted is not None and len(predicted[0]) != len(x):
             predicted = None  # of an iterate with other ghosts
         lagged = self.integrator.lagged_loads
-        self._last_parts = {} if lagged else self._last_parts
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
         reach = self.stage.reach
