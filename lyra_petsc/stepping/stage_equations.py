@@ -25,7 +25,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
@@ -403,17 +403,29 @@ class StageEquations:
 
         On the tangent at v the vertices go beside their circles, and directors far beyond.
         """
-        if not self.active.edged or self.stage.reach * self._farthest_turn(way) <= LARGEST_TURN:
+        if not self.active.edged or self.stage.reach * self.farthest_turn(way) <= LARGEST_TURN:
             return False
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         changed = 0
         for term in self.active.edged:
-            places, values = term.followed(x, ahead, self.active.frozen[term])
-            own = places < way.size
-            own[own] = self.prescribed.free.ravel()[places[own]]
-            way.reshape(-1)[places[own]] = values[own] / self.stage.reach
-            changed += int(own.any())
+            changed += self._follow_in(way, *term.followed(x, ahead, self.active.frozen[term]))
         return bool(self.points.comm.allreduce(changed, MPI.MAX))
+
+    def let_directors_follow(self, v: Array, way: Array, bent: Array) -> None:
+        """Let all unknowns of edges go, on the way from v that vertices go by ``bent`` (n_owned, 3) [m/s], so
+        that triangles are bent as on the tangent, by ``way``; collective.
+        """
+        along = self.ahead(v, bent)[1]
+        x, ahead = self.ahead(v, way)
+        for term in self.active.edged:
+            self._follow_in(bent, *term.followed(x, ahead, self.active.frozen[term], along))
+
+    def _follow_in(self, way: Array, places: Ints, values: Array) -> bool:
+        """Put ways (m,) [m] of the free unknowns at ``places`` (m,) into way (n_owned, 3) [m/s]; if any."""
+        own = places < way.size
+        own[own] = self.prescribed.free.ravel()[places[own]]
+        way.reshape(-1)[places[own]] = values[own] / self.stage.reach
+        return bool(own.any())
 
     @property
     def edges_lag(self) -> bool:
@@ -493,11 +505,11 @@ class StageEquations:
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        turn = 0.0 if self.integrator.moves else self._farthest_turn(way * self.stage.reach)
+        turn = 0.0 if self.integrator.moves else self.farthest_turn(way * self.stage.reach)
         most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
         for _ in range(SEARCHES):
             whole = gone == 0.0 and most == 1.0  # mostly
-            x, ahead = self._ahead(v, way) if whole else self._ahead(v + gone * way, (most - gone) * way)
+            x, ahead = self.ahead(v, way) if whole else self.ahead(v + gone * way, (most - gone) * way)
             seen = fraction = self.discretisation.largest_step(x, ahead)
             if seen < FEW:
                 x, ahead = self._look(v + gone * way, (most - gone) * way)
@@ -513,11 +525,11 @@ class StageEquations:
         return gone
 
     def _look(self, v: Array, way: Array) -> tuple[Array, Array]:
-        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `_ahead` gives;
+        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `ahead` gives;
         collective.
         """
-        self._follow(*self._ahead(v, way))
-        return self._ahead(v, way)
+        self._follow(*self.ahead(v, way))
+        return self.ahead(v, way)
 
     def pushed_apart(self, v: Array, way: Array) -> Array | None:
         """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
@@ -528,7 +540,7 @@ class StageEquations:
         """
         if not self.active.limiting:
             return None
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
         n, frozen, pushed = len(way), self.active.frozen, False
@@ -546,7 +558,7 @@ class StageEquations:
 
     def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
         """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
         frozen = self.active.frozen
@@ -569,7 +581,7 @@ class StageEquations:
         for term in self.active.limiting:
             term.release(length.get(term))
 
-    def _farthest_turn(self, way: Array) -> float:
+    def farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
         turn = max((term.largest_turn(way) for term in self.active.edged), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
@@ -578,7 +590,7 @@ class StageEquations:
         """The least of all ranks; collective."""
         return -self.points.largest(-number)[0]
 
-    def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
+    def ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
         x = self.evaluate_at(v)[0]
         ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
@@ -613,7 +625,7 @@ class StageEquations:
         """
         n = len(way)
         for _ in range(SEARCHES):
-            x, ahead = self._ahead(v, way)
+            x, ahead = self.ahead(v, way)
             taken = ahead
             for term in self.active.pushing:
                 taken = term.carried(x, taken, self.active.frozen[term])
@@ -630,7 +642,7 @@ class StageEquations:
         """
         gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
-            x, ahead = self._ahead(v + gone * way, (1.0 - gone) * way)
+            x, ahead = self.ahead(v + gone * way, (1.0 - gone) * way)
             seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
             part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
