@@ -31,14 +31,19 @@ PREFIX = "arcs_"
 """Of the options of the solver."""
 
 FARTHEST = 0.4
-"""Angle [rad] by which a Newton step may turn a triangle: with 0.25 and 0.6 as many iterations were needed,
-with 0.8 and more a fifth more."""
+"""Angle [rad] by which a Newton step may turn a triangle: with 0.25 and 0.6 shells take as many iterations or
+more, with 1.5 a tenth to a fifth more."""
 
 STRAIGHT = 0.01
 """Angle [rad] by which directors turn at most in steps that are left straight: an arc saves no iteration."""
 
 LOOSE = 1e-9
 """Diagonal over the largest one that holds what nothing else does: where it is."""
+
+
+def possible(ranks: int) -> bool:
+    """Whether this PETSc can factor the matrix."""
+    return ranks == 1 or bool(PETSc.Sys.hasExternalPackage("mumps"))
 
 
 class Arcs:

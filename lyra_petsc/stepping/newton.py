@@ -89,9 +89,9 @@ class Newton:
         self._corrects = still and linear.factors and bool(equations.active.edged)
         self._arcs: Arcs | None = None
         if self._corrects:
-            from lyra_petsc.stepping.arcs import Arcs  # of use for nothing else
+            from lyra_petsc.stepping.arcs import Arcs, possible  # of use for nothing else
 
-            self._arcs = Arcs(equations)
+            self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
         self.forcing = Forcing(
             self._ksp, fixed=fixed, contact=equations.discretisation.guards, cycles=linear.cycles
