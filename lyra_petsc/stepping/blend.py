@@ -45,10 +45,14 @@ class Blend:
         self._too_little, self._enough = 0.0, 1.0
         self._lower = LOWER
 
-    def after(self, taken: float) -> float:
-        """The fraction for the next iteration, when the line search took ``taken`` of the last step."""
+    def after(self, taken: float, *, exact: bool = False) -> float:
+        """The fraction for the next iteration, when the line search took ``taken`` of the last step; with
+        ``exact`` none is tried first.
+        """
         if taken < CUT:
             self.raise_()
+        elif self._adaptive and exact:
+            self._enough, self.value = self.value, 0.0
         elif self._adaptive:
             self._enough = self.value
             lowered = self._lower * self.value

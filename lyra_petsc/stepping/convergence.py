@@ -18,6 +18,9 @@ STALLED = 0.5
 FELL = 0.1
 """Fraction of the residual left by an iteration below which the preconditioner stays."""
 
+HALVED = 0.5
+"""Fraction of it below which factors of the exact Hessian are worth another try, at the price of a solve."""
+
 FINER_IN_CONTACT = 0.1
 """Part of the tolerances above which one more iteration is taken where parts meet: an impact magnifies what a
 step leaves, which depends on the number of ranks."""
@@ -50,6 +53,8 @@ class Convergence:
         Last residual norm [N].
     fell : bool
         Whether the last iteration lessened it much.
+    halved : bool
+        Whether it at least halved it.
     at_roundoff : bool
         Whether the solve ended because only round-off was left.
     left : float
@@ -83,6 +88,7 @@ class Convergence:
     def begin(self) -> None:
         """A new solve."""
         self.norm, self.fell, self.at_roundoff = 0.0, False, False
+        self.halved = True
         self.left, self.too_slow, self.stopped_by = np.inf, False, ""
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
@@ -91,11 +97,12 @@ class Convergence:
 
     @property
     def judged(self) -> bool:
-        """Whether the solve ended by this test, or where it is good enough.
+        """Whether the solve ended by this test, or in a motion where it is good enough.
 
-        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual.
+        Where its line search fails, PETSc takes a short direction for convergence, whatever the residual. In
+        statics small forces may lead far.
         """
-        return self._ended or self.balanced
+        return self._ended or (self._equations.integrator.moves and self.balanced)
 
     @property
     def balanced(self) -> bool:
@@ -111,6 +118,7 @@ class Convergence:
     def _test(self, snes: PETSc.SNES, iteration: int, residual: float, spent: int) -> int | None:
         before, self.norm = self.norm, residual
         self.fell = residual < FELL * before
+        self.halved = iteration == 0 or residual < HALVED * before
         if not np.isfinite(residual):
             return NOT_A_NUMBER
         if iteration > 0:

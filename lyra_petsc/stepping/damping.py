@@ -93,9 +93,9 @@ class Damping:
         return self._discretisation.fixed
 
     def freeze(self, x: Array, frozen: Mapping[Term, Any]) -> None:
-        """Take the geometry of positions x (n_local, 3), with what terms froze for the step."""
+        """Take the geometry of positions x (n_local, 3), left as they are, and what terms froze for it."""
         self.let_go()
-        self._at, self._stored, self.frozen = x.copy(), False, frozen
+        self._at, self._stored, self.frozen = x, False, frozen
         self.product.forget()
         if not self._once:
             self._own()

@@ -6,7 +6,7 @@ bracket = E(x_{n+1}) − E(x_n) − ∇E(x_{n+1})·Δx   (≤ 0 where E is conve
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -97,7 +97,7 @@ class Ledger:
         self._pull: Array | None = None
         self._targets: list[tuple[Array, Array]] = []
         if not system.integrator.moves:
-            self._pull, self._targets = self._external(dict(system.forces_now())), self._turning()
+            self._pull, self._targets = self._external(system.forces_now())[0], self._turning()
         self.measure()
 
     @property
@@ -128,6 +128,7 @@ class Ledger:
         budget, sums = self.budget, [float(value) for value in system.points.summed(*local)]
         budget.membrane, budget.bending, budget.potential = sums[:3]
         budget.more, budget.kinetic = dict(zip(self._more, sums[3:-1], strict=True)), sums[-1]
+        system.forget_directors()  # the next step has other frames
         return budget
 
     def kept(self) -> tuple[Budget, float]:
@@ -141,8 +142,7 @@ class Ledger:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
-        parts = system.forces_at_stage()
-        external = self._external(parts)
+        external, damping, damped = self._external(system.forces_at_stage())
         # targets that move with a handle let it work on the sheet
         if self._pull is None:
             turned = system.moving_energy_before - self._moving
@@ -155,15 +155,10 @@ class Ledger:
             )
         turned += system.pushed() + system.turn_targets_to_end()
         moved = system.x[: len(x_before)] - x_before
-        local = np.array([float(np.vdot(external, moved)) + turned, 0.0])
-        damping = np.zeros(len(self._at))
-        if "damping" in parts:
-            local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))
-            damping = parts["damping"].take(self._at)
-        damped = float(local[1])
+        local = np.array([float(np.vdot(external, moved)) + turned, damped])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         local[1] += system.damped.heat if system.damped else 0.0
-        del parts, external, moved  # energies need the room
+        del external, moved  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)
@@ -177,28 +172,31 @@ class Ledger:
         active, x = self._system.active, self._system.x
         return [term.targets(x, active.frozen[term]) for term in active.moving if not term.pushes]
 
-    def _external(self, parts: dict[str, Array]) -> Array:
-        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F, which
-        lose those of inertia and loads.
+    def _external(self, parts: Iterable[tuple[str, Array]]) -> tuple[Array, Array, float]:
+        """Forces (n_owned, 3) [N] of handles, springs and loads without a potential, of the parts of F; those
+        of damping at the prescribed unknowns (m,), and its heat [J].
         """
         system = self._system
-        self._at = system.prescribed.at
-        self._reactions = np.sum([part.take(self._at) for part in parts.values()], axis=0)
+        self._at = at = system.prescribed.at
+        self._reactions, damping, heat = np.zeros(len(at)), np.zeros(len(at)), 0.0
         if system.damped:
             self._reactions += system.damped.held
-        del parts["inertia"]  # what follows needs the room
-        external = np.negative(parts["loads"], out=parts.pop("loads"))
-        system.prescribed.put(external, external.take(self._at) + self._reactions)
+        weight = np.zeros((system.points.n_local, 3))
         for load in system.active.loads:
             if load.registration.energy:  # it has a potential, and does no work from outside
-                weight = np.zeros((system.points.n_local, 3))
                 load.add_force(system.x, 0.0, 0.0, weight)
-                weight *= system.applied.factor
-                external -= weight[: len(external)]
-        for name in ("wind", "springs"):
-            if name in parts:
-                external -= parts[name]
-        return external
+        external = weight[: system.points.n_owned]
+        external *= -system.applied.factor
+        for name, part in parts:
+            self._reactions += part.take(at)
+            if name in ("loads", "springs", "wind"):
+                external -= part
+            elif name == "damping":
+                damping = part.take(at)
+                heat = system.dt * float(np.vdot(system.stage_velocity, part))
+            del part  # the next needs the room
+        system.prescribed.put(external, external.take(at) + self._reactions)
+        return external, damping, heat
 
     def memory(self) -> tuple[dict[str, Array], dict[str, Any]]:
         """Arrays (n_owned, 3) and numbers to go on with after a restart."""

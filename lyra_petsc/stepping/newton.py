@@ -21,6 +21,7 @@ from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 if TYPE_CHECKING:
+    from lyra_petsc.stepping.arcs import Arcs
     from lyra_petsc.stepping.contact_model import ContactModel
 
 
@@ -86,6 +87,11 @@ class Newton:
         self._began_convex = False
         still = not (equations.integrator.moves or equations.discretisation.guards)
         self._corrects = still and linear.factors and bool(equations.active.edged)
+        self._arcs: Arcs | None = None
+        if self._corrects:
+            from lyra_petsc.stepping.arcs import Arcs, possible  # of use for nothing else
+
+            self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
         self.forcing = Forcing(self._ksp, fixed=fixed, cycles=linear.cycles)
 
@@ -110,7 +116,7 @@ class Newton:
             self._equations.new_iterate(v)
             self.forcing.before_solve(self.convergence.norm)
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
-        blend = self._blend.after(self._taken(u))
+        blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.set(v, blend, keep=self.convergence.fell, convex=self._convex)
 
     def _array(self, u: PETSc.Vec) -> Array:
@@ -152,10 +158,12 @@ class Newton:
             useless = self._useless(residual, y)
         if self._contact is not None and not useless:
             changed |= self._foresee(x, residual, y)
-        if self.globalisation.trusts:
+        bent = self._arcs is not None and self.globalisation.trusts and self._bend(x, residual, y)
+        if self.globalisation.trusts and not bent:
             changed |= self._follow_triangles(x, residual, y)
-        if self._equations.limits_steps:
+        if self._equations.limits_steps and not bent:
             changed |= self._limit(x, residual, y)
+        changed |= bent
         if self._corrects and self.globalisation.trusts:
             exact = self._linear.same and self._blend.value == 0.0
             changed |= self._correct(x, y, exact=exact)
@@ -207,6 +215,34 @@ class Newton:
         equations.residual(v, equations.stage.sigma * (v - equations.history), force)
         (square,) = equations.points.summed(float(np.vdot(force, force)))
         return float(np.sqrt(square)), force
+
+    def bend_guess(self, v: Array, guess: Array) -> None:
+        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs; collective."""
+        if self._arcs is not None:
+            guess[:] = v + self._arcs.bend(v, guess - v, strains=False)[0]
+
+    def _bend(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
+        """Let a step y that is taken in full go along arcs, as far as they lead; whether it does."""
+        assert self._arcs is not None
+        v = self._array(x)
+        if not self._arcs.matter(-self._array(y)):
+            return False
+        before = y.copy()
+        bent, way = self._arcs.bend(v, -self._array(y))
+        y.setArray(-bent.ravel())
+        downwards = bool(residual.dot(y) > 0.0)
+        if downwards:
+            self._equations.linearise_to(v + way)
+            self.allowed = 1.0
+        else:
+            before.copy(y)
+        before.destroy()
+        return downwards
+
+    def destroy(self) -> None:
+        """Free what it has of PETSc's; collective."""
+        if self._arcs is not None:
+            self._arcs.destroy()
 
     def _follow_triangles(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let directors follow their triangles in a step y that is taken in full; whether any does."""

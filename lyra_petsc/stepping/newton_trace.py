@@ -147,7 +147,7 @@ class Trace:
             velocity,
             position,
             residual,
-            system.forces_at_stage(),
+            dict(system.forces_at_stage()),
             system.prescribed.mask[:n].copy(),
             goal,
             int(self._snes.getConvergedReason()),

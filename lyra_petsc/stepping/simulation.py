@@ -259,7 +259,7 @@ class SteppedScene:
         """
         started = clock.perf_counter() - COMPILATION.seconds
         system, n = self.problem.system, self.problem.points.n_owned
-        x_before, v_before = system.x.copy(), system.v.copy()
+        x_before, v_before = system.x, system.v
         newton = linear = rejected = halvings = 0
         self._tried = []
         system.integrator = self._usual

@@ -17,15 +17,15 @@ Arrays only: no PETSc here. Collective where sums over ranks are returned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import cached_property, partial, reduce
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array
+from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
@@ -145,10 +145,11 @@ class StageEquations:
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
         self._least = self._least_stiffness()
-        # moving targets change the forces at one and the same place
-        internal = partial(self._sum, active.sheet)
-        self._internal = internal if active.moving else Remembered(internal)
-        once = integrator.lagged_loads
+        # moving targets change the forces at one and the same place; where a step is one linear solve, and
+        # directors are measured anew in each, no forces are asked for twice
+        internal, once = partial(self._sum, active.sheet), integrator.lagged_loads
+        changes = bool(active.moving) or bool(active.edged and once and integrator.moves)
+        self._internal = internal if changes else Remembered(internal)
         self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
         last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
@@ -165,7 +166,7 @@ class StageEquations:
         self._predicted: tuple[Array, Array] | None = None
         self._leaps = False
         self._uncorrected: Array | None = None
-        self._last_parts: dict[str, Array] = {}
+        self._squares: list[float] = []
         self.damped: Damped | None = None
 
     @property
@@ -235,7 +236,7 @@ class StageEquations:
         if self.watches_impacts:
             terms = self.active.limiting
             self._stored = sum(float(t.energies(self.x, self.active.frozen[t]).sum()) for t in terms)
-        self.history = self.v[:n].copy() if stage.v is None else stage.v
+        self.history = self.v[:n] if stage.v is None else stage.v
         self._set_history(stage, t0 + after)
         self.moving_energy_before = self.active.moving_energy(self.x)
 
@@ -254,10 +255,10 @@ class StageEquations:
         x, turns = self._frozen_positions(at), bool(self.active.pushing)
         if turns:  # by the stage an obstacle may be where the sheet is yet
             self.active.turn_targets(UpcomingStep(self.t0, self.t1, self.t0, x, self.reference.at))
-        parts = self._parts(self.x, v, np.zeros_like(self.history))
+        total = self._total(self.x, v, np.zeros_like(self.history), np.empty_like(self.history))
         if turns:
             self.active.turn_targets(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
-        force, mass = np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.mass[:, None]
+        force, mass = np.where(self.prescribed.free, -total, 0.0), self.mass[:, None]
         return np.divide(force, mass, out=np.zeros_like(force), where=mass > 0.0)
 
     def _freeze(self, at: float) -> None:
@@ -309,10 +310,10 @@ class StageEquations:
 
     def out_of_balance(self) -> tuple[Array, float]:
         """Force (n_owned, 3) [N] on the free unknowns now, norm [N] of its largest part; collective."""
-        parts = self.forces_now()
-        return np.where(self.prescribed.free, -sum(parts.values()), 0.0), self.largest_force()
+        total = self._total(self.x, self.v, np.zeros_like(self.history), np.empty_like(self.history))
+        return np.where(self.prescribed.free, -total, 0.0), self.largest_force()
 
-    def forces_now(self) -> dict[str, Array]:
+    def forces_now(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the start of the step, each (n_owned, 3) [N]; nothing is accelerated."""
         return self._parts(self.x, self.v, np.zeros_like(self.history))
 
@@ -407,17 +408,29 @@ class StageEquations:
 
         On the tangent at v the vertices go beside their circles, and directors far beyond.
         """
-        if not self.active.edged or self.stage.reach * self._farthest_turn(way) <= LARGEST_TURN:
+        if not self.active.edged or self.stage.reach * self.farthest_turn(way) <= LARGEST_TURN:
             return False
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         changed = 0
         for term in self.active.edged:
-            places, values = term.followed(x, ahead, self.active.frozen[term])
-            own = places < way.size
-            own[own] = self.prescribed.free.ravel()[places[own]]
-            way.reshape(-1)[places[own]] = values[own] / self.stage.reach
-            changed += int(own.any())
+            changed += self._follow_in(way, *term.followed(x, ahead, self.active.frozen[term]))
         return bool(self.points.comm.allreduce(changed, MPI.MAX))
+
+    def let_directors_follow(self, v: Array, way: Array, bent: Array) -> None:
+        """Let all unknowns of edges go, on the way from v that vertices go by ``bent`` (n_owned, 3) [m/s], so
+        that triangles are bent as on the tangent, by ``way``; collective.
+        """
+        along = self.ahead(v, bent)[1]
+        x, ahead = self.ahead(v, way)
+        for term in self.active.edged:
+            self._follow_in(bent, *term.followed(x, ahead, self.active.frozen[term], along))
+
+    def _follow_in(self, way: Array, places: Ints, values: Array) -> bool:
+        """Put ways (m,) [m] of the free unknowns at ``places`` (m,) into way (n_owned, 3) [m/s]; if any."""
+        own = places < way.size
+        own[own] = self.prescribed.free.ravel()[places[own]]
+        way.reshape(-1)[places[own]] = values[own] / self.stage.reach
+        return bool(own.any())
 
     @property
     def edges_lag(self) -> bool:
@@ -498,11 +511,11 @@ class StageEquations:
 
     def largest_step(self, v: Array, way: Array) -> float:
         """Largest fraction of the way from v by ``way`` (n_owned, 3) [m/s] that terms allow; collective."""
-        turn = 0.0 if self.integrator.moves else self._farthest_turn(way * self.stage.reach)
+        turn = 0.0 if self.integrator.moves else self.farthest_turn(way * self.stage.reach)
         most, gone = (FARTHEST_TURN / turn if turn > FARTHEST_TURN else 1.0), 0.0
         for _ in range(SEARCHES):
             whole = gone == 0.0 and most == 1.0  # mostly
-            x, ahead = self._ahead(v, way) if whole else self._ahead(v + gone * way, (most - gone) * way)
+            x, ahead = self.ahead(v, way) if whole else self.ahead(v + gone * way, (most - gone) * way)
             seen = fraction = self.discretisation.largest_step(x, ahead)
             if seen < FEW:
                 x, ahead = self._look(v + gone * way, (most - gone) * way)
@@ -519,11 +532,11 @@ class StageEquations:
         return gone
 
     def _look(self, v: Array, way: Array) -> tuple[Array, Array]:
-        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `_ahead` gives;
+        """Let stencils be those all along the way from v by ``way`` (n_owned, 3) [m/s]; what `ahead` gives;
         collective.
         """
-        self._follow(*self._ahead(v, way))
-        return self._ahead(v, way)
+        self._follow(*self.ahead(v, way))
+        return self.ahead(v, way)
 
     def pushed_apart(self, v: Array, way: Array) -> Array | None:
         """The way from v by ``way`` (n_owned, 3) [m/s], but that what would then be too near goes aside; None
@@ -534,7 +547,7 @@ class StageEquations:
         """
         if not self.active.limiting:
             return None
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
         if not self.discretisation.near:
@@ -554,7 +567,7 @@ class StageEquations:
 
     def springs(self, v: Array, way: Array) -> dict[Elastic, Springs]:
         """What may touch on the way from v by ``way`` (n_owned, 3) [m/s], until `release`; collective."""
-        x, ahead = self._ahead(v, way)
+        x, ahead = self.ahead(v, way)
         if self.discretisation.largest_step(x, ahead) < 1.0:
             x, ahead = self._look(v, way)
         frozen = self.active.frozen
@@ -577,7 +590,7 @@ class StageEquations:
         for term in self.active.limiting:
             term.release(length.get(term))
 
-    def _farthest_turn(self, way: Array) -> float:
+    def farthest_turn(self, way: Array) -> float:
         """Largest angle [rad] by which directors turn on a way (n_owned, 3); collective."""
         turn = max((term.largest_turn(way) for term in self.active.edged), default=0.0)
         return float(self.points.comm.allreduce(turn, MPI.MAX))
@@ -586,7 +599,7 @@ class StageEquations:
         """The least of all ranks; collective."""
         return -self.points.largest(-number)[0]
 
-    def _ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
+    def ahead(self, v: Array, way: Array) -> tuple[Array, Array]:
         """Positions (n_local, 3) at velocities v (n_owned, 3), and how far ``way`` leads from there [m]."""
         x = self.evaluate_at(v)[0]
         ahead = fitted(way * self.stage.reach, len(way), self.points.n_local)
@@ -624,7 +637,7 @@ class StageEquations:
         """
         n = len(way)
         for _ in range(SEARCHES):
-            x, ahead = self._ahead(v, way)
+            x, ahead = self.ahead(v, way)
             taken = ahead
             for term in self.active.pushing:
                 taken = term.carried(x, taken, self.active.frozen[term])
@@ -641,7 +654,7 @@ class StageEquations:
         """
         gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
-            x, ahead = self._ahead(v + gone * way, (1.0 - gone) * way)
+            x, ahead = self.ahead(v + gone * way, (1.0 - gone) * way)
             seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
             part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
@@ -701,39 +714,54 @@ class StageEquations:
         """What ``evaluate_at`` last returned."""
         return self._xs, self._vs
 
-    def forces_at_stage(self) -> dict[str, Array]:
+    def forces_at_stage(self) -> Iterator[tuple[str, Array]]:
         """The parts of F at the stage of the step just accepted, each (n_owned, 3) [N]."""
         rate = self.stage.sigma * (self._vs[: self.points.n_owned] - self.history)
-        parts, self._last_parts = self._parts(self._xs, self._vs, rate), {}
-        return parts
+        return self._parts(self._xs, self._vs, rate)
 
-    def _parts(self, x: Array, vs: Array, vdot: Array) -> dict[str, Array]:
-        self._last_parts = {}  # there is no room for both
-        parts = {"inertia": self.mass[:, None] * vdot, "internal": self._internal(x)}
+    def _parts(self, x: Array, vs: Array, vdot: Array) -> Iterator[tuple[str, Array]]:
+        """One part of F after the other: there is no room for all of them. What the internal forces are
+        computed from is remembered, so that these come last.
+        """
+        self._squares = []
+        yield self._counted("inertia", self.mass[:, None] * vdot)
+        del vdot
         if self.active.constraints:
-            parts["springs"] = self._sum(self.active.constraints, x)
-        parts["loads"] = -self.applied.now
+            yield self._counted("springs", self._sum(self.active.constraints, x))
+        yield self._counted("loads", -self.applied.now)
         if self.damping.acts:
-            parts["damping"] = self.damping.product(vs)
+            yield self._counted("damping", self.damping.product(vs))
+            if self.integrator.lagged_loads:  # nobody asks again
+                self.damping.product.forget()
         if self.active.viscous and not self.integrator.lagged_loads:
-            parts["wind"] = self._sum(self.active.viscous, vs)
-        self._last_parts = parts
-        return parts
+            yield self._counted("wind", self._sum(self.active.viscous, vs))
+        yield self._counted("internal", self._internal(x))
+
+    def _counted(self, name: str, part: Array) -> tuple[str, Array]:
+        """A part of F, whose square goes into `largest_force`."""
+        self._squares.append(float(np.einsum("ij,ij,ij", part, part, self.prescribed.counted)))
+        return name, part
 
     def _sum(self, terms: Sequence[Elastic | Viscous], at: Array) -> Array:
         return self.active.gradient(terms, at, self.points)
 
+    def _total(self, x: Array, vs: Array, vdot: Array, out: Array) -> Array:
+        """F (n_owned, 3) [N] into ``out``."""
+        out[:] = 0.0
+        for _, part in self._parts(x, vs, vdot):
+            out += part
+            del part
+        return out
+
     def residual(self, v: Array, vdot: Array, out: Array) -> None:
         """F (n_owned, 3) [N]; in prescribed unknowns σ m (v − v*); collective."""
-        parts = self._parts(*self.evaluate_at(v), vdot).values()
-        reduce(lambda total, part: np.add(total, part, out=out), parts)
+        self._total(*self.evaluate_at(v), vdot, out)
         at, velocity = self.prescribed.at, self.prescribed.velocity
         self.prescribed.put(out, self.stage.sigma * self.mass[at // 3] * (v.take(at) - velocity))
 
     def largest_force(self) -> float:
         """Norm [N] of the largest part of F last evaluated, over the unknowns that count; collective."""
-        parts = (np.where(self.prescribed.counted, part, 0.0) for part in self._last_parts.values())
-        return float(np.sqrt(self.points.summed(*(float(np.vdot(p, p)) for p in parts)).max(initial=0.0)))
+        return float(np.sqrt(self.points.summed(*self._squares).max(initial=0.0)))
 
     def block_summary(self) -> list[str]:
         """Lines on the elements with changing stencils and the blocks they add to the matrix, none without;
@@ -840,7 +868,6 @@ class StageEquations:
         if predicted is not None and len(predicted[0]) != len(x):
             predicted = None  # of an iterate with other ghosts
         lagged = self.integrator.lagged_loads
-        self._last_parts = {} if lagged else self._last_parts
         for remembered in self._asked_once:  # the linear solve needs the room
             remembered.forget()
         reach = self.stage.reach

@@ -38,9 +38,9 @@ class State:
         self.update_ghosts()
 
     def set(self, x: Array, v: Array) -> None:
-        """Take positions and velocities (n_owned, 3); collective."""
-        n = self._discretisation.layout.n_owned
-        self.x[:n], self.v[:n] = x, v
+        """Take positions and velocities (n_owned, 3); collective. The arrays before stay what they are."""
+        layout = self._discretisation.layout
+        self.x, self.v = (fitted(values, layout.n_owned, layout.n_local) for values in (x, v))
         self.update_ghosts()
 
 

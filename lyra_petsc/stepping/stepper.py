@@ -25,6 +25,7 @@ from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
 from lyra_petsc.stepping.initial_guess import first_guess
+from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
@@ -262,6 +263,7 @@ class Stepper:
         for name in self._filled:
             database.delValue(name)
         self._at_exit()
+        self._newton.destroy()
         self.ts.destroy()
         self.linear.destroy()
         self.velocity.destroy()
@@ -455,6 +457,9 @@ class Stepper:
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
         first_guess(self._equations, guess)
+        integrator = self._equations.integrator
+        if isinstance(integrator, Static) and integrator.ahead is not None:
+            self._newton.bend_guess(self._equations.velocity_of_staying(), guess)
         if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole
             equations = self._equations

@@ -164,20 +164,23 @@ class MidEdge(Elastic):
         found.tangent[far] = tangent[far]
         return found
 
-    def followed(self, x: Array, way: Array, frozen: Frames) -> tuple[Ints, Array]:
+    def followed(
+        self, x: Array, way: Array, frozen: Frames, along: Array | None = None
+    ) -> tuple[Ints, Array]:
         places, _, length, edges = self.of_edges
         linear = way.ravel()[places] / length
-        far = np.abs(linear) > LARGEST_TURN
+        far = np.abs(linear) > LARGEST_TURN if along is None else np.ones(len(places), dtype=bool)
+        along = way if along is None else along
         if not far.any():
             return np.empty(0, dtype=np.int64), np.empty(0)
         chosen = np.flatnonzero(far[edges].any(axis=1))
         number, sign = edges[chosen], self.elements.data["sign"][chosen]
-        y = x + way
+        y = x + along
         y.ravel()[places] = x.ravel()[places]  # unknowns as they were
         before, after = self._computed(x, frozen)[number], self._computed(y, frozen)[number]
         corners, moved = x[self.stencil[chosen]], way[self.stencil[chosen]]
         angle, normal, square, e = _angles(corners, before[:, :, :3])
-        turned, _, left, _ = _angles(corners + moved, after[:, :, :3])
+        turned, _, left, _ = _angles(y[self.stencil[chosen]], after[:, :, :3])
         height = np.sum(moved * normal[:, None, :], axis=2)
         size = np.sqrt(square)[:, None] * np.linalg.norm(e, axis=2)
         with np.errstate(divide="ignore", invalid="ignore"):

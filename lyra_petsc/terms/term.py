@@ -470,10 +470,10 @@ class Elastic(Term):
         """
         return None
 
-    def followed(self, x: Array, way: Array, frozen: Any) -> tuple[Ints, Array]:
+    def followed(self, x: Array, way: Array, frozen: Any, along: Array | None = None) -> tuple[Ints, Array]:
         """Places of edges whose unknowns go far on the way (n_local, 3) [m] from x, and better ways, (n,).
 
-        The same to first order.
+        The same to first order. Of all edges, where vertices go ``along`` (n_local, 3) [m] instead.
         """
         return np.empty(0, dtype=np.int64), np.empty(0)
 

@@ -121,7 +121,7 @@ def test_forces_and_reactions_are_the_change_of_momentum(comm: MPI.Comm, name: s
             x, v = system.x[:n].copy(), system.v[:n].copy()
             simulation.step(DT)
             ledger.record(x)
-            parts = system.forces_at_stage()
+            parts = dict(system.forces_at_stage())
             outer = ledger.reaction - sum(parts[key] for key in ("loads", "wind", "springs") if key in parts)
             force = comm.allreduce(outer.sum(axis=0))
             momentum = comm.allreduce((system.mass[:, None] * (system.v[:n] - v)).sum(axis=0))

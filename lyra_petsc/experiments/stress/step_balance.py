@@ -445,7 +445,7 @@ class StageAccountant(Accountant):
         x0, x1 = self._x, system.x
         # targets that move stand where the step ends by now; damping is right in the frames of the step
         system.active.turn_targets(self._at(system.t0 + system.stage.after))
-        parts = system.forces_at_stage()
+        parts = dict(system.forces_at_stage())
         ended = self._at(system.t1)
         frozen = {term: term.freeze(ended) for term in system.active.elastic}
         system.active.frozen = system.active.frozen | frozen

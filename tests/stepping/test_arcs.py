@@ -1,0 +1,102 @@
+"""Newton's steps of equilibria along arcs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import grid, rotation, scene_of
+
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.verification.cases.shells import slit_annulus_scene
+from lyra_petsc.stepping.arcs import FARTHEST, STRAIGHT, Arcs
+from lyra_petsc.stepping.simulation import SteppedScene
+
+SHEET: dict[str, Any] = {
+    "mesh": grid(1.0, 0.8, 6, 5, "alternating"),
+    "material": {"young": 1e7, "poisson": 0.3, "thickness": 0.01, "density": 1.0},
+    "gravity": [0, 0, 0],
+    "time": {"analysis": "static"},
+}
+AXIS = np.array([0.6, 0.0, 0.8])
+
+
+def turning(simulation: SteppedScene, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities of staying, and the way on the tangent of a turn about the origin."""
+    system, n = simulation.problem.system, simulation.problem.points.n_vertices
+    system.begin_step(0.0, 1.0)
+    way = np.zeros_like(system.history)
+    way[:n] = angle * np.cross(AXIS, system.x[:n])
+    for term in system.active.edged:
+        places = term.edge_places
+        own = places < way.size
+        way.reshape(-1)[places[own]] = angle * (term.of_edges.length * (term.frames.tangent @ AXIS))[own]
+    return system.velocity_of_staying(), way / system.stage.reach
+
+
+@pytest.mark.parallel(2, 3)
+def test_a_turn_keeps_the_shape(comm: MPI.Comm) -> None:
+    simulation = SteppedScene(comm, scene_of(SHEET))
+    system, n = simulation.problem.system, simulation.problem.points.n_vertices
+    staying, way = turning(simulation, 0.9 * FARTHEST)
+    arcs = Arcs(system)
+    bent, straight = arcs.bend(staying, way)
+    np.testing.assert_array_equal(straight, way)
+    start, there = system.x[:n].copy(), system.ahead(staying, bent)
+    moved = (there[0] + there[1])[:n]
+    turned = start @ rotation(AXIS, 0.9 * FARTHEST).T
+
+    # nothing holds it: the middle goes on, beside its circle
+    def middle(x: np.ndarray) -> np.ndarray:
+        total = np.zeros(3)
+        comm.Allreduce(x.sum(axis=0), total)
+        return total / comm.allreduce(len(x))
+
+    np.testing.assert_allclose(moved - middle(moved), turned - middle(turned), atol=1e-7)
+    energy = [sum(float(t.energies(x, system.active.frozen[t]).sum()) for t in system.active.elastic)
+              for x in (there[0] + there[1], there[0] + system.ahead(staying, way)[1])]  # fmt: skip
+    bending, tangent = (comm.allreduce(each) for each in energy)
+    assert bending < 1e-9 * tangent
+    arcs.destroy()
+    simulation.destroy()
+
+
+@pytest.mark.parallel(1)
+def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
+    content = SHEET | {"handles": [{"group": "left", "clamp": True}]}
+    simulation = SteppedScene(comm, scene_of(content))
+    system, n = simulation.problem.system, simulation.problem.points.n_vertices
+    staying, _ = turning(simulation, 0.0)
+    arcs, random = Arcs(system), np.random.default_rng(3)
+    way = np.where(system.prescribed.free, random.uniform(-1.0, 1.0, staying.shape), 0.0)
+    way *= 0.01 / (system.stage.reach * np.abs(way[:n]).max())
+    apart = []
+    for size in (0.1, 0.01):
+        bent, _ = arcs.bend(staying, size * way)
+        assert not np.any((bent - size * way)[~system.prescribed.free])
+        apart.append(np.abs(bent - size * way).max())
+    assert 0.0 < apart[1] < 0.02 * apart[0]
+    far, least = arcs.bend(staying, 1e3 * way)[1], 1e-6 * STRAIGHT
+    assert np.abs(far).max() < 0.9 * np.abs(1e3 * way).max()  # cut
+    assert arcs.matter(1e3 * way)
+    assert not arcs.matter(least * way)
+    arcs.destroy()
+    simulation.destroy()
+
+
+@pytest.mark.parallel(1)
+def test_a_shell_that_turns_far_takes_few_iterations() -> None:
+    bench, step = Bench(MPI.COMM_SELF, exact=False), 1.0 / 15.0
+    content = slit_annulus_scene(bench, 12)[0] | {
+        "gravity": [0, 0, 0],
+        "time": {"analysis": "static", "step": step},
+        "solver": {"force_tolerance": 1e-6},
+        "petsc": {"ts_adapt_dt_max": step},
+    }
+    with bench.simulation(content) as trial:
+        newton = 0
+        while not trial.simulation.finished:
+            newton += trial.step().newton_iterations
+    assert newton <= 62  # 58; 66 along straight ways
