@@ -189,8 +189,8 @@ class Simulation:
     @property
     def energies(self) -> dict[str, float]:
         """Of the whole sheet [J]: kinetic, membrane, bending, potential; and the cumulative works
-        external_work (handles and loads other than gravity) and dissipation (material damping); and the
-        energies of terms that have a column of their own in history.csv.
+        external_work (handles and loads other than gravity) and dissipation (damping of the material and of
+        impacts); and the energies of terms that have a column of their own in history.csv.
         """
         energies = asdict(self._running.budget)
         more: dict[str, float] = energies.pop("more")

@@ -2,7 +2,7 @@
 
 **All integrators**: the barrier is no spring to bounce on. `damp_impacts` damps the rates at which distances
 in contact change by dashpots of half the critical damping of barrier and mass, along the lines between
-nearest points. What meets parts with about a sixth of its speed, whatever Δt is, and comes to rest within a
+nearest points. What meets parts with about a tenth of its speed, whatever Δt is, and comes to rest within a
 few periods of the barrier; what lies, slides or rolls at the same distance is not damped. (Without it sheets
 bounce for long under backward Euler with short steps, and with any under integrators of second order; and
 what bounces slides on where it should stand, as its normal force is too small every other moment.)

@@ -1,0 +1,65 @@
+"""What meets parts with a tenth of its speed, whatever the integrator is, and comes to rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from physics import end_on_one_rank, gathered, grid, scene_of
+
+from lyra_petsc.stepping.simulation import SteppedScene
+
+pytestmark = pytest.mark.parallel
+
+SPEED, END = 0.5, 0.12
+FLOOR: dict[str, Any] = {"plane": {"point": [0.0, 0.0, -0.021], "normal": [0.0, 0.0, 1.0]}}
+UP = [{"time": 0.0}, {"time": 1.0, "translate": [0.0, 0.0, SPEED]}]
+
+
+def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]:
+    """A sheet without weight that is thrown at a floor, or that a floor is thrown at."""
+    meets = {"motion": UP, "interpolation": "linear"} if floor_moves else {}
+    return {
+        "mesh": grid(0.4, 0.3, 3, 2),
+        "initial": {"velocity": [0.0, 0.0, 0.0 if floor_moves else -SPEED]},
+        "contact": {"gap": 0.02, "self": False},
+        "obstacles": {"floor": FLOOR | meets},
+        "time": {"end": END, "step": step, "integrator": integrator},
+    }
+
+
+@pytest.mark.parametrize("floor_moves", [False, True])
+@pytest.mark.parametrize(
+    ("integrator", "step"), [("beuler", 2.5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
+)
+def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float, floor_moves: bool) -> None:
+    simulation = SteppedScene(comm, scene_of(impact(integrator, step, floor_moves=floor_moves)))
+    system, n = simulation.problem.system, simulation.problem.points.n_owned
+    before, impulse = simulation.budget.total, 0.0
+    while not simulation.finished:
+        taken = simulation.step()
+        impulse -= taken.dt * float(simulation.ledger.obstacle_forces(1)[0, 2])
+    own = float(system.mass.sum()), float(system.mass @ system.v[:n, 2])
+    mass, momentum = (float(value) for value in system.points.summed(*own))
+    budget = simulation.budget
+    simulation.destroy()
+    floor = SPEED if floor_moves else 0.0
+    assert momentum / mass - floor == pytest.approx(0.105 * SPEED, rel=0.1)
+    assert momentum + (0.0 if floor_moves else mass * SPEED) == pytest.approx(impulse, rel=0.01)
+    unexplained = budget.total + budget.dissipation - budget.external_work - before
+    # backward Euler damps by itself, too
+    assert abs(unexplained) < (0.05 if integrator == "beuler" else 0.01) * 0.5 * mass * SPEED**2
+
+
+def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
+    scene = scene_of(impact("bdf2", 1e-3, floor_moves=True))
+    simulation = SteppedScene(comm, scene)
+    while not simulation.finished:
+        simulation.step()
+    x = gathered(simulation.problem.points, simulation.problem.system.x)
+    simulation.destroy()
+    if (alone := end_on_one_rank(comm, scene, shared_tmp / "run", 20)) is not None:
+        np.testing.assert_allclose(x, alone, rtol=0.0, atol=1e-9)
