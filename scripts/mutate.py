@@ -74,8 +74,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "energy_balance.py",
-        'local[1] = system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))',
-        'local[1] = 0.5 * system.dt * float(np.vdot(system.stage_velocity, parts["damping"]))',
+        "heat = system.dt * float(np.vdot(system.stage_velocity, part))",
+        "heat = 0.5 * system.dt * float(np.vdot(system.stage_velocity, part))",
         ("tests/stepping/test_budgets.py",),
     ),
     Change(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -274,7 +275,7 @@ def scenes(draw: Draw) -> dict[str, Any]:
 @st.composite
 def mutated(draw: Draw) -> dict[str, Any]:
     """Blocks of a scene with one to three entries that are out of place."""
-    blocks = draw(scenes())
+    blocks = deepcopy(draw(scenes()))  # some of it is shared between scenes
     for _ in range(draw(st.integers(1, 3))):
         places = places_of(blocks)
         if not places:

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from physics import CLOTH, Simulation, gathered, grid, scene_of
 
-from lyra_petsc.stepping.impacts import damp_bounces
+from lyra_petsc.stepping.impacts import damp_impacts
 from lyra_petsc.stepping.simulation import SteppedScene
 from lyra_petsc.terms.contact import ContactBarrier
 
@@ -69,7 +69,7 @@ def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> Non
         system.damping.freeze(system.x, system.active.frozen)
         assert system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
         assert not system.discretisation.near
-        assert not damp_bounces(system).any()
+        assert not damp_impacts(system).felt.any()
     floor = {"floor": {"plane": {"point": [0.0, 0.0, -1e-3], "normal": [0.0, 0.0, 1.0]}}}
     with Simulation(SCENE | FAR | {"obstacles": floor}, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system
