@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.stage_equations import StageEquations
+from lyra_petsc.terms import dashpots
 from lyra_petsc.terms.term import Elastic
 
 DAMPING = 0.5
@@ -105,33 +105,20 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     apart = np.einsum("ei,eik->ek", beta[between], system.x[rows[between]])
     normal = normal.copy()
     normal[between] = apart / np.maximum(np.linalg.norm(apart, axis=1), np.finfo(float).tiny)[:, None]
-    _add_along(rows, beta, normal, force, out)
+    np.add.at(out, rows, (force[:, None] * beta)[:, :, None] * normal[:, None, :])
 
 
-def _add_along(rows: Ints, beta: Array, normal: Array, size: Array, out: Array) -> None:
-    """Add impulses of sizes (m,) along normals (m, 3), times β (m, 4), to rows (m, 4) of out (n_local, 3)."""
-    np.add.at(out, rows, (size[:, None] * beta)[:, :, None] * normal[:, None, :])
-
-
-def normal_forces(system: StageEquations) -> Array:
-    """Normal forces (n_owned,) [N] on vertices that meet something, at the stage of the step just taken."""
-    x = system.x if system.stage.after == system.dt else system.stage_positions
+def normal_forces(system: StageEquations) -> Array | None:
+    """Normal forces (n_owned,) [N] on vertices that meet something, at the stage of the step just taken; None
+    where that is its end.
+    """
+    if system.stage.after == system.dt:
+        return None
     out = np.zeros(system.points.n_owned)
     for term in system.active.limiting:
-        *_, force, vertex = term.touching_points(x, system.active.frozen[term])
-        np.add.at(out, vertex[vertex >= 0], force[vertex >= 0])
+        *_, force, vertex = term.touching_points(system.stage_positions, system.active.frozen[term])
+        out += np.bincount(vertex[vertex >= 0], force[vertex >= 0], minlength=len(out))
     return out
-
-
-def _vertices_of(layout: Layout, points: Ints, beta: Array, vertex: Ints) -> Ints:
-    """Local rows (m,) of the vertices that pairs are of, or of those of edges and of points of obstacles the
-    vertex with the least global number that a nearest point is on or beside.
-    """
-    number = np.where(
-        (points >= 0) & (beta != 0.0), layout.global_number[np.maximum(points, 0)], np.iinfo(np.int64).max
-    )
-    found: Ints = points[np.arange(len(points)), number.argmin(axis=1)]
-    return np.where(vertex >= 0, vertex, found)
 
 
 def damp_impacts(system: StageEquations) -> Damped:
@@ -144,38 +131,40 @@ def damp_impacts(system: StageEquations) -> Damped:
     """
     layout, free = system.points, system.prescribed.free
     n, dt, felt = layout.n_owned, system.dt, np.zeros(layout.n_owned)
-    pairs = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
-    if not any(layout.largest(sum(len(points) for points, *_ in pairs))):
+    every = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
+    if not any(layout.largest(sum(len(pairs.points) for pairs in every))):
         held = np.zeros(len(system.prescribed.at))
         return Damped(felt, held, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3)))
-    every = tuple(np.concatenate(part) for part in zip(*pairs, strict=True))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
-    mine = _vertices_of(layout, every[0], every[1], every[4]) < n
-    points, beta, normal, stiffness, vertex, obstacle, pushed = (part[mine] for part in every)
-    sheet = points >= 0
-    rows, beta = np.where(sheet, points, 0), np.where(sheet, beta, 0.0)
-    shared = np.zeros_like(system.x)
-    np.add.at(shared[:, 0], rows, np.abs(beta) * np.abs(beta).sum(axis=1, keepdims=True))
+    mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
+    shared, inverse, impulse = np.zeros((3, *system.x.shape))
+    for pairs, own in zip(every, mine, strict=True):
+        dashpots.choose(*pairs[:2], pairs.vertex, layout.global_number, n, own)
+        dashpots.share(*pairs[:2], own, shared)
     layout.add_to_owners(shared)
-    inverse, mass = np.zeros_like(system.x), system.mass[:, None]  # 1/m, 0 of what is held
+    mass = system.mass[:, None]
     free = free & (mass > 0.0)
-    inverse[:n] = np.divide(shared[:n, :1], mass, out=np.zeros_like(shared[:n]), where=free)
+    np.divide(shared[:n, :1], mass, out=inverse[:n], where=free)  # 0 of what is held
     layout.update_ghosts(inverse)
-    least = np.where(beta != 0.0, inverse[rows].max(axis=2), 0.0).max(axis=1, initial=0.0)
-    rate = np.einsum("ei,eik,ek->e", beta, system.v[rows], normal) - pushed / dt
-    part = -np.expm1(-2.0 * DAMPING * dt * np.sqrt(stiffness * least))
-    push = -np.divide(part, least, out=np.zeros_like(part), where=least > 0.0) * rate
-    _add_along(rows, beta, normal, push, impulse := np.zeros_like(system.x))
+    work, obstacle, at, force = 0.0, [], [], []
+    for pairs, own in zip(every, mine, strict=True):
+        push = np.empty(len(own))
+        given = *pairs[:4], pairs.pushed, own, dt, DAMPING
+        dashpots.damp(system.v, inverse, *given, push, impulse)
+        vertex = np.flatnonzero(own & (pairs.vertex >= 0))
+        felt += np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
+        work += float(push @ pairs.pushed) / dt
+        on = np.flatnonzero(own & (pairs.obstacle >= 0))
+        beta = np.where(pairs.points[on] >= 0, pairs.beta[on], 0.0)
+        side, corners = beta.sum(axis=1), system.x[np.maximum(pairs.points[on], 0)]
+        obstacle.append(pairs.obstacle[on])
+        at.append(np.einsum("ei,eik->ek", beta, corners) / side[:, None])
+        force.append(-(push[on] * side / dt)[:, None] * pairs.normal[on])
     layout.add_to_owners(impulse)
     change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
-    work = float(push @ pushed) / dt
     # what is held goes on, against its part of the impulses; what is not loses or gains
     heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
     system.integrator.take_jump(change)
-    np.add.at(felt, vertex[vertex >= 0], push[vertex >= 0] / dt)
-    on, side = obstacle >= 0, beta.sum(axis=1)
-    at = np.einsum("ei,eik->ek", beta[on], system.x[rows[on]]) / side[on, None]
-    force = -(push * side / dt)[on, None] * normal[on]
     held = -impulse[:n].take(system.prescribed.at) / dt
-    return Damped(felt, held, work, heat, obstacle[on], at, force)
+    return Damped(felt, held, work, heat, *(np.concatenate(part) for part in (obstacle, at, force)))

@@ -369,10 +369,10 @@ class StageEquations:
                 left = self.integrator.surplus
                 self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
             rubbing = [term for term in self.active.near if term.slips]
-            acted = impacts.normal_forces(self) if rubbing else np.zeros(n)
+            acted = impacts.normal_forces(self) if rubbing else None
             self.damped = impacts.damp_impacts(self)
             for term in rubbing:
-                term.take_normal_forces(acted + self.damped.felt)
+                term.take_normal_forces(acted, self.damped.felt)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""

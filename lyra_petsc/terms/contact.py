@@ -30,7 +30,7 @@ from lyra_petsc.terms.contact_search import SheetSearch, Simplices
 from lyra_petsc.terms.one_sided import Springs
 from lyra_petsc.terms.remembered import Remembered, unwritable
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, Pair, Part, UpcomingStep
+from lyra_petsc.terms.term import Dashpots, Elastic, Offsets, Pair, Part, UpcomingStep
 
 KEPT = 0.2
 """Part of its distance, or of the gap where it is farther, that a pair keeps in a Newton iteration."""
@@ -683,7 +683,7 @@ class ContactBarrier(Elastic):
         beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)
         return self.points[at], beta, normal, force, self.vertex_of(at)
 
-    def dashpots(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints, Ints, Array]:
+    def dashpots(self, x: Array, frozen: Places) -> Dashpots:
         met = self.meeting(x, frozen.after)
         square = np.sum(met.felt[:, :3] ** 2, axis=1)
         of = np.flatnonzero((met.weight > 0.0) & (square > 0.0) & np.isfinite(met.felt[:, 4]))
@@ -698,7 +698,7 @@ class ContactBarrier(Elastic):
             foot = np.einsum("ei,eik->ek", part, x[np.maximum(points[mine], 0)]) / side
             moved = foot - (foot - way) @ turn  # where it is now, less where it was
             pushed[mine] = np.einsum("ek,ek->e", side * moved, normal[mine])
-        return points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed
+        return Dashpots(points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed)
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:
         """Sum of the sizes of the normal forces [N] on each local vertex, (n_local,), of the pairs that this

@@ -101,7 +101,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
-        self._felt: Array | None = None  # normal forces in the step just taken, if not those at its end
+        self._felt: tuple[Array | None, Array] | None = None  # what normal forces were in the step just taken
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -157,15 +157,18 @@ class CoulombFriction(Elastic):
         led = vertex >= 0
         total = np.bincount(vertex[led], force[led], minlength=len(more))
         if self._felt is not None:
-            missed += self._felt[: len(more)] - total
-            missed[(total == 0.0) & (self._felt[: len(more)] == 0.0)] = 0.0
+            felt = (total if self._felt[0] is None else self._felt[0][: len(more)]) + self._felt[1][
+                : len(more)
+            ]
+            missed += felt - total
+            missed[(total == 0.0) & (felt == 0.0)] = 0.0
             np.clip(missed, -total, total, out=more)
             missed -= more
         if more.any():
             force[led] *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[vertex[led]]
 
-    def take_normal_forces(self, force: Array) -> None:
-        self._felt = force
+    def take_normal_forces(self, force: Array | None, damping: Array) -> None:
+        self._felt = force, damping
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
         self._renew(x, frozen.places, self._pairs)

@@ -189,6 +189,30 @@ class Term(ABC):
                 add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], values)
 
 
+class Dashpots(NamedTuple):
+    """Pairs between whose nearest points distances are damped.
+
+    Attributes
+    ----------
+    points, beta, normal : (m, 4), (m, 4), (m, 3)
+        As `Elastic.touching_points` has them.
+    stiffness : (m,)
+        Second derivative b″ of the energy by the distance [N/m].
+    vertex, obstacle : (m,)
+        Vertex of a sheet that meets something, −1 of others; what it meets, −1 between sheets.
+    pushed : (m,)
+        By how much the obstacle's motion in the step brought it nearer [m].
+    """
+
+    points: Ints
+    beta: Array
+    normal: Array
+    stiffness: Array
+    vertex: Ints
+    obstacle: Ints
+    pushed: Array
+
+
 class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
@@ -377,12 +401,10 @@ class Elastic(Term):
         nothing = np.empty((0, 4), dtype=np.int64), np.empty((0, 4)), np.empty((0, 3))
         return *nothing, np.empty(0), np.empty(0, dtype=np.int64)
 
-    def dashpots(self, x: Array, frozen: Any) -> tuple[Ints, Array, Array, Array, Ints, Ints, Array]:
-        """The same where repulsion stiffens at the end of the step, of pairs that other ranks count, too;
-        with its second derivative b″ (m,) [N/m] instead of the force, the obstacle (m,), −1 between sheets,
-        and by how much its motion in the step brought it nearer (m,) [m].
-        """
-        return *self.touching_points(x, frozen), np.empty(0, dtype=np.int64), np.empty(0)
+    def dashpots(self, x: Array, frozen: Any) -> Dashpots:
+        """Pairs whose repulsion stiffens at the end of the step, those that other ranks count, too."""
+        points, beta, normal, force, vertex = Elastic.touching_points(self, x, frozen)
+        return Dashpots(points, beta, normal, force, vertex, vertex, force)
 
     def carried(self, x: Array, way: Array, frozen: Any) -> Array:
         """Ways (n_local, 3) [m] from x on which what moves takes along what is in its way; else ``way``."""
@@ -440,8 +462,10 @@ class Elastic(Term):
     def take_pairs(self, x: Array, frozen: Any) -> None:
         """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
 
-    def take_normal_forces(self, force: Array) -> None:
-        """Know the normal forces (n_owned,) [N] on vertices that met something in the step just taken."""
+    def take_normal_forces(self, force: Array | None, damping: Array) -> None:
+        """Know the normal forces (n_owned,) [N] on vertices that met something in the step just taken, None:
+        as at its end; and those of dashpots.
+        """
 
     def element_state(self) -> tuple[Ints, Array]:
         """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,

@@ -1,0 +1,68 @@
+"""Kernels of the dashpots between nearest points: shares of masses, and impulses.
+
+Pairs are as `term.Elastic.dashpots` gives them; only those of this rank, ``mine``, count.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lyra_petsc.kernels.cache import Index
+from lyra_petsc.kernels.element import kernel
+
+
+@kernel()
+def choose(points, beta, vertex, number, n, mine):  # type: ignore[no-untyped-def]
+    """Which pairs are this rank's: it owns their vertex, or of pairs without one that with the least global
+    number (n_local,) that a nearest point is on or beside; its own rows come first, ``n`` of them.
+    """
+    for e in range(len(points)):
+        first = vertex[e]
+        if first < 0:
+            least = np.iinfo(np.int64).max
+            for i in range(4):
+                row = points[e, i]
+                if row >= 0 and beta[e, i] != 0.0 and number[Index(row)] < least:
+                    least, first = number[Index(row)], row
+        mine[e] = 0 <= first < n
+
+
+@kernel()
+def share(points, beta, mine, out):  # type: ignore[no-untyped-def]
+    """Add |β_ei| Σ_j |β_ej| of the pairs e to the first column of out (n_local, 3)."""
+    for e in range(len(points)):
+        if mine[e]:
+            total = 0.0
+            for j in range(4):
+                total += abs(beta[e, j]) if points[e, j] >= 0 else 0.0
+            for i in range(4):
+                if points[e, i] >= 0:
+                    out[Index(points[e, i]), 0] += abs(beta[e, i]) * total
+
+
+@kernel()
+def damp(v, inverse, points, beta, normal, stiffness, pushed, mine, dt, damping, push, out):  # type: ignore[no-untyped-def]
+    """Add the impulses [N s] of dashpots in dt [s] to out (n_local, 3), and keep each in push (m,).
+
+    By velocities v (n_local, 3) [m/s] and 1/m (n_local, 3) [1/kg] of the parts of the masses that a pair may
+    move; ``damping`` is over the critical one, ``pushed`` (m,) [m] how far obstacles came nearer.
+    """
+    for e in range(len(points)):
+        push[e] = 0.0
+        if not mine[e]:
+            continue
+        most, rate = 0.0, -pushed[e] / dt
+        for i in range(4):
+            if points[e, i] >= 0 and beta[e, i] != 0.0:
+                row = Index(points[e, i])
+                for k in range(3):
+                    most = max(most, inverse[row, k])
+                    rate += beta[e, i] * v[row, k] * normal[e, k]
+        if most > 0.0:
+            push[e] = math.expm1(-2.0 * damping * dt * math.sqrt(stiffness[e] * most)) / most * rate
+            for i in range(4):
+                if points[e, i] >= 0:
+                    for k in range(3):
+                        out[Index(points[e, i]), k] += push[e] * beta[e, i] * normal[e, k]
