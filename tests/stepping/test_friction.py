@@ -146,14 +146,15 @@ def test_a_sheet_slides_on_a_sheet_by_coulombs_law(comm: MPI.Comm, integrator: s
     system, layout = simulation.problem.system, simulation.problem.points
     upper = np.where(layout.original >= 25 * 7, system.mass[: layout.n_vertices], 0.0)
     mass = comm.allreduce(float(upper.sum()))
-    speeds = []
+    speeds, times = [], []
     while not simulation.finished:
         simulation.step()
         if simulation.time > begin - 1e-9:
+            times.append(simulation.time)
             speeds.append(comm.allreduce(float(upper @ system.v[: layout.n_vertices] @ DOWN)) / mass)
-    found = (speeds[-1] - speeds[0]) / (end - begin)
+    found = (speeds[-1] - speeds[0]) / (times[-1] - times[0])
     simulation.destroy()
-    assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=1e-2)
+    assert found == pytest.approx(0.2 * G * math.sin(SLOPE), rel=6e-3)
 
 
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])

@@ -33,7 +33,7 @@ def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]
 
 @pytest.mark.parametrize("floor_moves", [False, True])
 @pytest.mark.parametrize(
-    ("integrator", "step"), [("beuler", 2.5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
+    ("integrator", "step"), [("beuler", 5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
 )
 def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float, floor_moves: bool) -> None:
     simulation = SteppedScene(comm, scene_of(impact(integrator, step, floor_moves=floor_moves)))
@@ -47,11 +47,11 @@ def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float,
     budget = simulation.budget
     simulation.destroy()
     floor = SPEED if floor_moves else 0.0
-    assert momentum / mass - floor == pytest.approx(0.105 * SPEED, rel=0.1)
+    assert momentum / mass - floor == pytest.approx(0.1 * SPEED, rel=0.15)
     assert momentum + (0.0 if floor_moves else mass * SPEED) == pytest.approx(impulse, rel=0.01)
     unexplained = budget.total + budget.dissipation - budget.external_work - before
     # backward Euler damps by itself, too
-    assert abs(unexplained) < (0.05 if integrator == "beuler" else 0.01) * 0.5 * mass * SPEED**2
+    assert abs(unexplained) < (0.08 if integrator == "beuler" else 0.01) * 0.5 * mass * SPEED**2
 
 
 def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:

@@ -682,8 +682,8 @@ def _sheet_on_sheet(n: int, friction: float, integrator: str, end: float) -> tup
     "that holds it, slides with g (sin α − μ cos α) at 0.5 and 0.9 of it; four integrators",
     source="Coulomb's law",
     resolutions=(8, 12),
-    claim=Exact(2e-2),
-    claims={"acceleration, beuler": Exact(5e-3)} | {f"creep, {name}": Exact(1e-6) for name in SLIDERS},
+    claim=Exact(5e-3),
+    claims={f"creep, {name}": Exact(1e-6) for name in SLIDERS},
     counts="cells a side",
     quick=1,
 )
@@ -696,10 +696,10 @@ def sheets(bench: Bench, n: float) -> Iterator[Measured]:
             content, count = _sheet_on_sheet(round(n), part * math.tan(angle), integrator, RAN)
             with bench.simulation(content) as trial:
                 mass = trial.mass[count:]
-                before = _at(trial, BEGIN).v[count:] @ down
+                before, begin = _at(trial, BEGIN).v[count:] @ down, trial.simulation.time
                 change = trial.run().v[count:] @ down - before
             exact = G * (1.0 - part) * math.sin(angle)
-            found = float(mass @ change) / mass.sum() / (RAN - BEGIN)
+            found = float(mass @ change) / mass.sum() / (RAN - begin)  # steps may have been shortened
             off = max(off, (abs(found / exact - 1.0), found, exact))
         yield Measured(f"acceleration, {integrator}", off[1], off[2], "m/s²")
         content, count = _sheet_on_sheet(round(n), STICKS * math.tan(angle), integrator, 2.0 * SETTLED)
