@@ -1,4 +1,4 @@
-"""Ways along arcs: what a Newton step of an equilibrium turns keeps its size.
+"""Newton steps of equilibria along arcs, on which triangles that turn keep their size.
 
 On the tangent, vertices that turn go beside their circles and stretch the sheet by the square of their angle,
 which Newton's method must take back. A way u gives every triangle, of deformation gradient F, the gradient

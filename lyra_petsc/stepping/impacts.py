@@ -139,7 +139,7 @@ def damp_impacts(system: StageEquations) -> Damped:
     mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
     shared, inverse, impulse = np.zeros((3, *system.x.shape))
     for pairs, own in zip(every, mine, strict=True):
-        dashpots.choose(*pairs[:2], pairs.vertex, layout.global_number, n, own)
+        dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
         dashpots.share(*pairs[:2], own, shared)
     layout.add_to_owners(shared)
     mass = system.mass[:, None]

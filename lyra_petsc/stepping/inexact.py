@@ -19,9 +19,9 @@ STATIC = 1e-4
 """In a static analysis always: its Newton steps are so large that a looser solve costs more of them."""
 
 ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
-"""Of the one linear solve of a semi-implicit step, and where parts are near; the latter also of those of a
-collision. An impact magnifies what a solve leaves, which depends on the number of ranks, thirty to a hundred
-times."""
+"""Of the one linear solve of a semi-implicit step; the second where parts are near, and of all solves of a
+step in which parts collide. An impact magnifies what a solve leaves, which depends on the number of ranks,
+thirty to a hundred times."""
 
 COLLISION = 1.0
 """How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then

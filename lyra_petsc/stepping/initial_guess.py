@@ -12,25 +12,28 @@ from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.stage_equations import StageEquations
 
 
-def first_guess(system: StageEquations, out: Array) -> None:
-    """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; collective."""
+def first_guess(system: StageEquations, out: Array) -> bool:
+    """Velocities of the stage into ``out`` (n_owned, 3), prescribed coordinates exactly; whether they are
+    extrapolated from past equilibria; collective.
+    """
     n, integrator = system.points.n_owned, system.integrator
     if integrator.starts_at_rest:
-        out[:] = 0.0
+        out[:], ahead = 0.0, None
         if isinstance(integrator, Static) and not system.discretisation.guards:
             ahead = integrator.ahead
             if ahead is not None:
                 out[:] = ahead / integrator.pseudo
                 system.leap()
         system.prescribe(out)
-        return
+        return ahead is not None
     going_on = system.v[:n].copy()
     system.prescribe(going_on)
     if integrator.order > 1 and not system.discretisation.guards:
         out[:] = going_on
-        return
+        return False
     staying = system.beginning()
     if system.discretisation.guards:
         going_on = staying + system.largest_step(staying, going_on - staying) * (going_on - staying)
     less = system.objective(staying)[0] < system.objective(going_on)[0]
     out[:] = staying if less else going_on
+    return False

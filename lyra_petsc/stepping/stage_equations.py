@@ -806,13 +806,11 @@ class StageEquations:
     @property
     def may_impact(self) -> bool:
         """Whether anything is near anything, and vertices go a part of its gap in the step; collective."""
-        limiting, reach = self.active.limiting, self.stage.reach
+        limiting = self.active.limiting
         if not (limiting and self.discretisation.near):
             return False
-        far = IMPACT * min(term.skin for term in limiting)
-        near = any(term.n_elements for term in limiting)
-        goes = reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0) > far
-        return all(self.points.largest(near, bool(goes)))
+        way = self.stage.reach * np.abs(self._vs[: self.points.n_vertices]).max(initial=0.0)
+        return self.points.largest(float(way))[0] > IMPACT * min(term.skin for term in limiting)
 
     def collides(self, far: float) -> bool:
         """Whether anything may meet in the step by coming nearer by more than ``far`` [m]; collective."""

@@ -25,7 +25,6 @@ from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.extrapolation import Extrapolation
 from lyra_petsc.stepping.inexact import LOOSEST, ONCE, ONCE_IN_CONTACT, STATIC
 from lyra_petsc.stepping.initial_guess import first_guess
-from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.newton import Newton
 from lyra_petsc.stepping.newton_trace import FailedSolve, Trace
@@ -456,9 +455,7 @@ class Stepper:
 
     def _guess(self, snes: PETSc.SNES, u: PETSc.Vec) -> None:
         guess = u.getArray().reshape(self._shape)
-        first_guess(self._equations, guess)
-        integrator = self._equations.integrator
-        if isinstance(integrator, Static) and integrator.ahead is not None:
+        if first_guess(self._equations, guess):
             self._newton.bend_guess(self._equations.velocity_of_staying(), guess)
         if not self._iterates:
             # the linear solve starts there; its tolerance stays relative to the whole

@@ -14,7 +14,7 @@ from lyra_petsc.kernels.element import kernel
 
 
 @kernel()
-def choose(points, beta, vertex, number, n, mine):  # type: ignore[no-untyped-def]
+def find_own(points, beta, vertex, number, n, mine):  # type: ignore[no-untyped-def]
     """Which pairs are this rank's: it owns their vertex, or of pairs without one that with the least global
     number (n_local,) that a nearest point is on or beside; its own rows come first, ``n`` of them.
     """

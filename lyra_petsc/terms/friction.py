@@ -101,7 +101,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
-        self._felt: tuple[Array | None, Array] | None = None  # what normal forces were in the step just taken
+        self._felt: tuple[Array | None, Array] | None = None  # as `take_normal_forces` is given
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -157,9 +157,8 @@ class CoulombFriction(Elastic):
         led = vertex >= 0
         total = np.bincount(vertex[led], force[led], minlength=len(more))
         if self._felt is not None:
-            felt = (total if self._felt[0] is None else self._felt[0][: len(more)]) + self._felt[1][
-                : len(more)
-            ]
+            n, (force_of_step, damping) = len(more), self._felt
+            felt = damping[:n] + (total if force_of_step is None else force_of_step[:n])
             missed += felt - total
             missed[(total == 0.0) & (felt == 0.0)] = 0.0
             np.clip(missed, -total, total, out=more)

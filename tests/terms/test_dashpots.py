@@ -40,6 +40,6 @@ def test_a_pair_is_of_the_rank_of_one_vertex() -> None:
     beta = np.array([[1, -0.5, -0.5, 0], [0, -0.5, -0.5, 0], [-1, 0.5, 0.5, 0], [0.5, 0.5, -1, 0]])
     vertex, number = np.array([0, -1, 5, -1]), np.array([9, 3, 8, 2, 1, 7, 6, 5])
     mine = np.empty(4, dtype=bool)
-    dashpots.choose(points, beta, vertex, number, 4, mine)
+    dashpots.find_own(points, beta, vertex, number, 4, mine)
     # of its vertex; of 6, which has the least number; of its vertex; of 3
     np.testing.assert_array_equal(mine, [True, False, False, True])

@@ -81,7 +81,9 @@ class NoHistory:
         """Add ``change`` (n_owned, 3) [m] to remembered positions, as their reference is another."""
 
     def take_jump(self, change: Array) -> None:
-        """Go on as if velocities had been other by ``change`` (n_owned, 3) [m/s] before the state, too."""
+        """Velocities jump by ``change`` (n_owned, 3) [m/s] at the end of the step: change what is remembered
+        as if they had been so before, too.
+        """
 
     def memory(self) -> tuple[Arrays, dict[str, float]]:
         """Vertex arrays (n_owned, 3) and numbers to go on with after a restart."""
