@@ -191,8 +191,7 @@ class StageEquations:
         least = np.zeros((self.points.n_local, 3))
         for term in self.active.edged:
             least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
-        found: Array = least[self.points.n_vertices : self.points.n_owned].max(axis=1)
-        return found
+        return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
     def begin(self, time: float) -> None:
         """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
