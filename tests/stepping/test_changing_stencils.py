@@ -145,6 +145,7 @@ def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None
     assert 0.0 < min(nearest) < DISTANCE
 
 
+@pytest.mark.parallel(alone=False)
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     x, _, pairs = flown(comm, {})
     alone = comm.Split(comm.rank)

@@ -46,6 +46,7 @@ def falling(above: float) -> dict[str, Any]:
     }
 
 
+@pytest.mark.parallel(alone=False)
 def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
     ways = []
     for ranks in (MPI.COMM_SELF, comm):
@@ -95,6 +96,7 @@ def roll(folder: Path) -> dict[str, Any]:
     }
 
 
+@pytest.mark.parallel(alone=False)
 @pytest.mark.parametrize(("scene", "steps"), [(two_sheets, 40), (tent, 40), (roll, 40)])
 def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -> None:
     common = {"gravity": [0.0, 0.0, -9.81], "material": {"cloth": "gray-interlock", "damping": 0.01}}
@@ -119,6 +121,7 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
 
 
+@pytest.mark.parallel(alone=False)
 @pytest.mark.parametrize("integrator", ["semi-implicit", "beuler", "bdf2"])
 def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) -> None:
     """An impact magnifies what a step leaves, which depends on the number of ranks."""

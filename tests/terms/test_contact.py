@@ -231,6 +231,7 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
         assert most > 0.1
 
 
+@pytest.mark.parallel(alone=False)
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     def end(on: MPI.Comm) -> Array:
         with Watched(on, two_sheets()) as run:
