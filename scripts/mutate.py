@@ -213,8 +213,8 @@ CHANGES: list[Change] = [
         (STABLE + "test_a_strip_below_its_critical_weight_stands",),
     ),
     Change(
-        STEPPING + "stage_equations.py",
-        "blocks = self.applied.factor * following_stiffness",
+        STEPPING + "exact_hessian.py",
+        "blocks = system.applied.factor * following_stiffness",
         "blocks = following_stiffness",
         (STABLE + "test_the_hessian_is_the_slope_of_all_forces[pressure]",),
     ),
