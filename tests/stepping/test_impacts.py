@@ -31,6 +31,7 @@ def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]
     }
 
 
+@pytest.mark.parallel(1)
 @pytest.mark.parametrize("floor_moves", [False, True])
 @pytest.mark.parametrize(
     ("integrator", "step"), [("beuler", 5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]

@@ -136,7 +136,7 @@ def test_work_of_moved_handles_is_the_energy_stored(comm: MPI.Comm) -> None:
         assert budget.external_work == pytest.approx(budget.membrane + budget.bending, rel=1e-3)
 
 
-@pytest.mark.parametrize("model", ["hinge", "midedge"])
+@pytest.mark.parametrize("model", [pytest.param("hinge", marks=pytest.mark.parallel(1)), "midedge"])
 def test_work_of_clamps_that_turn_is_the_energy_stored(model: str, comm: MPI.Comm) -> None:
     turn = {"rotate": {"axis": [0, 1, 0], "degrees": -60}, "translate": [0.035, 0, 0.02]}
     content = {

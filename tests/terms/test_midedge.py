@@ -333,7 +333,7 @@ TURN = {
 }
 
 
-@pytest.mark.parallel(alone=False)
+@pytest.mark.parallel(2, alone=False)
 @pytest.mark.parametrize("scheme", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2", "static"])
 def test_runs_do_not_depend_on_ranks(comm: MPI.Comm, scheme: str) -> None:
     time = {"analysis": "static"} if scheme == "static" else STEPS | {"integrator": scheme}
