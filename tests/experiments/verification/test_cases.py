@@ -35,10 +35,12 @@ FEWER: dict[str, tuple[str, object]] = {
     "elastica-tip": ("KINDS", ("criss-cross", "gmsh")),
     "hinged-roof": ("PATTERNS", ("alternating",)),
     "incline": ("SLOPES", (5.0, 60.0)),
+    "sheets": ("SLIDERS", ("bdf2",)),
     "cusick": ("STARTS", 2),
 }  # fmt: skip
 """What is cut of cases that repeat it: other meshes, on which `plate`, `column` and other shells bend; the
-slope between the least and the greatest; starts.
+slope between the least and the greatest; integrators, as `tests/stepping/test_friction.py` has them all;
+starts.
 """
 
 TOGETHER = (
