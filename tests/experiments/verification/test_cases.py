@@ -33,6 +33,7 @@ FEWER: dict[str, tuple[str, object]] = {
                  "elastica-overhang")
 } | {
     "elastica-tip": ("KINDS", ("criss-cross", "gmsh")),
+    "plate-vibration": ("KINDS", ("criss-cross", "gmsh")),
     "hinged-roof": ("PATTERNS", ("alternating",)),
     "incline": ("SLOPES", (5.0, 60.0)),
     "sheets": ("SLIDERS", ("bdf2",)),
