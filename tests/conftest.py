@@ -9,7 +9,8 @@ in the test's process, ``cli/launch.py`` starts the program, ``written_run.py`` 
 Tests marked ``parallel`` run under ``mpirun -n N python -m pytest -m parallel``, every rank
 running the same test at the same time on ``COMM_WORLD``; without mpirun they run on one rank.
 ``parallel(2)`` keeps a test of which three ranks show no more to two, ``parallel(3)`` one of how data lie
-on ranks to three, ``parallel(1)`` one of a module that is marked to one.
+on ranks to three, ``parallel(1)`` one of a module that is marked to one. ``parallel(alone=False)`` leaves out
+one rank, of a test that compares ranks, or repeats there what several show.
 After each such test the ranks agree on its outcome: a failure on any rank fails it on all, is
 shown by rank 0, and a rank whose partners never come to that agreement ends the whole job.
 """
@@ -87,15 +88,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect tests that are to run on other numbers of ranks."""
-    if WORLD.size == 1:
-        return
     chosen = [
         item
         for item in items
-        if not (mark := item.get_closest_marker("parallel")) or WORLD.size in (mark.args or (WORLD.size,))
+        if not (mark := item.get_closest_marker("parallel")) or meant(*mark.args, **mark.kwargs)
     ]
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = chosen
+
+
+def meant(*ranks: int, alone: bool = True) -> bool:
+    """Whether a test with this mark runs on as many ranks as there are."""
+    return alone if WORLD.size == 1 else WORLD.size in (ranks or (WORLD.size,))
 
 
 def pytest_collection_finish() -> None:

@@ -56,5 +56,4 @@ class ReferencePositions:
         found = self._positions.get(start)
         if found is None:
             found = self._positions[max(self._positions)]
-        positions: Array = found[np.searchsorted(self._rows, rows)]
-        return positions
+        return found[np.searchsorted(self._rows, rows)]

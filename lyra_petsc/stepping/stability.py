@@ -85,9 +85,11 @@ class Examination:
                 reason=f"{points.n_vertices_global} vertices are more than the {MOST_VERTICES} "
                 "that factors are made for"
             )
+        from lyra_petsc.stepping.exact_hessian import add_exact_hessian  # of no use in motions
+
         system.renew_pattern()
         values = system.discretisation.rows.zeros()
-        system.exact_hessian(values)
+        add_exact_hessian(system, values)
         self._inertia = Inertia(points, system.discretisation.rows.pattern, values)
         pivots = self._inertia.pivots()
         if pivots is None:

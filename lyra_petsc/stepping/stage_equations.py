@@ -26,7 +26,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.scatter import add_elements
 from lyra_petsc.linear.discretisation import Discretisation
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.stepping.active_terms import ActiveTerms
@@ -39,7 +38,7 @@ from lyra_petsc.stepping.reference_positions import ReferencePositions
 from lyra_petsc.stepping.state import State, fitted
 from lyra_petsc.terms.prescribed_handles import Held
 from lyra_petsc.terms.remembered import Remembered
-from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Load, Part, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Part, Term, UpcomingStep, Viscous
 
 if TYPE_CHECKING:
     from lyra_petsc.stepping.impacts import Damped
@@ -191,8 +190,7 @@ class StageEquations:
         least = np.zeros((self.points.n_local, 3))
         for term in self.active.edged:
             least.reshape(-1)[term.edge_places] = LEAST * term.edge_stiffness
-        found: Array = least[self.points.n_vertices : self.points.n_owned].max(axis=1)
-        return found
+        return least[self.points.n_vertices : self.points.n_owned].max(axis=1)
 
     def begin(self, time: float) -> None:
         """Take the present positions as reference of everything that starts to act by ``time`` [s]."""
@@ -883,31 +881,3 @@ class StageEquations:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
         if len(changing):
             rows.constrain(values, self.prescribed.mask, beside)
-
-    def exact_hessian(self, values: Array) -> None:
-        """Add to block rows (n_blocks, 3, 3) the exact Hessian [N/m] of all energies at the state.
-
-        And the symmetric part of the stiffness of loads that follow it; prescribed unknowns are decoupled.
-        """
-        from lyra_petsc.terms.load_stiffness import following_stiffness  # of no use in motions
-
-        rows = self.discretisation.rows
-        for term in self.active.elastic:
-            rows.add_stiffness(term, self.x, self.active.frozen[term], 0.0, 1.0, values)
-        following: list[Load | Viscous] = [load for load in self.active.loads if load.follows]
-        for load in [*following, *self.active.viscous]:
-            blocks = self.applied.factor * following_stiffness(load, self.x, self._force_of)
-            offsets = rows.pattern.offsets_of(load.stencil)
-            add_elements(np.ones(load.n_elements), blocks, offsets, values)
-        if len(self.prescribed.beside.changing):
-            rows.constrain(values, self.prescribed.mask, self.prescribed.beside)
-
-    def _force_of(self, term: Term, x: Array, out: Array) -> None:
-        """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
-        if isinstance(term, Load):
-            term.add_force(x, self.t0, self.t1, out)
-        elif isinstance(term, Viscous):
-            against = np.zeros_like(out)
-            frozen = term.freeze(UpcomingStep(self.t0, self.t1, self.t1, x, self.reference.at))
-            term.add_gradient(np.zeros_like(x), frozen, against)
-            out -= against

@@ -374,8 +374,7 @@ class ContactBarrier(Elastic):
         farther = np.linalg.norm(after, axis=1) > np.linalg.norm(now, axis=1)
         theirs = np.where(farther[:, None], after, now)
         contact_pairs.approaches(x, self._places[0], way, theirs, kinds, points, reach, found)
-        nearer: Ints = np.column_stack([kinds, obstacle, points, rings])[found < reach]
-        return nearer
+        return np.column_stack([kinds, obstacle, points, rings])[found < reach]
 
     def _at_obstacles(self, x: Array, way: Array, boxes: Array) -> list[Ints]:
         """Pairs with obstacles, wherever on their way in the step these are near patches in ``boxes``."""
@@ -457,8 +456,7 @@ class ContactBarrier(Elastic):
             contact_pairs.distances(points, at, kinds, pairs, out)
             least = np.minimum(least, out.reshape(n, m))
         least -= self.obstacles.radius[others[:, 3]]
-        close: NDArray[np.bool_] = least < np.reshape(reach, (-1, 1))
-        return close
+        return least < np.reshape(reach, (-1, 1))
 
     # -- energy ------------------------------------------------------------------------------------
 
@@ -492,8 +490,7 @@ class ContactBarrier(Elastic):
         met = self.meeting(x, frozen.now)
         counts = met.counted != 0.0  # these are among the owned pairs, as they come first
         energies = (met.counted * met.energy)[counts]
-        out: Array = np.bincount(met.at[counts], energies, minlength=self.n_owned).astype(np.float64)
-        return out
+        return np.bincount(met.at[counts], energies, minlength=self.n_owned).astype(np.float64)
 
     def add_gradient(self, x: Array, frozen: Places, out: Array) -> None:
         if not self.n_elements:
@@ -592,8 +589,7 @@ class ContactBarrier(Elastic):
         """Distance less thickness and radius [m] of all pairs, (E,)."""
         out = np.empty(self.n_elements)
         contact_pairs.distances(x, others, self.kind, self.points, out)
-        found: Array = out - self.offset
-        return found
+        return out - self.offset
 
     def gaps(self, x: Array, frozen: Places) -> Array:
         return self.distances(x, frozen.now)[: self.n_owned]
@@ -676,8 +672,7 @@ class ContactBarrier(Elastic):
     def vertex_of(self, at: Ints) -> Ints:
         """The vertex of a sheet that each of pairs (m,) is of, −1 of edges and of points of obstacles."""
         of_vertex = (self.kind[at] != EDGE_EDGE) & (self.points[at, 0] >= 0)
-        found: Ints = np.where(of_vertex, self.points[at, 0], -1)
-        return found
+        return np.where(of_vertex, self.points[at, 0], -1)
 
     def touching_points(self, x: Array, frozen: Places) -> tuple[Ints, Array, Array, Array, Ints]:
         beta, normal, force, at = self.touching(x, frozen.now, self.n_owned)

@@ -32,8 +32,7 @@ class Simplices:
         """Corners of those of some patches (n,)."""
         sizes = self.first[chosen + 1] - self.first[chosen]
         shift = np.repeat(self.first[chosen] - np.cumsum(sizes) + sizes, sizes)
-        corners: Ints = self.corners[np.arange(len(shift)) + shift]
-        return corners
+        return self.corners[np.arange(len(shift)) + shift]
 
 
 class SheetSearch:

@@ -193,8 +193,7 @@ class MidEdge(Elastic):
         def mean(values: Array) -> Array:
             values = np.where(weight > 0.0, weight * sign * values, 0.0)
             sums = np.bincount(number.ravel(), values.ravel(), len(places))
-            found: Array = np.divide(sums, total, out=np.zeros(len(places)), where=total > 0.0)[far]
-            return found
+            return np.divide(sums, total, out=np.zeros(len(places)), where=total > 0.0)[far]
 
         total = np.bincount(number.ravel(), weight.ravel(), len(places))
         bends = np.clip(linear[far] + mean(expected), -LARGEST_TURN, LARGEST_TURN)
@@ -246,8 +245,7 @@ class MidEdge(Elastic):
         tail, head = self.of_edges.ends[edges].T
         tangent, start = unit(x[head] - x[tail]), frozen.tangent[edges]
         about = (tangent + start) / (1.0 + np.sum(tangent * start, axis=1, keepdims=True))
-        total: Array = (force * self.of_edges.length[edges]) @ about
-        return total
+        return (force * self.of_edges.length[edges]) @ about
 
     # -- energy ------------------------------------------------------------------------------------
 
@@ -306,8 +304,7 @@ class MidEdge(Elastic):
     def force_scale(self, size: float) -> Array:
         data = self.elements.data
         trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
-        scale: Array = trace * size / data["height"] ** 2
-        return scale
+        return trace * size / data["height"] ** 2
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
@@ -321,8 +318,7 @@ class MidEdge(Elastic):
 
 def areas(material: Array) -> Array:
     """Areas (n,) [m²] of triangles whose corners are ``material`` (n, 2, 2) [m] from the first."""
-    found: Array = 0.5 * np.abs(np.linalg.det(material))
-    return found
+    return 0.5 * np.abs(np.linalg.det(material))
 
 
 def _outward(material: Array) -> tuple[Array, Array]:
@@ -338,8 +334,7 @@ def curvatures_of_tangents(material: Array) -> Array:
     normal, size = _outward(material)
     x, y = normal[..., 0], normal[..., 1]
     weight = (size / areas(material)[:, None])[:, None, :]
-    found: Array = -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * weight
-    return found
+    return -np.stack([x * x, y * y, 2.0 * x * y], axis=1) * weight
 
 
 def normals_of(x: Array, triangles: AnyInts) -> Array:

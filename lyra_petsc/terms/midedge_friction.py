@@ -140,8 +140,7 @@ class MidEdgeFriction(Elastic):
 
     def force_scale(self, size: float) -> Array:
         data = self.elements.data
-        scale: Array = data["stiffness"][:, [0, 3, 5]].sum(axis=1) * size / data["height"] ** 2
-        return scale
+        return data["stiffness"][:, [0, 3, 5]].sum(axis=1) * size / data["height"] ** 2
 
     # -- state -------------------------------------------------------------------------------------
 

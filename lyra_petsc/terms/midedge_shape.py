@@ -209,8 +209,7 @@ def tangents_at(angle: Array) -> Array:
     """T of angles α [rad], of any shape."""
     size = np.abs(angle)
     beyond = 1.0 + 2.0 * (size - 0.25 * np.pi)
-    found: Array = np.copysign(np.where(size < 0.25 * np.pi, np.tan(size), beyond), angle)
-    return found
+    return np.copysign(np.where(size < 0.25 * np.pi, np.tan(size), beyond), angle)
 
 
 @kernel()

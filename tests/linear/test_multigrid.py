@@ -68,6 +68,7 @@ def test_iterations_hardly_grow_with_the_mesh(kind: str, comm: MPI.Comm) -> None
     assert fine <= 1.5 * coarse + 1
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize("scheme", ["semi-implicit", "beuler"])
 def test_unknowns_of_edges_cost_few_iterations(scheme: str, clamped: bool, comm: MPI.Comm) -> None:

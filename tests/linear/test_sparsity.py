@@ -128,6 +128,11 @@ def imported(**more: Any) -> set[str]:
     return set(json.loads(done.stdout.splitlines()[-1]))
 
 
+@pytest.fixture(scope="module")
+def of_membrane() -> set[str]:
+    return imported()
+
+
 MEMBRANE_SCENE = {
     "membrane",
     "membrane_laws",
@@ -143,16 +148,15 @@ MEMBRANE_SCENE = {
 
 
 @pytest.mark.slow
-def test_a_membrane_scene_imports_and_compiles_no_other_term() -> None:
-    loaded = imported()
-    terms = {m.removeprefix("lyra_petsc.terms.") for m in loaded if m.startswith("lyra_petsc.terms.")}
+def test_a_membrane_scene_imports_and_compiles_no_other_term(of_membrane: set[str]) -> None:
+    terms = {m.removeprefix("lyra_petsc.terms.") for m in of_membrane if m.startswith("lyra_petsc.terms.")}
     assert terms == MEMBRANE_SCENE
-    assert not loaded & set(HEAVY)
+    assert not of_membrane & set(HEAVY)
 
 
 @pytest.mark.slow
-def test_each_key_of_a_scene_brings_its_own_term_and_no_more() -> None:
-    without = {m for m in imported() if ".terms." in m}
+def test_each_key_of_a_scene_brings_its_own_term_and_no_more(of_membrane: set[str]) -> None:
+    without = {m for m in of_membrane if ".terms." in m}
     added = {
         "wind": {"wind": {"velocity": [0, 0, 1], "density": 1.0}},
         "gravity": {"gravity": [0, 0, -9.81]},

@@ -59,7 +59,7 @@ def column(table: Any, name: str) -> Array:
     return np.asarray(table[name], dtype=np.float64)
 
 
-@pytest.mark.parallel(2)
+@pytest.mark.parallel(2, alone=False)
 def test_a_flag_moves_as_without_contact_until_it_meets_itself(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.size=0.1", "time.end=0.25", "time.step=0.003125")
     if (run := run_of(comm, shared_tmp, "flag-contact", *settings)) is None:
@@ -68,7 +68,7 @@ def test_a_flag_moves_as_without_contact_until_it_meets_itself(comm: MPI.Comm, s
     np.testing.assert_allclose(tip, [1.4778, 0.2017, 0.7594], atol=2e-3)  # as flag.yaml, with finer steps
 
 
-@pytest.mark.parallel(3)
+@pytest.mark.parallel(3, alone=False)
 def test_a_tablecloth_lies_with_its_weight_and_is_pulled_off(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.grid.nx=10", "mesh.grid.ny=10", "time.step=0.02")
     if (run := run_of(comm, shared_tmp, "tablecloth", *settings)) is None:
@@ -79,7 +79,7 @@ def test_a_tablecloth_lies_with_its_weight_and_is_pulled_off(comm: MPI.Comm, sha
     assert run.positions[-1][:, 0].min() > 0.4
 
 
-@pytest.mark.parallel(2)
+@pytest.mark.parallel(1)
 def test_a_stack_weighs_on_its_box(comm: MPI.Comm, shared_tmp: Path) -> None:
     coarse = [f"mesh[{sheet}].grid.{n}=2" for sheet in range(20) for n in ("nx", "ny")]
     if (run := run_of(comm, shared_tmp, "stack", *coarse, "time.step=0.02", "time.end=2")) is None:
@@ -90,7 +90,7 @@ def test_a_stack_weighs_on_its_box(comm: MPI.Comm, shared_tmp: Path) -> None:
     assert (np.diff(heights) > 0.0).all()  # in the order in which they fell
 
 
-@pytest.mark.parallel(2)
+@pytest.mark.parallel(1)
 def test_a_wrung_cloth_has_eight_turns(comm: MPI.Comm, shared_tmp: Path) -> None:
     settings = ("mesh.grid.nx=12", "mesh.grid.ny=3", "time.step=0.02")
     if (run := run_of(comm, shared_tmp, "wring", *settings)) is None:

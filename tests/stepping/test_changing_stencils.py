@@ -94,6 +94,7 @@ def flown(
     return x, float(v[30:, 2].mean()), pairs
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
     def watch(simulation: SteppedScene) -> None:
@@ -145,6 +146,7 @@ def test_nothing_crosses_and_steps_of_newton_are_limited(comm: MPI.Comm) -> None
     assert 0.0 < min(nearest) < DISTANCE
 
 
+@pytest.mark.parallel(alone=False)
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     x, _, pairs = flown(comm, {})
     alone = comm.Split(comm.rank)
@@ -157,6 +159,7 @@ def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
 ALL_SOLVERS = SOLVERS | {"assembled operator": {"pc_type": "pbjacobi", "mat_type": "aij"}}
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", ALL_SOLVERS)
 def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
     time = {"time": SCENE["time"] | {"end": 0.03}}

@@ -11,7 +11,7 @@ from physics import grid, scene_of
 from lyra_petsc.errors import SolverError
 from lyra_petsc.stepping.simulation import SteppedScene
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 SHEET: dict[str, Any] = {
     "mesh": grid(1.0, 1.0, 3, 3),

@@ -16,7 +16,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 CELLS, GAP, STEPS = 24, 1e-5, 3
 

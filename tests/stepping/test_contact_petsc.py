@@ -66,6 +66,7 @@ def expected() -> Array:
     return thrown(MPI.COMM_SELF, direct_solver(MPI.COMM_SELF))
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_preconditioner_serves_contact(comm: MPI.Comm, kind: str, expected: Array) -> None:
     if kind == "mumps" and not PETSc.Sys.hasExternalPackage("mumps"):

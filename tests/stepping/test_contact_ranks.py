@@ -30,6 +30,11 @@ FLOOR = {"plane": {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
 TURNED = {"rotate": {"axis": [0.3, 1.0, 0.5], "degrees": 20.0}}
 
 
+def on(value: Any, *ranks: int) -> Any:
+    """A parameter of a test that compares so many ranks with one."""
+    return pytest.param(value, marks=pytest.mark.parallel(*ranks, alone=False))
+
+
 def falling(above: float) -> dict[str, Any]:
     return {
         "mesh": [
@@ -46,6 +51,7 @@ def falling(above: float) -> dict[str, Any]:
     }
 
 
+@pytest.mark.parallel(alone=False)
 def test_small_sheets_on_any_number_of_ranks(comm: MPI.Comm) -> None:
     ways = []
     for ranks in (MPI.COMM_SELF, comm):
@@ -95,8 +101,11 @@ def roll(folder: Path) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize(("scene", "steps"), [(two_sheets, 40), (tent, 40), (roll, 40)])
-def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -> None:
+STEPS = 30
+
+
+@pytest.mark.parametrize("scene", [on(two_sheets, 2, 3), on(tent, 2), on(roll, 3)])
+def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any) -> None:
     common = {"gravity": [0.0, 0.0, -9.81], "material": {"cloth": "gray-interlock", "damping": 0.01}}
     content = common | {"time": {"end": 1.0, "step": 0.004}}
     (folder := shared_tmp / str(comm.rank)).mkdir()
@@ -108,10 +117,10 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -
         simulation = SteppedScene(ranks, scene_of(content))
         size, contacts = simulation.problem.outline.size, 0.0
         ways.append([])
-        for step in range(1, steps + 1):
+        for step in range(1, STEPS + 1):
             simulation.step()
             contacts = max(contacts, simulation.ledger.columns()["contacts"])
-            if step in (20, steps):
+            if step in (20, STEPS):
                 ways[-1].append(gathered(simulation.problem.points, simulation.problem.system.x))
         assert contacts > 10.0
         simulation.destroy()
@@ -119,7 +128,7 @@ def test_ranks_agree(comm: MPI.Comm, shared_tmp: Path, scene: Any, steps: int) -
         np.testing.assert_allclose(together, alone, rtol=0.0, atol=tolerance * size)
 
 
-@pytest.mark.parametrize("integrator", ["semi-implicit", "beuler", "bdf2"])
+@pytest.mark.parametrize("integrator", [on("semi-implicit", 2), on("beuler", 2, 3), on("bdf2", 3)])
 def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) -> None:
     """An impact magnifies what a step leaves, which depends on the number of ranks."""
     content = {

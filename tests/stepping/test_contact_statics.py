@@ -17,7 +17,7 @@ from lyra_petsc.stepping.simulation import SteppedScene
 
 Array = NDArray[np.float64]
 
-pytestmark = pytest.mark.parallel
+pytestmark = pytest.mark.parallel(2)
 
 CELLS = 8
 STATIC = {"analysis": "static", "step": 1.0}

@@ -142,7 +142,7 @@ def test_the_energy_balance_closes(integrator: str) -> None:
     assert abs(lost[1]) < 0.75 * abs(lost[0]) or abs(lost[1]) < 0.02
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(3)
 def test_a_run_goes_on_with_it_on_another_number_of_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = scene_of(falling("beuler"))
     simulation = SteppedScene(comm, scene)

@@ -93,7 +93,13 @@ def test_it_stands(comm: MPI.Comm) -> None:
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
 
 
-INTEGRATORS = ["semi-implicit", "beuler", "midpoint", "bdf2", "alpha2"]
+INTEGRATORS = [
+    "bdf2",
+    *(
+        pytest.param(name, marks=pytest.mark.parallel(1))
+        for name in ("semi-implicit", "beuler", "midpoint", "alpha2")
+    ),
+]
 
 
 def on_a_sheet(friction: float, integrator: str, end: float) -> dict[str, Any]:

@@ -194,7 +194,7 @@ def held_scene(handles: list[dict[str, Any]], **more: Any) -> dict[str, Any]:
     return {"mesh": MESH, "gravity": [0, 0, -9.81], "handles": handles, "motions": motions} | more
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 @pytest.mark.parametrize("interpolation", ["linear", "hermite"])
 def test_held_vertices_are_where_the_motion_says_at_every_step(

@@ -31,6 +31,7 @@ def impact(integrator: str, step: float, *, floor_moves: bool) -> dict[str, Any]
     }
 
 
+@pytest.mark.parallel(1)
 @pytest.mark.parametrize("floor_moves", [False, True])
 @pytest.mark.parametrize(
     ("integrator", "step"), [("beuler", 5e-4), ("midpoint", 1e-3), ("alpha2", 1e-3), ("bdf2", 1e-3)]
@@ -54,6 +55,7 @@ def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float,
     assert abs(unexplained) < (0.08 if integrator == "beuler" else 0.01) * 0.5 * mass * SPEED**2
 
 
+@pytest.mark.parallel(alone=False)
 def test_it_does_not_depend_on_ranks(comm: MPI.Comm, shared_tmp: Path) -> None:
     scene = scene_of(impact("bdf2", 1e-3, floor_moves=True))
     simulation = SteppedScene(comm, scene)

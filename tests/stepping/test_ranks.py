@@ -66,6 +66,7 @@ def outcome(
         )
 
 
+@pytest.mark.parallel(alone=False)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit"])
 @pytest.mark.parametrize("content", [SHEET, TWO_SHEETS, TINY], ids=["sheet", "two", "tiny"])
 def test_as_on_one_rank(comm: MPI.Comm, content: dict[str, Any], integrator: str) -> None:

@@ -147,6 +147,7 @@ def tight_linear(integrator: str) -> dict[str, Any]:
     return {"ksp_rtol": 1e-12} if integrator == "semi-implicit" else {}
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_sheets_thrown_at_each_other(comm: MPI.Comm, integrator: str) -> None:
     time = {"end": 0.018, "step": 0.002, "integrator": integrator}
@@ -212,6 +213,7 @@ def test_a_flat_sheet_hits_a_floor_with_100_m_per_s(comm: MPI.Comm, integrator: 
         assert "repeated by backward Euler" in " ".join(run.simulation.notes)
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "alpha2"])
 def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
     """Two sheets that a third hits; nothing else works on them, and none dampens."""
@@ -231,6 +233,7 @@ def test_impacts_make_no_energy(comm: MPI.Comm, integrator: str) -> None:
         assert most > 0.1
 
 
+@pytest.mark.parallel(alone=False)
 def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
     def end(on: MPI.Comm) -> Array:
         with Watched(on, two_sheets()) as run:
@@ -307,6 +310,7 @@ def dropped(shape: str, **more: Any) -> dict[str, Any]:
     return {"mesh": SHEET, "obstacles": {"it": OBSTACLES[shape]}, "time": time} | GRAVITY | more
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("shape", OBSTACLES)
 def test_a_sheet_falls_on(comm: MPI.Comm, shape: str) -> None:
     with Watched(comm, dropped(shape)) as run:
@@ -334,7 +338,7 @@ def test_a_sheet_falls_on_a_mesh(comm: MPI.Comm, shared_tmp: Path) -> None:
         assert run.x[:, 2].max() > -0.05
 
 
-@pytest.mark.parametrize("gap", [1e-3, 1e-5])
+@pytest.mark.parametrize("gap", [1e-3, pytest.param(1e-5, marks=pytest.mark.parallel(1))])
 def test_small_gaps_take_few_iterations(comm: MPI.Comm, gap: float) -> None:
     """Half a millimetre above a sphere at first, which one pair after another meets."""
     mesh = SHEET | {"transform": {"translate": [-0.3, -0.29, 0.0005]}}
@@ -360,6 +364,7 @@ def test_weight_at_rest(comm: MPI.Comm) -> None:
         assert 0.0 < left.min() <= left.max() < CONTACT["gap"]
 
 
+@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "midpoint"])
 @pytest.mark.parametrize("shape", ["plane", "sphere", "box"])
 def test_obstacles_that_move_carry_the_sheet(comm: MPI.Comm, shape: str, integrator: str) -> None:

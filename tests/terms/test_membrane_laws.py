@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.errors import InputError
-from lyra_petsc.kernels.element import kernel
+from lyra_petsc.kernels.cache import Index
 from lyra_petsc.scene.dump import dump_scene
 from lyra_petsc.scene.load import load_scene, scene_of
 from lyra_petsc.scene.materials.library import ShellMaterial, measured, resolve
@@ -53,24 +53,17 @@ class Law:
     """A material's energy, stress and tangent as functions of e (3,)."""
 
     def __init__(self, shell: ShellMaterial) -> None:
-        module, self._c = law_of(shell.law), np.array([law_of(shell.law).parameters(shell)])
-        energy, stress, tangent = module.energy, module.stress, module.tangent
-
-        @kernel()
-        def all_of(e, c):  # type: ignore[no-untyped-def]
-            w = energy(e[0], e[1], e[2], c, 0)
-            return w, stress(e[0], e[1], e[2], c, 0), tangent(e[0], e[1], e[2], c, 0)
-
-        self._all_of = all_of
+        self._law = law_of(shell.law)
+        self._c = np.array([self._law.parameters(shell)])
 
     def energy(self, e: Array) -> float:
-        return float(self._all_of(e, self._c)[0])
+        return float(self._law.energy(*e, self._c, Index(0)))
 
     def stress(self, e: Array) -> Array:
-        return np.array(self._all_of(e, self._c)[1])
+        return np.array(self._law.stress(*e, self._c, Index(0)))
 
     def tangent(self, e: Array) -> Array:
-        c11, c12, c22, c33, c13, c23 = self._all_of(e, self._c)[2]
+        c11, c12, c22, c33, c13, c23 = self._law.tangent(*e, self._c, Index(0))
         return np.array([[c11, c12, c13], [c12, c22, c23], [c13, c23, c33]])
 
 

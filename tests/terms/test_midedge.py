@@ -333,7 +333,7 @@ TURN = {
 }
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(2, alone=False)
 @pytest.mark.parametrize("scheme", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2", "static"])
 def test_runs_do_not_depend_on_ranks(comm: MPI.Comm, scheme: str) -> None:
     time = {"analysis": "static"} if scheme == "static" else STEPS | {"integrator": scheme}
@@ -624,7 +624,7 @@ def test_an_end_moment_rolls_a_strip_into_a_circle(pattern: str) -> None:
     assert np.abs(errors[1][1] / errors[0][1]) < 0.3
 
 
-@pytest.mark.parallel
+@pytest.mark.parallel(alone=False)
 def test_moments_do_not_depend_on_ranks(comm: MPI.Comm) -> None:
     x, energies = rolled(comm, 24, "alternating")
     alone = rolled(MPI.COMM_SELF, 24, "alternating") if comm.rank == 0 else (x, energies)

@@ -22,16 +22,27 @@ LONG = (
     "elastica-overhang", "slit-annulus", "sze-end-moment", "pinched-cylinder", "open-cylinder",
     "hinged-roof", "incline", "sheets", "rest", "capstan", "collision", "layers", "ruck", "pole",
     "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
-    "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane",
+    "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane", "roll-up", "plate-curvature",
+    "heavy-cantilever", "tip-load", "catenary-elastic", "sze-end-shear", "uniaxial-pull", "wind-drag",
 )  # fmt: skip
 """Cases whose finest resolutions take long."""
 
 FEWER: dict[str, tuple[str, object]] = {
-    name: ("KINDS", ("criss-cross", "gmsh"))
-    for name in ("post-buckling", "lateral-buckling", "elastica-tip", "elastica-weight", "elastica-roll-up",
+    name: ("KINDS", ("criss-cross",))
+    for name in ("post-buckling", "lateral-buckling", "elastica-weight", "elastica-roll-up",
                  "elastica-overhang")
-} | {"cusick": ("STARTS", 2)}  # fmt: skip
-"""What is cut of cases that repeat it: other kinds of meshes, on which `plate` and `column` bend; starts."""
+} | {
+    "elastica-tip": ("KINDS", ("criss-cross", "gmsh")),
+    "plate-vibration": ("KINDS", ("criss-cross", "gmsh")),
+    "hinged-roof": ("PATTERNS", ("alternating",)),
+    "incline": ("SLOPES", (5.0, 60.0)),
+    "sheets": ("SLIDERS", ("bdf2",)),
+    "cusick": ("STARTS", 2),
+}  # fmt: skip
+"""What is cut of cases that repeat it: other meshes, on which `plate`, `column` and other shells bend; the
+slope between the least and the greatest; integrators, as `tests/stepping/test_friction.py` has them all;
+starts.
+"""
 
 TOGETHER = (
     *SOME, "patch-states", "rigid-rotation", "wind-drag", "hanging-strip", "hanging-chain",
