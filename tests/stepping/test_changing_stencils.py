@@ -94,7 +94,6 @@ def flown(
     return x, float(v[30:, 2].mean()), pairs
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", ["beuler", "semi-implicit", "midpoint", "bdf2", "alpha2"])
 def test_two_sheets_bounce(comm: MPI.Comm, integrator: str) -> None:
     def watch(simulation: SteppedScene) -> None:
@@ -159,7 +158,6 @@ def test_the_answer_does_not_depend_on_ranks(comm: MPI.Comm) -> None:
 ALL_SOLVERS = SOLVERS | {"assembled operator": {"pc_type": "pbjacobi", "mat_type": "aij"}}
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("name", ALL_SOLVERS)
 def test_every_linear_solver(comm: MPI.Comm, name: str) -> None:
     time = {"time": SCENE["time"] | {"end": 0.03}}

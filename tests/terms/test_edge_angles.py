@@ -71,7 +71,6 @@ def compare(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch, scene: dict[str, An
     np.testing.assert_allclose(same[2], reactions, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_motion_is_that_of_plain_hinges(
     comm: MPI.Comm, integrator: str, monkeypatch: pytest.MonkeyPatch
@@ -185,7 +184,6 @@ def test_derivatives(comm: MPI.Comm, on_edges: None) -> None:
     simulation.destroy()
 
 
-@pytest.mark.parallel(2)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_run_goes_on_with_other_ranks(
     comm: MPI.Comm, integrator: str, on_edges: None, shared_tmp: Path
