@@ -4,8 +4,8 @@
 
 NAME is one of the scenes, without names all of them: 24 × 24 cells of gray interlock, 1 m wide. The table has
 steps, how many were repeated, Newton iterations of accepted steps (median, most) and of all attempts, linear
-iterations, and CPU time [s]: with the linear model of what is on the way (`stepping/contact_model.py`), and
-without it.
+iterations, and CPU time [s]: with the linear model that has the barrier's law
+(`stepping/contact_model.py`), and without it.
 """
 
 from __future__ import annotations

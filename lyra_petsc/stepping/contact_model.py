@@ -1,11 +1,12 @@
-"""Newton's linear system with what would touch on the way of its step: springs that push but do not pull.
+"""Newton's linear system with the barrier's own law on distances that are linear in its step.
 
-The Jacobian knows only what touches at the iterate. Parts that meet on the way of its step then pass each
-other far, and each iteration could go no farther than to the next of them. With springs (``terms.one_sided``)
-between all that is near the linear model is convex and piecewise quadratic, and Newton's method with exact
-line searches solves it: each of its iterations is a linear system with those springs that push. It costs no
-residual, no Jacobian and no detection of collisions. (Active sets of sequential quadratic programming:
-Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 18.)
+The Jacobian knows only what touches at the iterate, and there the slope of the barrier's force, which changes
+tenfold within a gap. Parts that meet on the way of its step then pass each other far, and what touches goes
+too near or leaves. Here all that is near has the law of the barrier (``terms.one_sided``) in an otherwise
+linear model, which is solved as by primal-dual methods of interior points: slopes of the law are those of
+chords, from the distance that there is to the one where the force is that of the last linear system. Steps
+are full ones: with line searches it took more of them. It costs no residual, no Jacobian and no detection of
+collisions. (Nocedal & Wright, Numerical Optimization, 2nd ed., ch. 19.)
 """
 
 from __future__ import annotations
@@ -15,19 +16,16 @@ from collections.abc import Callable
 import numpy as np
 from petsc4py import PETSc
 
-from lyra_petsc.arrays import Array, Mask
+from lyra_petsc.arrays import Array
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.one_sided import Springs
 
-SOLVES = 10
+SOLVES = 20
 """Linear systems with springs in a Newton iteration, at most."""
 
-BISECTIONS = 20
-"""In a line search."""
-
-SHORT = 0.02
-"""Length of a spring, over half the gap, up to which it does not matter whether it pushes."""
+MATCH = 0.1
+"""Part of the residual by which forces of springs may differ from those in the linear system."""
 
 
 class ContactModel:
@@ -54,59 +52,98 @@ class ContactModel:
         self.linear_iterations = 0
 
     def improve(
-        self, v: Array, residual: PETSc.Vec, y: PETSc.Vec, assemble: Callable[[], None], tolerance: float
+        self,
+        v: Array,
+        residual: PETSc.Vec,
+        y: PETSc.Vec,
+        assemble: Callable[[], None],
+        soften: Callable[[], bool],
+        tolerance: float,
     ) -> bool:
         """Let y, the Newton step from velocities v (n_owned, 3), be that of the model; whether it is another;
         collective.
 
-        ``assemble`` puts the linear system together again where it has other blocks; ``tolerance`` is that
-        of its solutions, relative to the residual.
+        ``assemble`` puts the linear system together again where it has other blocks, ``soften`` so that it is
+        easier to solve after that failed, if that can be; ``tolerance`` is that of its solutions, relative to
+        the residual.
         """
-        equations, self.linear_iterations = self._equations, 0
+        equations, linear, self.linear_iterations = self._equations, self._linear, 0
         self._springs = equations.springs(v, -y.getArray(readonly=True).reshape(v.shape))
         self._take(list(self._springs.values()))
-        length = self._length + self._longer(y)
-        pushes = length < 0.0
-        if not self._differ(self._acts, pushes, length):
+        change, size = self._longer(y), residual.norm()
+        length = self._length + change
+        force, expected = self._law(length)[0], self._force - self._stiffness * change
+        if self._apart(force, expected) <= MATCH * size:
             equations.release({})
             return False
         if self._follow():
             assemble()
-        self._linear.keep(v)
-        first, z = y.copy(), y.duplicate()
+        linear.keep(v)
+        first, z, left = y.copy(), y.duplicate(), residual.copy()
+        self._go(left, y, force - expected)
         for _ in range(SOLVES):
-            fall = self._solve(residual, y, z, pushes, tolerance * residual.norm())
-            if fall is None:
+            slopes = self._chords(length, force, expected)
+            while not (solved := self._solve(left, z, slopes, tolerance * size)) and soften():
+                linear.keep(v)
+                residual.copy(left)
+                self._go(left, y, force - self._force + self._stiffness * (length - self._length))
+            if not solved:
                 break
+            y.axpy(1.0, z)
             change = self._longer(z)
-            part = self._part(fall, length, change, pushes)
-            y.axpy(part, z)
-            length = length + part * change
-            before, pushes = pushes, length < 0.0
-            if part == 1.0 and not self._differ(before, pushes, length):
+            length, expected = length + change, force - slopes * change
+            force = self._law(length)[0]
+            self._go(left, z, force - expected)
+            if self._apart(force, expected) <= MATCH * size:
                 break
         downwards = bool(residual.dot(y) > 0.0)
         if not downwards:
             first.copy(y)
         equations.release(dict(zip(self._springs, self._split(length), strict=True)) if downwards else {})
-        first.destroy()
-        z.destroy()
+        for each in (first, z, left):
+            each.destroy()
         return downwards
 
     def _take(self, springs: list[Springs]) -> None:
-        """Lengths, stiffness and weights of the springs of all terms, one after the other."""
+        """Lengths, weights, and forces and stiffness in the linear system, of all springs."""
         none = np.empty(0)
         self._length = np.concatenate([none, *(each.length for each in springs)])
-        self._stiffness = np.concatenate([none, *(each.stiffness for each in springs)])
-        self._weight = self._stiffness * np.concatenate([none, *(each.counted for each in springs)])
-        self._acts = np.concatenate([none, *(each.acts for each in springs)]) > 0.0
-        skins = [np.full(len(each.at), term.skin) for term, each in self._springs.items()]
-        self._short = SHORT * np.concatenate([none, *skins])
+        self._counted = np.concatenate([none, *(each.counted for each in springs)])
+        acts = np.concatenate([none, *(each.acts for each in springs)])
+        self._force, self._stiffness = (acts * part for part in self._law(self._length))
 
     def _split(self, values: Array) -> list[Array]:
         """Values of all springs by term."""
         ends = np.cumsum([len(each.at) for each in self._springs.values()])
         return np.split(values, ends[:-1])
+
+    def _law(self, length: Array) -> tuple[Array, Array]:
+        """Forces [N] and stiffness [N/m] of all springs at these lengths [m]."""
+        none = (np.empty(0), np.empty(0))
+        parts = zip(self._springs.values(), self._split(length), strict=True)
+        found = [none, *(each.law(own) for each, own in parts)]
+        return np.concatenate([force for force, _ in found]), np.concatenate([slope for _, slope in found])
+
+    def _chords(self, length: Array, force: Array, expected: Array) -> Array:
+        """Slopes [N/m] of the law from these lengths [m] to where forces [N] are those expected."""
+        expected = np.maximum(expected, 0.0)
+        parts = zip(self._springs.values(), *map(self._split, (length, force, expected)), strict=True)
+        return np.concatenate([np.empty(0), *(each.chords(*own) for each, *own in parts)])
+
+    def _apart(self, force: Array, expected: Array) -> float:
+        """How far forces [N] of springs are from those expected, which do not pull; collective."""
+        off = force - np.maximum(expected, 0.0)
+        return float(np.sqrt(self._equations.points.summed(float(np.vdot(self._counted * off, off)))[0]))
+
+    def _go(self, left: PETSc.Vec, z: PETSc.Vec, more: Array) -> None:
+        """Let what is ``left`` [N] of the model be that after a step z, to which the present matrix belongs,
+        where springs push by ``more`` (m,) [N] than it expects.
+        """
+        there = left.duplicate()
+        self._linear.operator.mat.mult(z, there)
+        left.axpy(-1.0, there)
+        left.setArray(left.getArray(readonly=True) - self._forces(more).ravel())
+        there.destroy()
 
     def _longer(self, y: PETSc.Vec) -> Array:
         """By how much springs become longer [m] in a step y."""
@@ -116,43 +153,24 @@ class ContactModel:
         equations.points.update_ghosts(ahead)
         return np.concatenate([np.empty(0), *(each.longer(ahead) for each in self._springs.values())])
 
-    def _differ(self, before: Mask, after: Mask, length: Array) -> bool:
-        """Whether other springs push, and not only by a hair; collective."""
-        other = (before != after) & (np.abs(length) > self._short)
-        return bool(self._equations.points.summed(float(np.count_nonzero(other)))[0] > 0.0)
-
-    def _solve(
-        self, residual: PETSc.Vec, y: PETSc.Vec, z: PETSc.Vec, pushes: Mask, left: float
-    ) -> float | None:
-        """Let z lead from y to the solution with the springs that push, to a residual of ``left`` [N]; twice
-        how far the energy of that system falls on it [W]; None where the solve failed.
+    def _solve(self, left: PETSc.Vec, z: PETSc.Vec, slopes: Array, enough: float) -> bool:
+        """Let z lead from where this is ``left`` [N] to the solution with springs of these slopes [N/m], to a
+        residual ``enough`` [N]; whether it could be solved for.
         """
         ksp, linear, equations = self._ksp, self._linear, self._equations
-        change = self._stiffness * (pushes.astype(np.float64) - self._acts)
-        each = dict(zip(self._springs, self._split(change), strict=True))
+        each = dict(zip(self._springs, self._split(slopes - self._stiffness), strict=True))
 
         def add(rows: Array) -> None:
             equations.add_springs(self._springs, each, rows)
 
         linear.with_more(add)
-        b, at_y = residual.copy(), residual.duplicate()
-        b.setArray(b.getArray(readonly=True) + self._forces(change * self._length).ravel())
         ksp.setOperators(linear.operator.mat, linear.preconditioner.mat)
         kept = ksp.getTolerances()
-        y.copy(z)
-        ksp.setInitialGuessNonzero(True)
-        ksp.setTolerances(rtol=1e-14, atol=left)
-        ksp.solve(b, z)
-        ksp.setInitialGuessNonzero(False)
+        ksp.setTolerances(rtol=1e-14, atol=enough)
+        ksp.solve(left, z)
         ksp.setTolerances(*kept)
         self.linear_iterations += ksp.getIterationNumber()
-        linear.operator.mat.mult(y, at_y)
-        at_y.aypx(-1.0, b)
-        z.axpy(-1.0, y)
-        fall = float(at_y.dot(z))
-        b.destroy()
-        at_y.destroy()
-        return fall if ksp.getConvergedReason() > 0 and fall > 0.0 else None
+        return ksp.getConvergedReason() > 0 and bool(left.dot(z) > 0.0)
 
     def _forces(self, size: Array) -> Array:
         """Gradient (n_owned, 3) [N] of springs that pull by ``size`` [N], 0 where unknowns are prescribed."""
@@ -161,24 +179,3 @@ class ContactModel:
         for each, force in zip(self._springs.values(), self._split(size), strict=True):
             each.add_forces(force, out)
         return np.where(self._equations.prescribed.free, out[: points.n_owned], 0.0)
-
-    def _part(self, fall: float, length: Array, change: Array, pushes: Mask) -> float:
-        """Which part of the way to the solution with springs that push (m,) leads lowest; collective.
-
-        ``length`` and ``change`` (m,) [m] are those of springs at its beginning and on it.
-        """
-        equations = self._equations
-        weight = self._weight * change / equations.stage.reach
-
-        def slope(part: float) -> float:
-            there = length + part * change
-            more = float(np.vdot(weight, np.minimum(there, 0.0) - np.where(pushes, there, 0.0)))
-            return float(equations.points.summed(more)[0]) - (1.0 - part) * fall
-
-        if slope(1.0) <= 1e-6 * fall:
-            return 1.0
-        low, high = 0.0, 1.0
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-        return low

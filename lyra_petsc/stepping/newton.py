@@ -183,7 +183,16 @@ class Newton:
         def assemble() -> None:
             self._linear.set(v, self._blend.value, keep=False, convex=self._convex)
 
-        changed = self._contact.improve(v, residual, y, assemble, self.forcing.in_use)
+        def soften() -> bool:
+            self._linear.set_operator_again(v, self._blend.value)
+            if failed_factors.forget(self._ksp) or self._linear.better_preconditioner(v):
+                return True
+            more = self._blend.raise_()
+            if more:
+                self._linear.set_operator_again(v, self._blend.value)
+            return more
+
+        changed = self._contact.improve(v, residual, y, assemble, soften, self.forcing.in_use)
         self.foreseen_linear += self._contact.linear_iterations
         return changed
 

@@ -296,7 +296,7 @@ class ContactBarrier(Elastic):
         self.shares = surface_shares.shares(what[:, 6])
         self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
-        self._foreseen = np.zeros(self.n_elements)
+        self._foreseen = np.full(self.n_elements, np.nan)
         self._springs: Springs | None = None
 
     def _between_others(self) -> NDArray[np.bool_]:
@@ -541,27 +541,24 @@ class ContactBarrier(Elastic):
 
     def springs(self, x: Array, way: Array, frozen: Places) -> Springs:
         met, room = self.meeting(x, frozen.now), self._room
-        stiffness = HALFWAY * self.barrier.stiffness
-        pairs = self.kind, self.points, self.offset, self.gap, stiffness, self.barrier.parallel
+        pairs = self.kind, self.points, self.offset, self.gap, self.barrier.stiffness, self.barrier.parallel
         given = met.at, met.weight, met.counted, met.beta, met.felt
         while True:
             numbers = np.empty(room, dtype=np.int64)
             found = numbers, np.empty((room, 4)), np.empty((room, 3)), *np.empty((3, room))
-            counted = self.n_owned
-            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, TOUCHES, given, counted, found)
+            touch, n = contact_pairs.one_sided(x, frozen.now, way, *pairs, given, self.n_owned, found)
             if n <= room:
                 break
             room = n
-        at, beta, normal, spring, length, counts = (part[:n] for part in found)
+        at, beta, normal, scale, length, counts = (part[:n] for part in found)
         acts = np.arange(n) < touch
-        self._springs = Springs(at, self.points[at], beta, normal, spring, length, counts, acts)
+        self._springs = Springs(at, self.points[at], beta, normal, scale, self.gap[at], length, counts, acts)
         return self._springs
 
     def release(self, length: Array | None) -> None:
-        self._foreseen[:] = 0.0
+        self._foreseen[:] = np.nan
         if length is not None and self._springs is not None:
-            push = np.where(self._springs.acts, 0.0, np.maximum(-length, 0.0))
-            self._foreseen[self._springs.at] = HALFWAY * push
+            self._foreseen[self._springs.at] = self._springs.law(length)[0] / self._springs.scale
         self._springs = None
 
     def aims(self, x: Array, way: Array, frozen: Places) -> tuple[NDArray[Any], ...]:

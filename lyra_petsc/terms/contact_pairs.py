@@ -62,6 +62,9 @@ ADVANCES = 1000
 BISECTIONS = 30
 """In the search for the distance at which the barrier has a force."""
 
+CHORD = 1e-3
+"""Length of a chord over the gap below which it is a tangent."""
+
 PARALLEL = 1e-12
 """Squared sine of the angle of two edges, or sides of a triangle, below which they count as parallel."""
 
@@ -902,9 +905,10 @@ def aims(x, others, way, kind, points, offset, gap, most, foreseen, aim, before,
     """Least distances less the offsets (E,) [m] that pairs should have after a ``way`` (n_local, 3) [m] of
     Newton's.
 
-    Where the barrier's force is what it is in the linear model, and what does not touch yet at the part
-    ``most`` of the gap, which no aim is beyond; −∞ of pairs that stay apart. On which side (E, 3) parts are
-    that would pass each other; 0 where distances tell. Whether a pair presses (E,) in the linear model.
+    Where the barrier's force over k [m] is what it is in the linear model, that is ``foreseen`` (E,), or no
+    number where that is Newton's own; else at the part ``most`` of the gap, which no aim is beyond; −∞ of
+    pairs that stay apart. On which side (E, 3) parts are that would pass each other; 0 where distances tell.
+    Whether a pair presses (E,) in the linear model.
     """
     p, n, beta, none = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3)
     nearer = 2.0 * _farthest(way)
@@ -921,7 +925,8 @@ def aims(x, others, way, kind, points, offset, gap, most, foreseen, aim, before,
         if kind[e] <= EDGE_EDGE:
             for k in range(3):
                 before[e, k] = n[k]
-        if delta < gap[e]:
+        force = foreseen[e]
+        if math.isnan(force) and delta < gap[e]:
             along = 0.0
             for i in range(4):
                 if points[e, i] >= 0:
@@ -929,26 +934,22 @@ def aims(x, others, way, kind, points, offset, gap, most, foreseen, aim, before,
                         along += beta[i] * n[k] * way[Index(points[e, i]), k]
             _, slope, second = barrier(delta, gap[e])
             force = -slope - second * along
-        else:
-            force = foreseen[e]
         if force > 0.0:
             aim[e], presses[e] = min(aim[e], _where(force, gap[e])), True
 
 
 @kernel()
-def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, most, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Springs that stand for what touches, or would after a ``way`` (n_local, 3) [m], in a linear model.
-
-    They push while their length s is below 0, with the force −κ s. What touches has the second derivative of
-    the barrier, and its force at x; what does not, b″ in the middle of the gap, and s = 0 at the part
-    ``most`` of the gap.
+def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, met, n_counted, found):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Springs with the law of the barrier on distances that are linear in a step: of what touches, and of
+    what may after a ``way`` (n_local, 3) [m].
 
     Parameters
     ----------
     met : tuple
         Numbers, how often they count, for this rank too, β and what is felt of the pairs of `meeting`.
     found : tuple of (room,), (room, 4), (room, 3), (room,), (room,), (room,)
-        Numbers of the pairs, β, unit normals, κ [N/m], s at x [m], and how often they count for this rank.
+        Numbers of the pairs, β, unit normals, how often each counts times the barrier's k [N/m], δ at x [m],
+        and how often they count for this rank.
 
     Returns
     -------
@@ -958,10 +959,8 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, mo
     numbers, beta, normal, spring, length, counted = found
     at, often, ours, given, felt = met
     p, u, b, none, n = np.empty((4, 3)), np.empty(3), np.empty(4), np.zeros(3), 0
-    touches = np.zeros(len(kind), dtype=np.bool_)
     for m in range(len(at)):
         e = at[m]
-        touches[e] = True
         if not often[m] > 0.0 or not felt[m, 4] > 0.0 or not felt[m, 4] < np.inf:
             continue
         if kind[e] == EDGE_EDGE:
@@ -969,9 +968,9 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, mo
             if _fades(p, parallel):
                 continue
         d = math.sqrt(felt[m, 0] ** 2 + felt[m, 1] ** 2 + felt[m, 2] ** 2)
-        numbers[n], spring[n], counted[n] = e, often[m] * felt[m, 4] * d * d, ours[m] / often[m]
         d = -d if kind[e] == VERTEX_INSIDE else d
-        length[n] = felt[m, 3] / (felt[m, 4] * d)
+        numbers[n], spring[n], counted[n] = e, often[m] * stiffness, ours[m] / often[m]
+        length[n] = d - offset[e]
         for i in range(4):
             beta[n, i] = given[m, i]
         for k in range(3):
@@ -979,16 +978,15 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, mo
         n += 1
     first, nearer = n, 2.0 * _farthest(way)
     for e in range(len(kind)):
-        if touches[e]:
-            continue
         _load(x, others, points, e, p)
         if at_least(p, kind[e]) - offset[e] - nearer >= gap[e]:
             continue
         delta = _ahead_of(p, kind[e], none, b, u) - offset[e]
-        if not most * gap[e] < delta < gap[e] + nearer or (kind[e] == EDGE_EDGE and _fades(p, parallel)):
+        # what is nearer was met, by itself or by one whose nearest points are the same
+        if not gap[e] <= delta < gap[e] + nearer or (kind[e] == EDGE_EDGE and _fades(p, parallel)):
             continue
         if n < len(numbers):
-            numbers[n], spring[n], length[n] = e, stiffness, delta - most * gap[e]
+            numbers[n], spring[n], length[n] = e, stiffness, delta
             counted[n] = 1.0 if e < n_counted else 0.0
             for i in range(4):
                 beta[n, i] = b[i]
@@ -996,6 +994,37 @@ def one_sided(x, others, way, kind, points, offset, gap, stiffness, parallel, mo
                 normal[n, k] = u[k]
         n += 1
     return first, n
+
+
+@kernel()
+def law(delta, gap, least, force, stiffness):  # type: ignore[no-untyped-def]
+    """−b′ / k [m] and b″ / k of distances (n,) [m], below ``least`` (n,) [m] along the tangent there."""
+    for m in range(len(delta)):
+        at = max(delta[m], least[m])
+        if at >= gap[m]:
+            force[m] = stiffness[m] = 0.0
+            continue
+        _, slope, stiffness[m] = barrier(at, gap[m])
+        force[m] = stiffness[m] * (at - delta[m]) - slope
+
+
+@kernel()
+def chords(delta, gap, least, force, expected, out):  # type: ignore[no-untyped-def]
+    """Slopes (n,) of `law`, from where it is ``force`` (n,) [m] to where it is ``expected`` (n,) [m]; the
+    tangent's where that is the same.
+    """
+    for m in range(len(delta)):
+        _, slope, second = barrier(least[m], gap[m])
+        if expected[m] <= 0.0:
+            there = gap[m]
+        elif expected[m] >= -slope:
+            there = least[m] - (expected[m] + slope) / second
+        else:
+            there = _where(expected[m], gap[m])
+        if abs(there - delta[m]) > CHORD * gap[m]:
+            out[m] = max(0.0, (expected[m] - force[m]) / (delta[m] - there))
+        else:
+            out[m] = barrier(max(delta[m], least[m]), gap[m])[2] if delta[m] < gap[m] else 0.0
 
 
 @kernel()

@@ -1,7 +1,7 @@
-"""Springs that push but do not pull, on distances linear in a Newton step: what may touch on its way.
+"""Springs with the law of a barrier on distances linear in a Newton step: what touches, or may on its way.
 
-A spring has the energy ½ κ min(0, s)², s = s_0 + Σ_i β_i n · w_i for ways w_i of its four points; those of
-obstacles, with numbers below 0, stand still.
+A spring is δ = δ_0 + Σ_i β_i n · w_i long for ways w_i of its four points, and pushes as the barrier does;
+those of obstacles, with numbers below 0, stand still.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ from lyra_petsc.arrays import Array
 from lyra_petsc.kernels.cache import Index
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_outer
+from lyra_petsc.terms import contact_pairs
 from lyra_petsc.terms.term import Offsets
+
+BELOW = 0.5
+"""Part of the gap, or of the distance that there is where that is less, below which the law goes on along its
+tangent: linear systems are then no stiffer than the sheet. Forces, and distances for them, are found again by
+what is expected of them."""
 
 
 class Springs(NamedTuple):
@@ -29,19 +35,20 @@ class Springs(NamedTuple):
         Local rows; below 0 of obstacles.
     beta, normal : (m, 4), (m, 3)
         β and unit normals n.
-    stiffness, length : (m,)
-        κ [N/m] and s_0 [m].
+    scale, gap, length : (m,)
+        How often each counts times the barrier's k [N/m], gap [m] and distance less offset δ [m].
     counted : (m,)
         How often each counts for this rank.
     acts : (m,) bool
-        Which are in the term's gradient and Hessian already; they push.
+        Which are in the term's gradient and Hessian already.
     """
 
     at: NDArray[np.int64]
     points: NDArray[np.int64]
     beta: Array
     normal: Array
-    stiffness: Array
+    scale: Array
+    gap: Array
     length: Array
     counted: Array
     acts: NDArray[np.bool_]
@@ -51,6 +58,26 @@ class Springs(NamedTuple):
         out = np.empty(len(self.at))
         _lengthen(self.points, self.beta, self.normal, way, out)
         return out
+
+    @property
+    def _least(self) -> Array:
+        """Lengths (m,) [m] below which the law goes on along its tangent."""
+        least: Array = BELOW * np.minimum(self.gap, self.length)
+        return least
+
+    def law(self, length: Array) -> tuple[Array, Array]:
+        """Forces (m,) [N] and stiffness (m,) [N/m] at these lengths (m,) [m]."""
+        force, stiffness = np.empty((2, len(self.at)))
+        contact_pairs.law(length, self.gap, self._least, force, stiffness)
+        return self.scale * force, self.scale * stiffness
+
+    def chords(self, length: Array, force: Array, expected: Array) -> Array:
+        """Slopes (m,) [N/m] of the law from lengths (m,) [m], where it is ``force`` (m,) [N], to where it is
+        what is expected (m,) [N].
+        """
+        out = np.empty(len(self.at))
+        contact_pairs.chords(length, self.gap, self._least, force / self.scale, expected / self.scale, out)
+        return self.scale * out
 
     def add_forces(self, size: Array, out: Array) -> None:
         """Add ``size`` (m,) [N] times the gradients of their lengths to rows of out (n_local, 3)."""

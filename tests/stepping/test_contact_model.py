@@ -56,3 +56,15 @@ def test_what_meets_in_a_step_is_found_in_few_iterations(
     monkeypatch.setattr(ContactModel, "improve", lambda *_: False)
     _, before = steps(comm)  # some of these may be repeated, and lead less far
     assert sum(newton) < 0.9 * sum(before)
+
+
+@pytest.mark.parametrize(("gap", "most"), [(1e-5, 10), (1e-4, 7)])
+def test_small_gaps_take_few_iterations(gap: float, most: int, comm: MPI.Comm) -> None:
+    place = {"translate": [-0.5, -0.48, 0.0]}
+    scene = thrown_at_a_ball() | {"contact": {"gap": gap}}
+    scene["mesh"] = grid(1.0, 1.0, 16, 16, "alternating") | {"transform": place}
+    simulation = SteppedScene(comm, scene_of(scene))
+    newton = [simulation.step().newton_iterations for _ in range(16)]
+    for name in simulation.stepper.our_options:
+        PETSc.Options().delValue(name)
+    assert np.median(newton[4:]) <= most, newton

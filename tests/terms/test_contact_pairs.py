@@ -345,6 +345,47 @@ def test_free_ways(name: str, speed: float) -> None:
     assert pairs.free_way(way, others_way, most=0.5 * min(found)) == 0.5 * min(found)
 
 
+def test_pairs_are_pushed_to_where_the_force_is_the_foreseen_one() -> None:
+    pairs = KINDS["vertex and triangle"][0]()
+    n, gap, force = len(pairs), np.full(len(pairs), GAP), 3.0 * GAP
+    aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
+    numbers = pairs.kind, pairs.points, pairs.offset, gap
+    still = np.zeros_like(pairs.x)
+    contact_pairs.aims(pairs.x, pairs.others, still, *numbers, 0.7, np.full(n, force), aim, before, presses)
+    left = pairs.distances() - pairs.offset
+    touch = (left > 0.0) & (left < GAP)
+    assert touch.any()
+    assert presses[touch].all()
+    np.testing.assert_allclose(
+        [-contact_pairs.barrier(each, GAP)[1] for each in aim[touch]], force, rtol=1e-6
+    )
+
+
+def test_the_law_of_springs_is_the_barriers_and_goes_on_straight() -> None:
+    least = 0.5 * GAP
+    delta = GAP * np.linspace(-2.0, 1.2, 65)
+    gap, below = np.full(len(delta), GAP), np.full(len(delta), least)
+    force, stiffness = np.empty((2, len(delta)))
+    contact_pairs.law(delta, gap, below, force, stiffness)
+    inside, straight = (delta > least) & (delta < GAP), delta < least
+    _, slope, second = contact_pairs.barrier(delta[inside], GAP)
+    np.testing.assert_allclose(force[inside], -slope)
+    np.testing.assert_allclose(stiffness[inside], second)
+    _, slope, second = contact_pairs.barrier(least, GAP)
+    np.testing.assert_allclose(force[straight], second * (least - delta[straight]) - slope)
+    assert not force[delta >= GAP].any()
+    # chords lead from any of these distances to where the force is what is expected
+    for expected in (0.0, 0.1 * GAP, 2.0 * GAP, 40.0 * GAP):
+        slopes, there, of = np.empty((3, len(delta)))
+        contact_pairs.chords(delta, gap, below, force, np.full(len(delta), expected), slopes)
+        some = (np.abs(force - expected) > 0.05 * GAP) & (slopes > 0.0)
+        assert some.sum() > len(delta) // 3
+        there = delta + (force - expected) / np.where(some, slopes, 1.0)
+        contact_pairs.law(there, gap, below, of, stiffness)
+        np.testing.assert_allclose(of[some], expected, atol=1e-6 * GAP)
+        assert (slopes >= 0.0).all()
+
+
 @pytest.mark.parametrize("name", [name for name in KINDS if "fade" not in name])
 def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: str) -> None:
     pairs = KINDS[name][0]()
@@ -352,7 +393,7 @@ def test_pairs_are_pushed_to_where_the_force_is_that_of_the_linear_model(name: s
     way = 0.3 * np.random.default_rng(5).normal(size=pairs.x.shape)
     numbers = pairs.kind, pairs.points, pairs.offset, gap
     aim, before, presses = np.empty(n), np.zeros((n, 3)), np.empty(n, dtype=np.bool_)
-    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, np.zeros(n), aim, before, presses)
+    contact_pairs.aims(pairs.x, pairs.others, way, *numbers, most, np.full(n, np.nan), aim, before, presses)
 
     def slopes(delta: Array) -> Array:
         return np.array([contact_pairs.barrier(each, GAP)[1] for each in delta])
