@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -32,9 +33,28 @@ gaps it saves a tenth of the iterations, and took twice the time."""
 CORRECTED = 0.5
 """Fraction of the residual at the end of a step below which a correction of it is taken."""
 
+MOST_CORRECTIONS = 8
+"""Of one step."""
+
+BACK, ON = -1.0, 0.5
+"""Part of the step before that a correction may add to it for secants to tell more than the matrix."""
+
 
 def _largest(vector: PETSc.Vec) -> float:
     return float(vector.norm(PETSc.NormType.INFINITY))
+
+
+def _by_secants(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
+    """Let a correction, solved for with the matrix of the first of these steps, be that of Broyden's matrix
+    after the last of them; collective.
+
+    (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.4, algorithm QNERR.)
+    """
+    for step, following in itertools.pairwise(steps):
+        correction.axpy(step.dot(correction) / step.dot(step), following)
+    repeated = steps[-1].dot(correction) / steps[-1].dot(steps[-1])
+    if BACK < repeated < ON:
+        correction.scale(1.0 / (1.0 - repeated))
 
 
 class Newton:
@@ -188,26 +208,39 @@ class Newton:
         return changed
 
     def _correct(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
-        """Solve once more with the same matrix at the end of a step y that is taken in full; whether what
-        is left there becomes much less, and y is longer by that. ``exact``: y is the whole Newton step.
+        """Solve again and again with the same matrix at the end of a step y that is taken in full, as long as
+        what is left there becomes much less; whether y is another by that. ``exact``: y is the whole Newton
+        step, and more than one correction is tried.
 
-        It takes back the stretch of a step along tangents, for a residual and a solve with factors at hand
-        (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order).
+        The first takes back the stretch of a step along tangents, for a residual and a solve with factors at
+        hand (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order). What
+        follows are steps of Broyden's method.
         """
-        first = self._array(x) - self._array(y)
+        convergence, v = self.convergence, self._array(x)
+        first = v - self._array(y)
         size, force = self._force(first)
-        left, correction = y.duplicate(), y.duplicate()
-        left.setArray(force.ravel())
-        self._ksp.solve(left, correction)
-        self.more_linear += self._ksp.getIterationNumber()
-        better = self._force(first - self._array(correction))[0] < CORRECTED * size
-        if better:
-            self.convergence.corrected = _largest(correction) / _largest(y) if exact else 1.0
+        left, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
+        corrected = False
+        for _ in range(MOST_CORRECTIONS if exact else 1):
+            left.setArray(force.ravel())
+            self._ksp.solve(left, correction)
+            self.more_linear += self._ksp.getIterationNumber()
+            if exact:
+                _by_secants(correction, steps)
+            before = size
+            size, force = self._force(v - self._array(y) - self._array(correction))
+            if not size < CORRECTED * before:
+                break
+            corrected = True
             y.axpy(1.0, correction)
+            if exact and convergence.corrected_by(_largest(correction), _largest(steps[-1]), size):
+                break
+            steps.append(correction.copy())
+        if corrected:
             self._equations.linearise_to(first)
-        left.destroy()
-        correction.destroy()
-        return better
+        for vector in (left, correction, *steps):
+            vector.destroy()
+        return corrected
 
     def _force(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
