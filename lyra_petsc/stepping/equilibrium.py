@@ -110,6 +110,7 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
+        self._found = -np.inf  # load factor of the last equilibrium, if nothing was solved for since
         # factors tell at once how far the first load would lead
         self._sufficed = ANY if stepper.linear.factors else 0.0
         self._extrapolation = Extrapolation(system.points.comm)
@@ -137,11 +138,12 @@ class Equilibrium:
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
             if not solves:
+                linear += self._look_ahead(before, factor)
                 anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
-                self._in_vain, self._sufficed = 0, self._integrator.pseudo
+                self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
@@ -156,6 +158,7 @@ class Equilibrium:
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             system.applied.given = self._integrator.ahead = None
+            self._integrator.others = []
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
@@ -175,7 +178,7 @@ class Equilibrium:
                 ceiling = self._integrator.pseudo if touches else ceiling
                 self._integrator.pseudo *= SHRINK
                 leaps = False
-        self._sufficed = 0.0
+        self._sufficed, self._found = 0.0, -np.inf
         self._in_vain += solves - lessened if arrived else 0
         stuck = attempt.stuck or self._off_balance(before, factor, history, x)
         system.x[:n] = x
@@ -190,6 +193,19 @@ class Equilibrium:
             words=attempt.words or words,
             stuck=stuck,
         )
+
+    def _look_ahead(self, before: float, factor: float) -> int:
+        """Expect equilibria to go on along the tangent, dx/dλ, which the last factors tell where loads alone
+        change; linear iterations; collective.
+        """
+        system = self._system
+        moves = system.points.largest(float(np.abs(system.prescribed.velocity).max(initial=0.0)))[0] > 0.0
+        if moves or before != self._found:
+            return 0
+        way, iterations = self._stepper.tangent(system.out_of_balance()[0])
+        if way is not None:
+            self._integrator.others = self._extrapolation.along(factor, way / (factor - before))
+        return iterations
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""

@@ -18,6 +18,7 @@ from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.globalisation import Globalisation
 from lyra_petsc.stepping.inexact import COLLISION, Forcing
+from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -104,6 +105,7 @@ class Newton:
 
             self._contact = ContactModel(self._ksp, equations, linear, follow)
         self._from: PETSc.Vec | None = None
+        self._reach = 0.0
         self._began_convex = False
         still = not (equations.integrator.moves or equations.discretisation.guards)
         self._corrects = still and linear.factors and bool(equations.active.edged)
@@ -138,6 +140,7 @@ class Newton:
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.set(v, blend, keep=self.convergence.fell, convex=self._convex)
+        self._reach = self._equations.stage.reach
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -250,9 +253,31 @@ class Newton:
         return float(np.sqrt(square)), force
 
     def bend_guess(self, v: Array, guess: Array) -> None:
-        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs; collective."""
-        if self._arcs is not None:
-            guess[:] = v + self._arcs.bend(v, guess - v, strains=False)[0]
+        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs: of all ways to expect that to
+        the least energy; collective.
+        """
+        integrator = self._equations.integrator
+        if self._arcs is None or not isinstance(integrator, Static):
+            return
+        least, ways = np.inf, [guess - v, *(way / integrator.pseudo for way in integrator.others)]
+        for way in ways:
+            there = v + self._arcs.bend(v, way, strains=False)[0]
+            self._equations.prescribe(there)
+            energy = self._equations.objective(there)[0] if len(ways) > 1 else 0.0
+            if energy < least:
+                least, guess[:] = energy, there
+
+    def tangent(self, force: Array) -> tuple[Array | None, int]:
+        """See `Stepper.tangent`."""
+        if self._arcs is None or self._reach == 0.0:
+            return None, 0
+        b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
+        b.setArray(force.ravel())
+        self._ksp.solve(b, x)
+        way = self._reach * self._array(x)
+        b.destroy()
+        x.destroy()
+        return (way if self._ksp.getConvergedReason() > 0 else None), int(self._ksp.getIterationNumber())
 
     def _bend(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let a step y that is taken in full go along arcs, as far as they lead; whether it does."""
