@@ -59,8 +59,6 @@ class Convergence:
         Whether the solve ended because only round-off was left.
     left : float
         Estimated remaining correction of any coordinate [m].
-    corrected : float
-        Part of the last Newton step that a second solve with its matrix added to it; 1 if it is not known.
     too_slow : bool
         Whether the solve was given up since its linear iterations passed the limit.
     usual : float
@@ -93,7 +91,7 @@ class Convergence:
         self._first_norm = self._increment = 0.0
         self._stalled = self._spent = 0
         self._balanced = self._ended = self._was_good = False
-        self.corrected = 1.0
+        self._expected = np.inf
 
     @property
     def judged(self) -> bool:
@@ -176,16 +174,25 @@ class Convergence:
         """Residual norm [N] that the scene asks for."""
         return float(self._tolerances.force_tolerance * self._equations.largest_force())
 
+    def corrected_by(self, correction: float, last: float, residual: float) -> bool:
+        """Expect corrections after a Newton step, by its matrix, to go on falling as from ``last`` to
+        ``correction`` [m/s]; whether that and the ``residual`` [N] they leave are as small as asked.
+
+        (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
+        """
+        part = correction / last
+        expected = correction * part / (1.0 - part) if part < SLOWEST else np.inf
+        self._expected = expected * self._equations.stage.reach
+        near = self._tolerances.step_tolerance * self.spacing
+        return self._expected <= near and residual <= self._force_tolerance()
+
     def _moved_by(self, increment: float) -> None:
         """Expect increments to go on falling as they fell last, where the residual shows that they may.
 
-        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.) A correction that was
-        added tells how solves with the same matrix contract errors: the next would add as much of it again.
-        (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
+        (Hairer & Wanner, Solving Ordinary Differential Equations II, equation IV.8.10.) Corrections that were
+        added tell more.
         """
         fell = increment / self._increment if self.fell and self._increment > 0.0 else 1.0
         self._increment = increment
         self.left = increment * (fell / (1.0 - fell) if fell < SLOWEST else 1.0)
-        part, self.corrected = self.corrected, 1.0
-        if part < SLOWEST:
-            self.left = min(self.left, increment * part * part / (1.0 - part))
+        self.left, self._expected = min(self.left, self._expected), np.inf

@@ -110,6 +110,9 @@ class Equilibrium:
         self._tolerances, self._spacing, self._size, self._floor = tolerances, spacing, size, floor
         self._longest, self._careful = LONGEST, 1.0
         self._in_vain = 0
+        # the last equilibrium, how it changes with the load factor [m], and what loads change by [N]
+        self._found, self._pull = 0.0, np.zeros((system.points.n_owned, 3))
+        self._rate: Array | None = None
         # factors tell at once how far the first load would lead
         self._sufficed = ANY if stepper.linear.factors else 0.0
         self._extrapolation = Extrapolation(system.points.comm)
@@ -137,11 +140,14 @@ class Equilibrium:
         while True:
             force = self._out_of_balance(before, factor, first=solves == 0)
             if not solves:
+                self._look_ahead(before, factor)
                 anchored, frozen = system.moving_energy_before, system.active.frozen
             history.append(_row(force, attempt if solves else None))
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
-                self._in_vain, self._sufficed = 0, self._integrator.pseudo
+                self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
+                self._rate, spent = self._stepper.tangent(self._pull)
+                linear += spent
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
@@ -156,6 +162,7 @@ class Equilibrium:
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             system.applied.given = self._integrator.ahead = None
+            self._integrator.others = []
             solves += 1
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
@@ -190,6 +197,16 @@ class Equilibrium:
             words=attempt.words or words,
             stuck=stuck,
         )
+
+    def _look_ahead(self, before: float, factor: float) -> None:
+        """Expect equilibria to go on along the tangent where loads alone change; collective."""
+        if before != self._found:
+            return
+        system = self._system
+        self._pull = system.out_of_balance()[0] / (factor - before)
+        moves = system.points.largest(float(np.abs(system.prescribed.velocity).max(initial=0.0)))[0] > 0.0
+        if self._rate is not None and not moves:
+            self._integrator.others = self._extrapolation.along(factor, self._rate)
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""
@@ -251,6 +268,8 @@ class Equilibrium:
         self._extrapolation.learn(factor, self._system.x[: self._system.points.n_owned])
         arrays, past = self._extrapolation.memory()
         numbers = {"scale": self._scale, "in_vain": self._in_vain, "sufficed": self._sufficed}
+        if self._rate is not None:
+            arrays["rate"] = self._rate
         return arrays, numbers | {"extrapolation": past}
 
     def restore(self, arrays: Mapping[str, Array], memory: Mapping[str, Any], factor: float) -> None:
@@ -258,6 +277,8 @@ class Equilibrium:
         self._scale = float(memory.get("scale", self._scale))
         self._in_vain = int(memory.get("in_vain", self._in_vain))
         self._sufficed = float(memory.get("sufficed", self._sufficed))
+        self._found = factor
+        self._rate = np.array(arrays["rate"]) if "rate" in arrays else None
         x = self._system.x[: self._system.points.n_owned]
         self._extrapolation.restore(arrays, memory.get("extrapolation", {}), factor, x)
 

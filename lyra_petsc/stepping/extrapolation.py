@@ -40,6 +40,18 @@ class Extrapolation:
         self.learn(t0, v)
         return self._expected(t1, min(self._degree, len(self._times) - 1))
 
+    def along(self, t1: float, rate: Array) -> list[Array]:
+        """Ways (n, 3) to expect until t1 from the last values, which change at ``rate``: the tangent, and the
+        parabola from the values before.
+        """
+        after = t1 - self._times[-1]
+        ways = [after * rate]
+        if len(self._times) > 1:
+            before = self._times[-1] - self._times[-2]
+            bend = (self._values[-2] - self._values[-1]) / before + rate
+            ways.append(after * rate + (after * after / before) * bend)
+        return ways
+
     def learn(self, t0: float, v: Array) -> None:
         """Take the velocities at t0 [s], unless they are known; collective."""
         if self._times and t0 <= self._times[-1]:

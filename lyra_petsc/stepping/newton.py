@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from lyra_petsc.stepping.blend import Blend
 from lyra_petsc.stepping.convergence import Convergence
 from lyra_petsc.stepping.globalisation import Globalisation
 from lyra_petsc.stepping.inexact import COLLISION, Forcing
+from lyra_petsc.stepping.integrators.static import Static
 from lyra_petsc.stepping.linear_system import LinearSystem
 from lyra_petsc.stepping.stage_equations import StageEquations
 
@@ -32,9 +34,28 @@ gaps it saves a tenth of the iterations, and took twice the time."""
 CORRECTED = 0.5
 """Fraction of the residual at the end of a step below which a correction of it is taken."""
 
+MOST_CORRECTIONS = 8
+"""Of one step."""
+
+BACK, ON = -1.0, 0.5
+"""Part of the step before that a correction may add to it for secants to tell more than the matrix."""
+
 
 def _largest(vector: PETSc.Vec) -> float:
     return float(vector.norm(PETSc.NormType.INFINITY))
+
+
+def _by_secants(correction: PETSc.Vec, steps: list[PETSc.Vec]) -> None:
+    """Let a correction, solved for with the matrix of the first of these steps, be that of Broyden's matrix
+    after the last of them; collective.
+
+    (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.4, algorithm QNERR.)
+    """
+    for step, following in itertools.pairwise(steps):
+        correction.axpy(step.dot(correction) / step.dot(step), following)
+    repeated = steps[-1].dot(correction) / steps[-1].dot(steps[-1])
+    if BACK < repeated < ON:
+        correction.scale(1.0 / (1.0 - repeated))
 
 
 class Newton:
@@ -84,6 +105,7 @@ class Newton:
 
             self._contact = ContactModel(self._ksp, equations, linear, follow)
         self._from: PETSc.Vec | None = None
+        self._reach = 0.0
         self._began_convex = False
         still = not (equations.integrator.moves or equations.discretisation.guards)
         self._corrects = still and linear.factors and bool(equations.active.edged)
@@ -118,6 +140,7 @@ class Newton:
         # where Newton converges the geometry hardly changes: what was set up an iteration ago still serves
         blend = self._blend.after(self._taken(u), exact=self._corrects and self.convergence.halved)
         self._linear.set(v, blend, keep=self.convergence.fell, convex=self._convex)
+        self._reach = self._equations.stage.reach
 
     def _array(self, u: PETSc.Vec) -> Array:
         values: Array = u.getArray(readonly=True).reshape(self._shape)
@@ -197,26 +220,39 @@ class Newton:
         return changed
 
     def _correct(self, x: PETSc.Vec, y: PETSc.Vec, *, exact: bool) -> bool:
-        """Solve once more with the same matrix at the end of a step y that is taken in full; whether what
-        is left there becomes much less, and y is longer by that. ``exact``: y is the whole Newton step.
+        """Solve again and again with the same matrix at the end of a step y that is taken in full, as long as
+        what is left there becomes much less; whether y is another by that. ``exact``: y is the whole Newton
+        step, and more than one correction is tried.
 
-        It takes back the stretch of a step along tangents, for a residual and a solve with factors at hand
-        (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order).
+        The first takes back the stretch of a step along tangents, for a residual and a solve with factors at
+        hand (Traub, Iterative Methods for the Solution of Equations, 1964, chapter 8: of third order). What
+        follows are steps of Broyden's method.
         """
-        first = self._array(x) - self._array(y)
+        convergence, v = self.convergence, self._array(x)
+        first = v - self._array(y)
         size, force = self._force(first)
-        left, correction = y.duplicate(), y.duplicate()
-        left.setArray(force.ravel())
-        self._ksp.solve(left, correction)
-        self.more_linear += self._ksp.getIterationNumber()
-        better = self._force(first - self._array(correction))[0] < CORRECTED * size
-        if better:
-            self.convergence.corrected = _largest(correction) / _largest(y) if exact else 1.0
+        left, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
+        corrected = False
+        for _ in range(MOST_CORRECTIONS if exact else 1):
+            left.setArray(force.ravel())
+            self._ksp.solve(left, correction)
+            self.more_linear += self._ksp.getIterationNumber()
+            if exact:
+                _by_secants(correction, steps)
+            before = size
+            size, force = self._force(v - self._array(y) - self._array(correction))
+            if not size < CORRECTED * before:
+                break
+            corrected = True
             y.axpy(1.0, correction)
+            if exact and convergence.corrected_by(_largest(correction), _largest(steps[-1]), size):
+                break
+            steps.append(correction.copy())
+        if corrected:
             self._equations.linearise_to(first)
-        left.destroy()
-        correction.destroy()
-        return better
+        for vector in (left, correction, *steps):
+            vector.destroy()
+        return corrected
 
     def _force(self, v: Array) -> tuple[float, Array]:
         """F (n_owned, 3) [N] at velocities v and its norm; collective."""
@@ -226,9 +262,31 @@ class Newton:
         return float(np.sqrt(square)), force
 
     def bend_guess(self, v: Array, guess: Array) -> None:
-        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs; collective."""
-        if self._arcs is not None:
-            guess[:] = v + self._arcs.bend(v, guess - v, strains=False)[0]
+        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs: of all ways to expect that to
+        the least energy; collective.
+        """
+        integrator = self._equations.integrator
+        if self._arcs is None or not isinstance(integrator, Static):
+            return
+        least, ways = np.inf, [guess - v, *(way / integrator.pseudo for way in integrator.others)]
+        for way in ways:
+            there = v + self._arcs.bend(v, way, strains=False)[0]
+            self._equations.prescribe(there)
+            energy = self._equations.objective(there)[0] if len(ways) > 1 else 0.0
+            if energy < least:
+                least, guess[:] = energy, there
+
+    def tangent(self, force: Array) -> tuple[Array | None, int]:
+        """See `Stepper.tangent`."""
+        if self._arcs is None or self._reach == 0.0:
+            return None, 0
+        b, x = self._snes.getSolution().duplicate(), self._snes.getSolution().duplicate()
+        b.setArray(force.ravel())
+        self._ksp.solve(b, x)
+        way = self._reach * self._array(x)
+        b.destroy()
+        x.destroy()
+        return (way if self._ksp.getConvergedReason() > 0 else None), int(self._ksp.getIterationNumber())
 
     def _bend(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let a step y that is taken in full go along arcs, as far as they lead; whether it does."""

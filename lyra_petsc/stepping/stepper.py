@@ -416,6 +416,12 @@ class Stepper:
             self._extrapolation.restore(arrays, numbers.get("extrapolation", {}), time, v)
         self.start(time, step)
 
+    def tangent(self, force: Array) -> tuple[Array | None, int]:
+        """How far (n_owned, 3) [m] a small force (n_owned, 3) [N] leads from where the last solve ended, by
+        the factors it had, if any, and linear iterations; collective.
+        """
+        return self._newton.tangent(force)
+
     @property
     def convergence(self) -> Convergence:
         """The test that ends its nonlinear solves."""

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from physics import grid, rotation, scene_of
 
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.verification.cases.shells import slit_annulus_scene
+from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
 from lyra_petsc.stepping.arcs import FARTHEST, STRAIGHT, Arcs
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -87,9 +87,17 @@ def test_arcs_are_ways_to_second_order(comm: MPI.Comm) -> None:
 
 
 @pytest.mark.parallel(1)
-def test_a_shell_that_turns_far_takes_few_iterations() -> None:
+@pytest.mark.parametrize(
+    ("shell", "most"),
+    [
+        # without tangents 54, with one correction of a step 58, along straight ways 66; the other 42, 53
+        (lambda bench: slit_annulus_scene(bench, 12), 50),  # 46
+        (lambda bench: open_cylinder_scene(bench, 16, "alternating"), 40),  # 36
+    ],
+)
+def test_a_shell_that_turns_far_takes_few_iterations(shell: Any, most: int) -> None:
     bench, step = Bench(MPI.COMM_SELF, exact=False), 1.0 / 15.0
-    content = slit_annulus_scene(bench, 12)[0] | {
+    content = shell(bench)[0] | {
         "gravity": [0, 0, 0],
         "time": {"analysis": "static", "step": step},
         "solver": {"force_tolerance": 1e-6},
@@ -99,4 +107,4 @@ def test_a_shell_that_turns_far_takes_few_iterations() -> None:
         newton = 0
         while not trial.simulation.finished:
             newton += trial.step().newton_iterations
-    assert newton <= 62  # 58; 66 along straight ways
+    assert newton <= most

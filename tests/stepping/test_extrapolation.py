@@ -33,6 +33,18 @@ def test_polynomials_are_gone_on_with(motion: Callable[[float], float], comm: MP
 
 
 @pytest.mark.parallel(2)
+def test_tangents_and_parabolas_are_gone_on_with(comm: MPI.Comm) -> None:
+    extrapolation = Extrapolation(comm)
+    extrapolation.learn(0.0, SHAPE)
+    (tangent,) = extrapolation.along(0.5, 3.0 * SHAPE)
+    np.testing.assert_allclose(tangent, 1.5 * SHAPE)
+    extrapolation.learn(0.2, (1.0 + 0.2 - 4.0 * 0.04) * SHAPE)
+    tangent, parabola = extrapolation.along(0.5, (1.0 - 8.0 * 0.2) * SHAPE)
+    np.testing.assert_allclose(tangent, -0.18 * SHAPE)
+    np.testing.assert_allclose(parabola, (0.5 - 4.0 * 0.25 - 0.2 + 4.0 * 0.04) * SHAPE)
+
+
+@pytest.mark.parallel(2)
 def test_what_jumps_to_and_fro_is_expected_to_stay(comm: MPI.Comm) -> None:
     extrapolation, sign = Extrapolation(comm), 1.0
     for step in range(6):

@@ -17,6 +17,8 @@ class Static(Integrator):
         Pseudo time step [s]: the larger, the closer to equilibrium a solve gets.
     ahead : (n_owned, 3) or None
         Way [m] that the next solve is expected to go; where Newton's method starts.
+    others : list of (n_owned, 3)
+        Other ways [m] that may be better.
     """
 
     name = "static"
@@ -27,6 +29,7 @@ class Static(Integrator):
     def __init__(self) -> None:
         self.pseudo = 1.0
         self.ahead: Array | None = None
+        self.others: list[Array] = []
 
     def stage_after(self, dt: float) -> float:
         return dt
