@@ -102,7 +102,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest"))
+        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -122,8 +122,12 @@ class MidEdge(Elastic):
         membrane = next((term for term in terms if isinstance(term, Membrane)), None)
         if membrane is not None and np.array_equal(membrane.stencil, self.stencil):
             self._membrane, self.stencil = membrane, membrane.stencil
-            own = self.elements.without("material")
-            self.elements = replace(own, stencil=membrane.elements.stencil)
+            own, theirs = self.elements.without("material"), membrane.elements
+            self.elements = replace(own, stencil=theirs.stencil)
+            numbers = own.data["triangle"]
+            if np.array_equal(numbers, theirs.index) and np.array_equal(own.index, theirs.index):
+                data = {**own.data, "triangle": theirs.index}
+                self.elements = replace(self.elements, index=theirs.index, data=data)
 
     @property
     def _material(self) -> Array:
@@ -131,6 +135,17 @@ class MidEdge(Elastic):
         if self._membrane is None:
             return self.elements.data["material"]
         return np.linalg.inv(self._membrane.elements.data["inverse"]).transpose(0, 2, 1)
+
+    @property
+    def _steepest(self) -> Array:
+        """Largest squared gradient (E,) [1/m²] of a barycentric coordinate: one over the smallest height²."""
+        if self._membrane is None:
+            inverse = np.linalg.inv(self._material.transpose(0, 2, 1))
+        else:
+            inverse = self._membrane.elements.data["inverse"]
+        (a, b), (c, d) = inverse.transpose(1, 2, 0)
+        largest: Array = np.maximum(a * a + b * b, c * c + d * d)
+        return np.maximum(largest, (a + c) ** 2 + (b + d) ** 2)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -304,9 +319,8 @@ class MidEdge(Elastic):
         return float(largest_angle(way.ravel(), self.of_edges.places, self.of_edges.length))
 
     def force_scale(self, size: float) -> Array:
-        data = self.elements.data
-        trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
-        scale: Array = trace * size / data["height"] ** 2
+        stiffness = self.elements.data["stiffness"]
+        scale: Array = (stiffness[:, 0] + stiffness[:, 3] + stiffness[:, 5]) * size * self._steepest
         return scale
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
