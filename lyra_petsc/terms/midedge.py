@@ -116,6 +116,7 @@ class MidEdge(Elastic):
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
+        self._at_end: Frames | None = None  # which have followed already
         self._membrane: Membrane | None = None  # of the same triangles
 
     def connect(self, terms: Iterable[Term]) -> None:
@@ -156,8 +157,14 @@ class MidEdge(Elastic):
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:
-        self.forget()  # by other frames directors are others
-        self.frames = self._carried(frozen, x)
+        if frozen is not self._at_end:
+            self.forget()  # by other frames directors are others
+            frozen = self._carried(frozen, x)
+        self.frames = frozen
+
+    def frames_at_end(self, x: Array, frozen: Frames) -> Frames:
+        self._at_end = self._carried(frozen, x)
+        return self._at_end
 
     @property
     def edge_stiffness(self) -> Array:
@@ -277,10 +284,12 @@ class MidEdge(Elastic):
         self._shapes = self._shapes_of = None
 
     def _computed(self, x: Array, frames: Frames) -> Array:
-        angle = x.ravel()[self.of_edges.places] / self.of_edges.length
-        out = np.empty((len(angle), 6))
+        angle = x.ravel()[self.of_edges.places]
+        angle /= self.of_edges.length
         # all at once: NumPy's are several at a time where the processor can
-        directors(x, self.of_edges.ends, *frames, np.cos(angle), np.sin(angle), out)
+        cosine, sine = np.cos(angle), np.sin(angle, out=angle)
+        out = np.empty((len(angle), 6))
+        directors(x, self.of_edges.ends, *frames, cosine, sine, out)
         return out
 
     def energies(self, x: Array, frozen: Frames) -> Array:
