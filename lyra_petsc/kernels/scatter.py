@@ -2,7 +2,7 @@
 
 An element's offsets are those of its pairs of points (0, 0), (0, 1), …, (n − 1, n − 1): twice the number of
 the block that the pair is added to, plus 1 where it is added transposed; negative where others have it. Where
-edges carry unknowns they are those of ``edge_offsets``.
+edges carry unknowns they are those of ``edge_couplings.offsets_of``.
 """
 
 from __future__ import annotations

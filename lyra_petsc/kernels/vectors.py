@@ -244,14 +244,11 @@ def _put_transposed(typing: Any, blocks: Any, k: Any, out: Any, at: Any) -> Any:
 
 
 def _fetch(typing: Any, blocks: Any, k: Any) -> Any:
-    """Let block k come into the caches, or of an array of one dimension nine numbers from k on; there need be
-    no such block.
-    """
-    width = 1 if blocks.ndim == 1 else 9
+    """Let block k come into the caches; there need be no such block."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         code = Code(context, builder, signature, arguments, "blocks k")
-        block = code.at(code.begin("blocks"), code.integer("k"), width)
+        block = code.at(code.begin("blocks"), code.integer("k"), 9)
         for last in (0, 8):  # it may lie on two cache lines
             code.fetch(builder.gep(block, [INDEX(last)]))
         return context.get_dummy_value()

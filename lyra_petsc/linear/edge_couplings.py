@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.kernels.cache import Index, cached
-from lyra_petsc.kernels.edge_offsets import FAR, EdgeOffsets
 from lyra_petsc.kernels.vectors import AHEAD, gather, gather_edges, scatter, scatter_edges
 from lyra_petsc.linear.pattern import MISSING, BlockPattern, begins, block_of, index_type, union
-from lyra_petsc.terms.term import WithEdges
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from lyra_petsc.terms.term import Offsets, WithEdges
 
 
 GROUP = 4
@@ -35,12 +35,6 @@ GROUP = 4
 
 ALIGNED = 4
 """Groups begin where the number of blocks before them would be a multiple of this: at 16 bytes."""
-
-FARTHEST = FAR - 1
-"""Numbers by which a coupling may stand behind the first one of its vertex or edge for a byte to tell."""
-
-CHUNK = 1 << 13
-"""Elements whose offsets are looked up together."""
 
 AHEAD_EDGES = 32
 """Blocks of four edges by which they are fetched before they are used."""
@@ -177,32 +171,21 @@ class EdgeCouplings:
         blocks, groups = flat[: 9 * n_blocks].reshape(-1, 9), flat[first:last].reshape(-1, 3 * GROUP)
         return EdgeValues(blocks, groups, flat[last : last + len(self.numbers.places)].reshape(-1, 1))
 
-    def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> EdgeOffsets:
-        """Where the couplings of elements with edges go; `MISSING` where one has no place."""
-        vertices, edges = elements
-        n, m = vertices.shape[1], edges.shape[1]
-        near = np.empty((len(edges), n * m + m * (m + 1) // 2), dtype=np.uint8)
-        groups, numbers = (of(pattern.n_blocks) for of in (self.first_group, self.first_number))
-        firsts, rows = np.array([groups, numbers, 3 * self.n_vertices]), (pattern.indptr, pattern.columns)
-        none, nothing = np.empty(0, dtype=np.int64), np.empty((0, near.shape[1]), dtype=np.int64)
-        pointers = self.groups.indptr, self.numbers.indptr
-        made = EdgeOffsets(vertices, edges, *pointers, near, none, nothing, firsts)
-        which, far = [none], [nothing]
-        for lo in range(0, len(edges), CHUNK):
-            part = slice(lo, lo + CHUNK)
-            some = WithEdges(vertices[part], edges[part])
-            found = np.empty((len(some.edges), near.shape[1]), dtype=np.int64)
-            _look_up(*rows, *self.groups, *self.numbers, groups, numbers, some.stencil, some.edges, found)
-            begin = made.begins(part)
-            behind = np.concatenate([found[:, : n * m] // 4 - begin[0], found[:, n * m :] - begin[1]], axis=1)
-            own = (some.vertices < self._n).all(axis=1) & (some.edges < 3 * self._n).all(axis=1)
-            own &= (behind <= FARTHEST).all(axis=1)
-            beyond = np.flatnonzero(~own)
-            near[part] = behind
-            near[lo + beyond, 0] = FAR
-            which.append(lo + beyond)
-            far.append(found[beyond])
-        return made._replace(which=np.concatenate(which), far=np.concatenate(far))
+    def offsets_of(self, elements: WithEdges, pattern: BlockPattern) -> Offsets:
+        """Where the couplings (a, b), b ≥ a, of elements go in which b is an edge; edges come after vertices.
+
+        Of a vertex and an edge four times the place of the first of three numbers in the flat form of values,
+        plus how far apart they are, less one; of two edges the place of their number. −1 where other ranks
+        have both.
+        """
+        stencil, m = elements.stencil, elements.edges.shape[1]
+        n = stencil.shape[1] - m
+        first = self.first_group(pattern.n_blocks)
+        kind = index_type(4 * (first + self.n_values))
+        out: Offsets = np.empty((len(stencil), n * m + m * (m + 1) // 2), dtype=kind)
+        rows = pattern.indptr, pattern.columns, *self.groups, *self.numbers
+        _look_up(*rows, first, self.first_number(pattern.n_blocks), stencil, elements.edges, out)
+        return out
 
     # -- prescribed unknowns -------------------------------------------------------------------------
 

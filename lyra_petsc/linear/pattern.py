@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.kernels.cache import cached
-from lyra_petsc.kernels.edge_offsets import EdgeOffsets
-from lyra_petsc.terms.term import Across, Coupling, Couplings, Offsets, WithEdges
+from lyra_petsc.terms.term import Across, Coupling, Couplings, WithEdges
 
 if TYPE_CHECKING:
     from lyra_petsc.linear.edge_couplings import EdgeCouplings
+
+Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 LARGEST_INT32 = 2**31 - 1
 
@@ -94,10 +95,10 @@ class BlockPattern:
         The first block of such a row is the diagonal one.
     columns : (n_blocks,) int32
         Local column of each block, ascending within a row.
-    offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks, or EdgeOffsets
+    offsets : dict of name → (E, n (n + 1) / 2) int32, int64 where there are too many blocks
         Where the couplings (a, b), b ≥ a, of an element go, as (0, 0), (0, 1), …, (n − 1, n − 1): twice the
         index of the block, plus 1 where its values are those of (a, b) transposed; −1 where other ranks have
-        both rows. Of `Across` (E,), of `WithEdges` see ``edge_offsets``.
+        both rows. Of `Across` (E,). Of `WithEdges` see ``edge_couplings.offsets_of``.
     edges : dict of name → WithEdges
         Elements that couple edges.
     edge_couplings : EdgeCouplings or None
@@ -128,7 +129,7 @@ class BlockPattern:
         found = [np.empty(0, dtype=np.int64)]
         for stencil in stencils:
             one, other = (stencil[:, side] for side in np.array(_pairs(stencil)).T.reshape(2, -1))
-            at = np.flatnonzero(self._offsets_of(stencil).ravel() == MISSING)
+            at = np.flatnonzero(self.offsets_of(stencil).ravel() == MISSING)
             found.append(_keys(one.ravel()[at], other.ravel()[at], n_local))
         return union(*found)
 
@@ -146,14 +147,11 @@ class BlockPattern:
         if isinstance(coupling, WithEdges):
             assert self.edge_couplings is not None
             return self.edge_couplings.offsets_of(coupling, self)
-        found = self._offsets_of(_stencil(coupling))
-        return found[:, 1].copy() if isinstance(coupling, Across) else found
-
-    def _offsets_of(self, stencil: NDArray[np.int32]) -> NDArray[Any]:
+        stencil = _stencil(coupling)
         n = stencil.shape[1]
-        out = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
+        out: Offsets = np.empty((len(stencil), n * (n + 1) // 2), dtype=index_type(2 * self.n_blocks))
         _look_up(self.indptr, self.columns, stencil, out)
-        return out
+        return out[:, 1].copy() if isinstance(coupling, Across) else out
 
     def extended(self, more: Ints, n_local: int) -> tuple[BlockPattern, Ints]:
         """The pattern with further blocks ``more``, keys as `missing` gives them, among more ghosts.
@@ -172,7 +170,7 @@ class BlockPattern:
         made.edges, made.edge_couplings, made.n_diagonal = self.edges, self.edge_couplings, self.n_diagonal
         kind = index_type(2 * len(keys))
         for name, offsets in self.offsets.items():
-            if isinstance(offsets, EdgeOffsets):
+            if name in self.edges:
                 made.offsets[name] = made.offsets_of(self.edges[name])
                 continue
             alike = [other for other in made.offsets if self.offsets[other] is offsets]

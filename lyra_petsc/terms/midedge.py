@@ -321,7 +321,7 @@ class MidEdge(Elastic):
         data, shape = self.elements.data, self.shape(x, frozen)
         numbers = self.of_edges.of_triangles, data["sign"], shape
         constants = *self._constants, self.of_edges.length
-        at = offsets[f"{self.name} vertices"], *offsets[self.name]
+        at = offsets[f"{self.name} vertices"], offsets[self.name]
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
     def largest_turn(self, way: Array) -> float:

@@ -32,7 +32,6 @@ import math
 import numpy as np
 
 from lyra_petsc.kernels.cache import Index
-from lyra_petsc.kernels.edge_offsets import find_of_triangles
 from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_corners, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
@@ -369,12 +368,12 @@ def _add_column(flat, at, column, factor):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _add_columns(flat, offsets, slot, edge, one, two, factor):  # type: ignore[no-untyped-def]
+def _add_columns(flat, offsets, e, edge, one, two, factor):  # type: ignore[no-untyped-def]
     """Add factor times the couplings of the corners 1 and 2 with an edge, and minus their sum of 0."""
     both = one[0] + two[0], one[1] + two[1], one[2] + two[2]
-    _add_column(flat, offsets[Index(slot + edge)], both, -factor)
-    _add_column(flat, offsets[Index(slot + 3 + edge)], one, factor)
-    _add_column(flat, offsets[Index(slot + 6 + edge)], two, factor)
+    _add_column(flat, offsets[e, edge], both, -factor)
+    _add_column(flat, offsets[e, 3 + edge], one, factor)
+    _add_column(flat, offsets[e, 6 + edge], two, factor)
 
 
 @kernel(inline="always")
@@ -385,14 +384,15 @@ def _add_number(flat, at, value):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
-def _fetch(e, corners, offsets, slot, values, flat):  # type: ignore[no-untyped-def]
-    """Let what triangle e is added to come into the caches."""
+def _fetch_ahead(e, corners, offsets, values):  # type: ignore[no-untyped-def]
+    """Let what a later triangle is added to come into the caches, as if it were blocks (3 × 3)."""
+    later = min(e + AHEAD, offsets.shape[0] - 1)
     for pair in range(6):
-        fetch(values, corners[e, pair] >> 1)
+        fetch(values, corners[later, pair] >> 1)
     for pair in range(9):
-        fetch(flat, offsets[Index(slot + pair)] >> 2)
+        fetch(values, (offsets[later, pair] >> 2) // 9)
     for pair in (9, 12, 14):
-        fetch(flat, offsets[Index(slot + pair)])
+        fetch(values, offsets[later, pair] // 9)
 
 
 @kernel(inline="always")
@@ -543,33 +543,18 @@ def add_hessian(  # type: ignore[no-untyped-def]
     length,
     weight,
     corners,
-    vertices,
-    places,
-    first_group,
-    first_number,
-    near,
-    which,
-    far,
-    firsts,
+    offsets,
     values,
 ):
-    """Add weight (E,) times the Hessians to block rows, where offsets of the couplings of ``corners`` (E, 6)
-    and those with edges, ``edge_offsets.EdgeOffsets``, say.
+    """Add weight (E,) times the Hessians to block rows, where offsets of the couplings of corners (E, 6) and
+    of those with edges (E, 15) say.
 
     A translation does nothing, so that of the corners only the second and the third are looked at.
     """
     flat, exact, batch = values.reshape(-1), 1.0 - blend, np.empty(95 * BATCH)
-    last, offsets = stencil.shape[0] - 1, np.empty(15 * (BATCH + AHEAD), np.int64)
-    now, ahead = 15 * BATCH, 15 * AHEAD
-    where = vertices, places, first_group, first_number, near, which, far, firsts
-    find_of_triangles(*where, 0, AHEAD, offsets[now:])
     for e in range(stencil.shape[0]):
-        i, slot = Index(e % BATCH), 15 * (e % BATCH)
-        if i == 0:
-            for k in range(ahead):
-                offsets[k] = offsets[now + k]
-            find_of_triangles(*where, e + AHEAD, BATCH, offsets[ahead:])
-        _fetch(min(e + AHEAD, last), corners, offsets, slot + ahead, values, flat)
+        _fetch_ahead(e, corners, offsets, values)
+        i = Index(e % BATCH)
         if i == 0:
             _load(x, stencil, edges, shape, e, batch)
             _load_constants(edges, sign, stiffness, rest, friction, length, e, batch)
@@ -605,12 +590,12 @@ def add_hessian(  # type: ignore[no-untyped-def]
             (b11, b12, b22), one, two, (h00, h01, h02, h11, h12, h22) = hessian
         factor = weight[e]
         add_corners(values, corners, e, (_times(factor, b11), _times(factor, b12), _times(factor, b22)))
-        _add_columns(flat, offsets, slot, 0, one[0], two[0], factor)
-        _add_columns(flat, offsets, slot, 1, one[1], two[1], factor)
-        _add_columns(flat, offsets, slot, 2, one[2], two[2], factor)
-        _add_number(flat, offsets[Index(slot + 9)], factor * h00)
-        _add_number(flat, offsets[Index(slot + 10)], factor * h01)
-        _add_number(flat, offsets[Index(slot + 11)], factor * h02)
-        _add_number(flat, offsets[Index(slot + 12)], factor * h11)
-        _add_number(flat, offsets[Index(slot + 13)], factor * h12)
-        _add_number(flat, offsets[Index(slot + 14)], factor * h22)
+        _add_columns(flat, offsets, e, 0, one[0], two[0], factor)
+        _add_columns(flat, offsets, e, 1, one[1], two[1], factor)
+        _add_columns(flat, offsets, e, 2, one[2], two[2], factor)
+        _add_number(flat, offsets[e, 9], factor * h00)
+        _add_number(flat, offsets[e, 10], factor * h01)
+        _add_number(flat, offsets[e, 11], factor * h02)
+        _add_number(flat, offsets[e, 12], factor * h11)
+        _add_number(flat, offsets[e, 13], factor * h12)
+        _add_number(flat, offsets[e, 14], factor * h22)

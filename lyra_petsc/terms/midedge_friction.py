@@ -135,7 +135,7 @@ class MidEdgeFriction(Elastic):
         length = self._sheet.of_edges.length
         constants = *self._constants(self._sliding(x, frozen)), length
         numbers = self._edges, data["sign"], shape
-        at = offsets[f"{self.name} vertices"], *offsets[self.name]
+        at = offsets[f"{self.name} vertices"], offsets[self.name]
         midedge_energy.add_hessian(x, self.stencil, blend, *numbers, *constants, weight, *at, values)
 
     def force_scale(self, size: float) -> Array:

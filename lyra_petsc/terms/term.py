@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
-from lyra_petsc.kernels.edge_offsets import EdgeOffsets
 from lyra_petsc.kernels.scatter import add_elements, add_mixed_elements
 from lyra_petsc.mesh.elements import Elements
 
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from lyra_petsc.terms.one_sided import Springs
     from lyra_petsc.terms.registry import Registration
 
-Offsets = NDArray[np.int32] | NDArray[np.int64] | EdgeOffsets
+Offsets = NDArray[np.int32] | NDArray[np.int64]
 
 CHUNK_VALUES = 32_768
 """Scalars of element Hessians computed before they are added to the matrix: they stay in cache."""
@@ -168,24 +167,26 @@ class Term(ABC):
         weight: Array,
         offsets: Mapping[str, Offsets],
         values: Array,
+        rows: Ints | slice = slice(None),
     ) -> None:
-        """Add weight × Hessians of elements, each with its own, to block rows; ``fill`` computes the lo-th to
-        hi-th.
+        """Add weight × Hessians of elements ``rows``, each with its own, to block rows; ``fill`` computes the
+        lo-th to hi-th.
         """
-        at, n = offsets[self.name], self.stencil.shape[1]
+        at, stencil = offsets[self.name][rows], self.stencil[rows]
+        n = stencil.shape[1]
         m = 0 if self.edges is None else self.edges.shape[1]
         shape = (n, n, 3, 3) if self.edges is None else (3 * n + m, 3 * n + m)
         chunk = max(1, CHUNK_VALUES // int(np.prod(shape)))
-        buffer = np.empty((min(chunk, self.n_elements), *shape))
-        for lo in range(0, self.n_elements, chunk):
-            hi = min(lo + chunk, self.n_elements)
+        buffer = np.empty((min(chunk, len(stencil)), *shape))
+        for lo in range(0, len(stencil), chunk):
+            hi = min(lo + chunk, len(stencil))
             blocks = buffer[: hi - lo]
             fill(lo, hi, blocks)
-            if isinstance(at, EdgeOffsets):
-                corners = offsets[f"{self.name} vertices"][lo:hi]
-                add_mixed_elements(weight[lo:hi], blocks, n, corners, at.of(lo, hi), values)
-            else:
+            if self.edges is None:
                 add_elements(weight[lo:hi], blocks, at[lo:hi], values)
+            else:
+                corners = offsets[f"{self.name} vertices"][rows][lo:hi]
+                add_mixed_elements(weight[lo:hi], blocks, n, corners, at[lo:hi], values)
 
 
 class Dashpots(NamedTuple):

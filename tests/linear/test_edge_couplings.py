@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from oracle import expanded
 
 from lyra_petsc.kernels.scatter import add_mixed_elements
-from lyra_petsc.linear import edge_couplings
 from lyra_petsc.linear.block_rows import BlockRows
 from lyra_petsc.linear.edge_couplings import EdgeCouplings, ProductWithEdges
 from lyra_petsc.linear.edge_sweeps import SweepsWithEdges, room
@@ -35,35 +33,10 @@ def mixed_rows(*, definite: bool = False) -> tuple[BlockPattern, np.ndarray, np.
     half = RNG.normal(size=(40, 12, 12))
     blocks = half @ half.transpose(0, 2, 1) if definite else half + half.transpose(0, 2, 1)
     values = np.zeros((pattern.n_stored, 3, 3))
-    offsets = pattern.offsets["corners"], pattern.offsets["mixed"].of(0, len(blocks))
-    add_mixed_elements(np.ones(40), blocks, 3, *offsets, values)
+    add_mixed_elements(np.ones(40), blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
     BlockRows(pattern).add_diagonal(np.full(N_OWNED, 2.0), values)
     dense = expanded(pattern, values, N_LOCAL).reshape(3 * N_OWNED, 3 * N_LOCAL)
     return pattern, values, dense
-
-
-def test_offsets_tell_where_couplings_stand(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In bytes, but of elements that touch ghosts or whose couplings are too far apart for one."""
-    pattern, values, dense = mixed_rows()
-    offsets, flat = pattern.offsets["mixed"], values.reshape(-1)
-    near = np.setdiff1d(np.arange(40), offsets.which)
-    assert 3 < len(near) < 37
-    assert (offsets.edges[near] < 3 * N_OWNED).all()
-    found = offsets.of(0, 40)
-    for e in range(40):
-        for a, vertex in enumerate(offsets.vertices[e]):
-            for b, place in enumerate(offsets.edges[e]):
-                at = found[e, 3 * a + b]
-                assert (at < 0) == (vertex >= N_OWNED and place >= 3 * N_OWNED)
-                if vertex < N_OWNED:
-                    column = flat[(at >> 2) + np.arange(3) * ((at & 3) + 1)]
-                    np.testing.assert_allclose(column, dense[3 * vertex : 3 * vertex + 3, place])
-    monkeypatch.setattr(edge_couplings, "FARTHEST", 20)
-    monkeypatch.setattr(edge_couplings, "CHUNK", 7)
-    coupling = WithEdges(offsets.vertices, offsets.edges)
-    farther = couplings_of(pattern).offsets_of(coupling, pattern)
-    assert len(offsets.which) < len(farther.which) < 40
-    np.testing.assert_array_equal(farther.of(0, 40), found)
 
 
 def couplings_of(pattern: BlockPattern) -> EdgeCouplings:

@@ -168,8 +168,7 @@ def test_sums_of_elements_with_unknowns_of_edges(n_owned: int) -> None:
     blocks = rng.random((3, 11, 11))
     blocks += blocks.transpose(0, 2, 1)
     weight, values = rng.random(3), np.zeros((pattern.n_stored, 3, 3))
-    offsets = pattern.offsets["corners"], pattern.offsets["mixed"].of(0, len(blocks))
-    add_mixed_elements(weight, blocks, 3, *offsets, values)
+    add_mixed_elements(weight, blocks, 3, pattern.offsets["corners"], pattern.offsets["mixed"], values)
     expected = np.zeros((24, 24))
     for e in range(3):
         places = np.concatenate([(3 * vertices[e][:, None] + np.arange(3)).ravel(), edges[e]])
