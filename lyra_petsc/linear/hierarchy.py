@@ -190,10 +190,11 @@ class Hierarchy:
         ------
         values : (n_blocks, 3, 3)
         free : (n_owned, 3)
-            0 for coordinates that take no part in interpolation, 1 for others.
+            0 for coordinates that take no part in interpolation, 1 for others; of the finest level those of
+            vertices alone, as edges take none.
         """
         finest = self.levels[0]
-        free = np.where(held[: finest.points.n_owned], 0.0, 1.0)
+        free = np.where(held[: finest.pattern.n_diagonal], 0.0, 1.0)
         below: tuple[Array, Array] | None = None
         if self._below is not None and not self._spare and finest.galerkin is not None:
             below = finest.galerkin.project(self._below.values(held, self._room_below), free)

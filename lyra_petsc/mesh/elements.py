@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lyra_petsc.arrays import Array, Ints
+from lyra_petsc.arrays import Ints
 
 
 @dataclass
@@ -32,7 +33,7 @@ class Elements:
     """
 
     stencil: NDArray[np.int32] | Ints
-    data: Mapping[str, Array] = field(default_factory=dict)
+    data: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     n_owned: int = -1
     index: NDArray[np.int32] | Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     edges: NDArray[np.int32] | Ints | None = None

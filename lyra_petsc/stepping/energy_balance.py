@@ -19,6 +19,8 @@ from lyra_petsc.terms.term import Pulling
 
 REDUCTIONS = {"sum": MPI.SUM, "min": MPI.MIN, "max": MPI.MAX}
 
+ROWS = 1 << 13
+"""Rows whose works are computed together."""
 
 ENERGIES = ("membrane_energy", "bending_energy", "potential_energy")
 """Columns of history.csv that energies of registered terms are added to; others come after these."""
@@ -75,6 +77,12 @@ class Works:
     damped: float
 
 
+def _work(force: Array, x_before: Array, x: Array) -> float:
+    """Of forces (n, 3) [N] on the way to x; there is no room for all of the ways."""
+    x, parts = x[: len(force)], (slice(lo, lo + ROWS) for lo in range(0, len(force), ROWS))
+    return sum(float(np.vdot(force[rows], x[rows] - x_before[rows])) for rows in parts)
+
+
 class Ledger:
     """Keeps the budget over the steps; collective.
 
@@ -113,7 +121,7 @@ class Ledger:
         n = system.points.n_owned
         columns = [*ENERGIES, *self._more]
         local = np.zeros(len(columns) + 1)
-        local[-1] = 0.5 * float(np.sum(system.mass[:, None] * system.v[:n] ** 2))
+        local[-1] = 0.5 * float(np.einsum("i,ij,ij", system.mass, system.v[:n], system.v[:n]))
         self._moving = 0.0
         for term in system.active.elastic:
             entry = term.registration
@@ -142,6 +150,7 @@ class Ledger:
     def record(self, x_before: Array) -> Budget:
         """Add the works of the step just accepted: its stage's forces times the way from x (n_owned, 3)."""
         system = self._system
+        system.end_frames()
         external, damping, damped = self._external(system.forces_at_stage())
         # targets that move with a handle let it work on the sheet
         if self._pull is None:
@@ -154,11 +163,10 @@ class Ledger:
                 for (at0, pull0), (at, pull) in zip(before, self._targets, strict=True)
             )
         turned += system.pushed() + system.turn_targets_to_end()
-        moved = system.x[: len(x_before)] - x_before
-        local = np.array([float(np.vdot(external, moved)) + turned, damped])
+        local = np.array([_work(external, x_before, system.x) + turned, damped])
         local[1] += sum(term.heat(system.x, system.active.frozen[term]) for term in system.active.sheet)
         local[1] += system.damped.heat if system.damped else 0.0
-        del external, moved  # energies need the room
+        del external  # energies need the room
         work, heat = system.points.summed(*local)
         self.budget.external_work += float(work)
         self.budget.dissipation += float(heat)

@@ -332,7 +332,8 @@ def _local(scene: Scene, outline: Outline, part: Part, mesh: Mesh | None) -> Pro
             entry, name = registered(term.registration.coarse), f"coarse {term.name}"
             # which are for forces and files, as the angles at rest, that regularised Hessians do not know
             elements = part.elements[name].without("length", "rest_height")
-            elements = replace(elements, data={**elements.data, "rest_angle": elements.data["k"]})
+            data = {**elements.data, "rest_angle": elements.data["k"]}
+            elements = replace(elements, data=data, index=np.empty(0, dtype=np.int32))
             coarse = cast("Elastic", made(entry, elements, scene, on_vertices))
             coarse.registration = replace(entry, name=name)  # a sheet beside it may have this term
             system.active.coarse[term] = coarse

@@ -316,7 +316,7 @@ class Sensitivities:
         ``started`` with others, has turned to.
         """
         pairs = zip(_edged(system), _edged(self._system), started, strict=True)
-        used = [(mine, self._system.active.frozen[theirs], start) for mine, theirs, start in pairs]
+        used = [(mine, self._system.frozen_in_step[theirs], start) for mine, theirs, start in pairs]
         found: dict[Term, Any] = {mine: mine.frames if now is start else now for mine, now, start in used}
         if found:
             system.active.refreeze(found)

@@ -123,6 +123,7 @@ class StageEquations:
 
     refused_way: RefusedDisplacement | None = None
     touches = False
+    _frozen_before: Mapping[Term, Any] | None = None
     _may_begin: Array | None = None  # where ``may_move`` found a way to
 
     def __init__(
@@ -144,11 +145,10 @@ class StageEquations:
         self.prescribed = Prescribed(discretisation, held, self.reference)
         self.applied = AppliedLoads(active.loads, self.points)
         self._least = self._least_stiffness()
-        # moving targets change the forces at one and the same place; where a step is one linear solve, and
-        # directors are measured anew in each, no forces are asked for twice
         internal, once = partial(self._sum, active.sheet), integrator.lagged_loads
-        changes = bool(active.moving) or bool(active.edged and once and integrator.moves)
-        self._internal = internal if changes else Remembered(internal)
+        # moving targets change the forces at one and the same place
+        self._internal = internal if active.moving else Remembered(internal)
+        self._frames: dict[Term, Any] = {}  # by which these are known at the end of a step
         self.damping = Damping(discretisation, active.elastic, moves=integrator.moves, once=once)
         last = (self._internal, self.damping.product) if once else ()
         self._asked_once = [each for each in last if isinstance(each, Remembered)]
@@ -263,8 +263,9 @@ class StageEquations:
         """Geometry, targets and loads that stay as they are at time ``at`` [s], the stage's."""
         x = self._frozen_positions(at)
         self.active.freeze(UpcomingStep(self.t0, self.t1, at, x, self.reference.at))
-        if self.active.edged and self.integrator.moves:  # by frames that have followed, forces are others
-            self.forget_forces()
+        frozen, moves, self._frozen_before = self.active.frozen, self.integrator.moves, None
+        if moves and any(frozen[term] is not self._frames.get(term) for term in self.active.edged):
+            self.forget_forces()  # by frames that have followed, they are others
         self.objective.begin_step()
         if self.integrator.moves or self.applied.given is None:
             lagged = self.active.viscous and self.integrator.lagged_loads
@@ -385,6 +386,22 @@ class StageEquations:
         return float(np.sqrt(self.points.summed(float(np.vdot(moments, moments)))[0]))
 
     # -- unknowns of edges at the end of a step ----------------------------------------------------
+
+    def end_frames(self) -> None:
+        """Let frames of edges follow to the end of a step that is one linear solve: so the forces there are
+        those that the next one begins with.
+        """
+        edged, frozen = self.active.edged, self.active.frozen
+        if edged and self.integrator.lagged_loads and self.integrator.moves:
+            self.active.refreeze({term: term.frames_at_end(self.x, frozen[term]) for term in edged})
+            self._frozen_before = frozen
+            self.forget_forces()
+            self._frames = {term: self.active.frozen[term] for term in edged}
+
+    @property
+    def frozen_in_step(self) -> Mapping[Term, Any]:
+        """What terms had frozen in the step, before frames of edges followed to its end."""
+        return self.active.frozen if self._frozen_before is None else self._frozen_before
 
     def turn_frames(self) -> bool:
         """Let the frames of edges that have turned far follow to where the equations were last evaluated;

@@ -102,7 +102,7 @@ class MidEdge(Elastic):
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest"))
+        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -116,14 +116,19 @@ class MidEdge(Elastic):
         self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
+        self._at_end: Frames | None = None  # which have followed already
         self._membrane: Membrane | None = None  # of the same triangles
 
     def connect(self, terms: Iterable[Term]) -> None:
         membrane = next((term for term in terms if isinstance(term, Membrane)), None)
         if membrane is not None and np.array_equal(membrane.stencil, self.stencil):
             self._membrane, self.stencil = membrane, membrane.stencil
-            own = self.elements.without("material")
-            self.elements = replace(own, stencil=membrane.elements.stencil)
+            own, theirs = self.elements.without("material"), membrane.elements
+            self.elements = replace(own, stencil=theirs.stencil)
+            numbers = own.data["triangle"]
+            if np.array_equal(numbers, theirs.index) and np.array_equal(own.index, theirs.index):
+                data = {**own.data, "triangle": theirs.index}
+                self.elements = replace(self.elements, index=theirs.index, data=data)
 
     @property
     def _material(self) -> Array:
@@ -131,6 +136,17 @@ class MidEdge(Elastic):
         if self._membrane is None:
             return self.elements.data["material"]
         return np.linalg.inv(self._membrane.elements.data["inverse"]).transpose(0, 2, 1)
+
+    @property
+    def _steepest(self) -> Array:
+        """Largest squared gradient (E,) [1/m²] of a barycentric coordinate: one over the smallest height²."""
+        if self._membrane is None:
+            inverse = np.linalg.inv(self._material.transpose(0, 2, 1))
+        else:
+            inverse = self._membrane.elements.data["inverse"]
+        (a, b), (c, d) = inverse.transpose(1, 2, 0)
+        largest: Array = np.maximum(a * a + b * b, c * c + d * d)
+        return np.maximum(largest, (a + c) ** 2 + (b + d) ** 2)
 
     # -- frames ------------------------------------------------------------------------------------
 
@@ -141,8 +157,14 @@ class MidEdge(Elastic):
         return self.frames
 
     def accept(self, x: Array, frozen: Frames) -> None:
-        self.forget()  # by other frames directors are others
-        self.frames = self._carried(frozen, x)
+        if frozen is not self._at_end:
+            self.forget()  # by other frames directors are others
+            frozen = self._carried(frozen, x)
+        self.frames = frozen
+
+    def frames_at_end(self, x: Array, frozen: Frames) -> Frames:
+        self._at_end = self._carried(frozen, x)
+        return self._at_end
 
     @property
     def edge_stiffness(self) -> Array:
@@ -260,10 +282,12 @@ class MidEdge(Elastic):
         self._shapes = self._shapes_of = None
 
     def _computed(self, x: Array, frames: Frames) -> Array:
-        angle = x.ravel()[self.of_edges.places] / self.of_edges.length
-        out = np.empty((len(angle), 6))
+        angle = x.ravel()[self.of_edges.places]
+        angle /= self.of_edges.length
         # all at once: NumPy's are several at a time where the processor can
-        directors(x, self.of_edges.ends, *frames, np.cos(angle), np.sin(angle), out)
+        cosine, sine = np.cos(angle), np.sin(angle, out=angle)
+        out = np.empty((len(angle), 6))
+        directors(x, self.of_edges.ends, *frames, cosine, sine, out)
         return out
 
     def energies(self, x: Array, frozen: Frames) -> Array:
@@ -302,9 +326,8 @@ class MidEdge(Elastic):
         return float(largest_angle(way.ravel(), self.of_edges.places, self.of_edges.length))
 
     def force_scale(self, size: float) -> Array:
-        data = self.elements.data
-        trace = data["stiffness"][:, [0, 3, 5]].sum(axis=1)
-        return trace * size / data["height"] ** 2
+        stiffness = self.elements.data["stiffness"]
+        return (stiffness[:, 0] + stiffness[:, 3] + stiffness[:, 5]) * size * self._steepest
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
         """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""

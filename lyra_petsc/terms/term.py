@@ -494,6 +494,10 @@ class Elastic(Term):
         """
         return None
 
+    def frames_at_end(self, x: Array, frozen: Any) -> Any:
+        """What ``frozen`` is to be from the end x of a step on, which ``accept`` then leaves as it is."""
+        return frozen
+
     def followed(self, x: Array, way: Array, frozen: Any, along: Array | None = None) -> tuple[Ints, Array]:
         """Places of edges whose unknowns go far on the way (n_local, 3) [m] from x, and better ways, (n,).
 

@@ -6,6 +6,7 @@ import weakref
 from typing import Any
 
 import numpy as np
+import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 from physics import grid, scene_of
@@ -50,4 +51,34 @@ def test_a_new_state_leaves_the_arrays_of_the_one_before() -> None:
     state.set(x + 1.0, state.v)
     np.testing.assert_array_equal(x, kept)
     np.testing.assert_array_equal(state.x, kept + 1.0)
+    end(simulation)
+
+
+def test_forces_at_the_end_of_a_linear_step_serve_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are computed once a step, by frames that have followed, and anew after a step that was refused."""
+    simulation = hanging(4)
+    simulation.step()
+    term, system = simulation.problem.terms["midedge"], simulation.problem.system
+    asked: list[int] = []
+    compute = term.add_gradient
+    monkeypatch.setattr(term, "add_gradient", lambda *given: (asked.append(1), compute(*given)))
+    for _ in range(3):
+        asked.clear()
+        simulation.step()
+        assert len(asked) == 1
+        remembered = system.pull_of(system.active.sheet, system.x).copy()
+        assert len(asked) == 1
+        system.forget_forces()
+        np.testing.assert_allclose(
+            remembered, system.pull_of(system.active.sheet, system.x), rtol=0.0, atol=1e-15
+        )
+        assert term.frames is system.active.frozen[term]
+    assert simulation.guard is not None
+    verdicts, stands = iter([False, True]), simulation.guard.stands
+    monkeypatch.setattr(
+        simulation.guard, "stands", lambda *given, **how: stands(*given, **how) and next(verdicts)
+    )
+    asked.clear()
+    assert simulation.step().rejected == 1
+    assert len(asked) == 3
     end(simulation)
