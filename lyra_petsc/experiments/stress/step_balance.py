@@ -49,8 +49,8 @@ from lyra_petsc.terms.term import Elastic, UpcomingStep
 EPSILON = 10.0 * float(np.finfo(np.float64).eps)
 """Relative round-off of a sum, as in `residual_roundoff`."""
 
-MOST_PANELS = 16
-"""Of the integral along the hinges' way."""
+MOST_PANELS, NEAR_PANELS = 16, 256
+"""Of the integral along the hinges' way, and that of contact, which begins with a panel for half the gap."""
 
 SAMPLES, WIDEST_TURN = 9, 1.0
 """Points of that way, and the turn [rad] between two of them beyond which a hinge may have jumped: one that
@@ -78,7 +78,7 @@ def energy(terms: Terms, x: Array) -> float:
 def force_along(
     comm: MPI.Comm, n: int, terms: Terms, turned: Terms, x0: Array, dx: Array, *, enough: float
 ) -> tuple[float, bool]:
-    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether hinges had their part taken from energies; collective.
+    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J], and whether some of it is from energies; collective.
 
     Exact for the membrane, whose energy is a quartic along a line; refined until it stands for the rest.
 
@@ -95,26 +95,42 @@ def force_along(
         Error [J] that does not matter.
     """
     smooth: Terms = {term: frozen for term, frozen in terms.items() if isinstance(term, Membrane)}
-    bent = {term: frozen for term, frozen in terms.items() if term not in smooth}
+    near = {term: frozen for term, frozen in terms.items() if term.registration.neighbours}
+    bent = {term: frozen for term, frozen in terms.items() if term not in smooth and term not in near}
 
-    def integral(which: Terms, panels: int, points: int) -> float:
-        return float(comm.allreduce(_panels(which, n, x0, dx, panels, points)))
-
-    exact = integral(smooth, 1, 2)
-    if not comm.allreduce(len(bent)):
-        return exact, False
-    widest = math.inf if turned else _widest_turn(bent, x0, dx)
-    if comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN:
-        # the nearest points of contact go from edge to triangle, where second derivatives leap
-        panels = 16 if any(term.registration.neighbours for term in bent) else 1
-        most, before = MOST_PANELS * panels, integral(bent, panels, 5)
+    def refined(which: Terms, panels: int, most: int) -> float | None:
+        """The integral of these terms' forces, from so many panels on; None if it does not stand."""
+        if panels >= most:
+            return None
+        before = _integral(comm, which, n, x0, dx, panels, 5)
         while panels < most:
             panels *= 2
-            now = integral(bent, panels, 5)
+            now = _integral(comm, which, n, x0, dx, panels, 5)
             if abs(now - before) <= max(enough, EPSILON * abs(now)):
-                return exact + now, False
+                return now
             before = now
-    return exact + float(comm.allreduce(energy(bent, x0 + dx) - energy({**bent, **turned}, x0))), True
+        return None
+
+    value, followed = _integral(comm, smooth, n, x0, dx, 1, 2), True
+    widest = math.inf if turned else _widest_turn(bent, x0, dx)
+    follows = comm.allreduce(widest, op=MPI.MAX) < WIDEST_TURN
+    # a barrier is as wide as its gap; second derivatives leap where nearest points go from edge to triangle
+    farthest, skin = largest(comm, dx[:n]), min((term.skin for term in near), default=0.0)
+    panels = max(MOST_PANELS, math.ceil(farthest / skin)) if skin > 0.0 else MOST_PANELS
+    for which, known, first, most in ((bent, follows, 1, MOST_PANELS), (near, True, panels, NEAR_PANELS)):
+        if which:
+            found = refined(which, first, most) if known else None
+            if found is None:
+                then = {term: turned.get(term, frozen) for term, frozen in which.items()}
+                change = energy(which, x0 + dx) - energy(then, x0)
+                found, followed = float(comm.allreduce(change)), False
+            value += found
+    return value, not followed
+
+
+def _integral(comm: MPI.Comm, terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
+    """∫₀¹ ∇E(x0 + s Δx)·Δx ds [J] by Gauss's rule on equal panels; collective."""
+    return float(comm.allreduce(_panels(terms, n, x0, dx, panels, points)))
 
 
 def _panels(terms: Terms, n: int, x0: Array, dx: Array, panels: int, points: int) -> float:
@@ -167,7 +183,8 @@ class StepBalance:
     spin, spin_tolerance : float
         Of Σ (x' − centre) × (m Δv) − Δt Σ torques.
     jumped : bool
-        Hinges turned too far to follow; their part of the bracket is from their energies.
+        Hinges turned too far to follow, or parts in contact went far over the gap; their part of the bracket
+        is from their energies.
     """
 
     change: float
@@ -667,7 +684,10 @@ def identity(record: Record) -> Verdict:
     )
     jumped = sum(balance.jumped for balance in record.balances)
     if jumped:
-        words += f"; in {jumped} steps hinges turned too far or jumped, and count by their energies"
+        words += (
+            f"; in {jumped} steps hinges turned too far or jumped, or contact came from too far, and count "
+            "by their energies"
+        )
     return Verdict(abs(worst.defect) <= worst.tolerance, words)
 
 

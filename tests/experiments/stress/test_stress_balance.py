@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,14 @@ def test_a_fast_jump_of_hinges_is_noticed(comm: MPI.Comm) -> None:
     outcome = run_case(comm, case, Setting(sheet(10), False, Scope.QUICK))
     assert any(balance.jumped for balance in outcome.record.balances)
     assert "jumped" in outcome.verdicts["energy"].words
+    assert outcome.failures == {}
+
+
+def test_a_balance_does_not_miss_a_narrow_barrier(comm: MPI.Comm) -> None:
+    """Of steps thousands of gaps long."""
+    [case] = selected(["contact-gap-1e-5-10ms"], Scope.USUAL)
+    outcome = run_case(comm, replace(case, steps=9), Setting(sheet(10), False, Scope.QUICK))
+    assert any(balance.jumped for balance in outcome.record.balances)
     assert outcome.failures == {}
 
 

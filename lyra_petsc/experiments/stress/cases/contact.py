@@ -234,6 +234,10 @@ contact = family(
         )
         for gap, level in (("1e-3", FULL), ("1e-4", USUAL), ("1e-5", FULL))
     ),
+    _case(
+        "contact-gap-1e-5-10ms", "gap 1e-5 m, Δt 10 ms", partial(_over_ball, contact={"gap": 1e-5}),
+        step=0.01, steps=30,
+    ),
     *(
         _case(
             f"contact-{ms}ms", f"Δt {ms} ms", partial(_over_ball, contact={"gap": GAP}),
