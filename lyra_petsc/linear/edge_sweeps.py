@@ -43,7 +43,7 @@ EDGES_EVERY = 2
 ALIGNED = 8
 """Vectors begin at a multiple of so many numbers of double precision."""
 
-SWEEPS = ((0.03, (3, 2, 3)), (0.3, (2, 2, 2)))
+SWEEPS = ((0.03, (3, 3, 3)), (0.3, (2, 2, 2)))
 """Up to parts of inertia in what all resists a vertex in its softest direction, sweeps over the vertices of
 the mesh, of the next coarser level, and of those below, which cost little; beyond, one. Of numbers that take
 equally long those with which iterations grow least with the mesh."""

@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from physics import gathered
 
 from lyra_petsc.errors import InputError
+from lyra_petsc.linear import presets
 from lyra_petsc.linear.matrix import AssembledMatrix, BlockMatrix
 from lyra_petsc.linear.presets import PYTHON_TYPE
 from lyra_petsc.scene.load import load_scene
@@ -245,8 +246,11 @@ class Scaling:
         b.copy(x)
 
 
-def test_sweeps_that_grow_without_bound_are_negative_curvature(comm: MPI.Comm) -> None:
+def test_sweeps_that_grow_without_bound_are_negative_curvature(
+    comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In the sixth step the exact Hessian, tried as its own preconditioner, is indefinite."""
+    monkeypatch.setattr(presets, "TWICE_FROM", 30.0)
     settings = ("time.integrator=alpha2", "time.step=0.01")
     simulation = SteppedScene(comm, load_scene(ROOT / "configs" / "swing.yaml", settings))
     for _ in range(7):
