@@ -250,4 +250,5 @@ def test_the_pairs_of_a_stack_are_shared(comm: MPI.Comm) -> None:
         assert isinstance(contact, ContactBarrier)
         work = np.array(comm.allgather(contact.n_elements))
         whole = comm.allreduce(contact.n_owned)
-        assert work.max() < 1.45 * whole / comm.size  # a cut is 13 vertices long, a rank 169 / ranks a sheet
+        # cuts, 13 vertices long, are to a rank's part of a sheet as √ranks
+        assert work.max() < (1.0 + 0.26 * comm.size**0.5) * whole / comm.size
