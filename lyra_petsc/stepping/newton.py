@@ -231,6 +231,8 @@ class Newton:
         convergence, v = self.convergence, self._array(x)
         first = v - self._array(y)
         size, force = self._force(first)
+        if size == 0.0:
+            return False
         left, correction, steps = y.duplicate(), y.duplicate(), [y.copy()]
         corrected = False
         for _ in range(MOST_CORRECTIONS if exact else 1):
