@@ -117,8 +117,8 @@ INCOMPLETE_FROM = 1.0
 iterations use incomplete factors."""
 
 TWICE_FROM = 300.0
-"""Iterations of block Jacobi from which coarser levels are visited twice: with 50,000 vertices that takes as
-long or longer up to 600, but its iterations do not grow with the mesh of a stiff sheet."""
+"""Iterations of block Jacobi from which coarser levels are visited twice. With 50,000 vertices that was no
+faster up to 600, but iterations of stiff sheets then hardly grow with the mesh."""
 
 
 def candidates(

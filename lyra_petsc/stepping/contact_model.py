@@ -57,13 +57,13 @@ class ContactModel:
         residual: PETSc.Vec,
         y: PETSc.Vec,
         assemble: Callable[[], None],
-        soften: Callable[[], bool],
+        ease: Callable[[], bool],
         tolerance: float,
     ) -> bool:
         """Let y, the Newton step from velocities v (n_owned, 3), be that of the model; whether it is another;
         collective.
 
-        ``assemble`` puts the linear system together again where it has other blocks, ``soften`` so that it is
+        ``assemble`` puts the linear system together again where it has other blocks, ``ease`` so that it is
         easier to solve after that failed, if that can be; ``tolerance`` is that of its solutions, relative to
         the residual.
         """
@@ -83,7 +83,7 @@ class ContactModel:
         self._go(left, y, force - expected)
         for _ in range(SOLVES):
             slopes = self._chords(length, force, expected)
-            while not (solved := self._solve(left, z, slopes, tolerance * size)) and soften():
+            while not (solved := self._solve(left, z, slopes, tolerance * size)) and ease():
                 linear.keep(v)
                 residual.copy(left)
                 self._go(left, y, force - self._force + self._stiffness * (length - self._length))

@@ -38,7 +38,8 @@ MOST_CORRECTIONS = 8
 """Of one step."""
 
 BACK, ON = -1.0, 0.5
-"""Part of the step before that a correction may add to it for secants to tell more than the matrix."""
+"""Broyden's matrix takes the place of the factored one where the correction, along the last step, is between
+these parts of it."""
 
 
 def _largest(vector: PETSc.Vec) -> float:
@@ -167,11 +168,7 @@ class Newton:
         if self._snes.getIterationNumber() == 0:
             self._began_convex = self._convex
         while useless:
-            if failed_factors.forget(self._ksp) or self._linear.better_preconditioner(self._array(x)):
-                pass
-            elif self._blend.raise_():
-                self._linear.set_operator_again(self._array(x), self._blend.value)
-            else:
+            if not self._ease(self._array(x)):
                 y.zeroEntries()
                 return True
             self._ksp.setOperators(self._linear.operator.mat, self._linear.preconditioner.mat)
@@ -196,6 +193,17 @@ class Newton:
         self.globalisation.search_along(residual.dot(y))
         return changed
 
+    def _ease(self, v: Array) -> bool:
+        """Let the linear system at velocities v be easier to solve, after that failed; whether it can be;
+        collective.
+        """
+        if failed_factors.forget(self._ksp) or self._linear.better_preconditioner(v):
+            return True
+        if not self._blend.raise_():
+            return False
+        self._linear.set_operator_again(v, self._blend.value)
+        return True
+
     def _foresee(self, x: PETSc.Vec, residual: PETSc.Vec, y: PETSc.Vec) -> bool:
         """Let a step y be that of the linear model in which parts do not pass each other; whether it is
         another.
@@ -206,16 +214,11 @@ class Newton:
         def assemble() -> None:
             self._linear.set(v, self._blend.value, keep=False, convex=self._convex)
 
-        def soften() -> bool:
+        def ease() -> bool:
             self._linear.set_operator_again(v, self._blend.value)
-            if failed_factors.forget(self._ksp) or self._linear.better_preconditioner(v):
-                return True
-            more = self._blend.raise_()
-            if more:
-                self._linear.set_operator_again(v, self._blend.value)
-            return more
+            return self._ease(v)
 
-        changed = self._contact.improve(v, residual, y, assemble, soften, self.forcing.in_use)
+        changed = self._contact.improve(v, residual, y, assemble, ease, self.forcing.in_use)
         self.foreseen_linear += self._contact.linear_iterations
         return changed
 
@@ -264,8 +267,8 @@ class Newton:
         return float(np.sqrt(square)), force
 
     def bend_guess(self, v: Array, guess: Array) -> None:
-        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs: of all ways to expect that to
-        the least energy; collective.
+        """Let the first guess (n_owned, 3) [m/s], far from v, lie along arcs: the end of least energy of all
+        ways that are expected; collective.
         """
         integrator = self._equations.integrator
         if self._arcs is None or not isinstance(integrator, Static):

@@ -62,8 +62,7 @@ class Springs(NamedTuple):
     @property
     def _least(self) -> Array:
         """Lengths (m,) [m] below which the law goes on along its tangent."""
-        least: Array = BELOW * np.minimum(self.gap, self.length)
-        return least
+        return BELOW * np.minimum(self.gap, self.length)
 
     def law(self, length: Array) -> tuple[Array, Array]:
         """Forces (m,) [N] and stiffness (m,) [N/m] at these lengths (m,) [m]."""
