@@ -52,11 +52,20 @@ WAYS: dict[str, dict[str, Any]] = {
     "alpha2, adaptive": {"end": 0.1, "step": "auto", "tolerance": 1e-2, "integrator": "alpha2"},
     "beuler, adaptive": {"end": 0.1, "step": "auto", "tolerance": 5e-2},
     "static": {"analysis": "static", "step": 0.1},
+    "static, directors": {"analysis": "static", "step": 0.1},
 }
 
+PLATE: dict[str, Any] = {
+    "material": {"young": 1e6, "poisson": 0.3, "thickness": 2e-3, "density": 1.0},
+    "handles": [{"box": [[-1, -1, -1], [1e-9, 1, 1]], "clamp": True}],
+    "gravity": [1.0, 0.5, -9.0],
+}
+"""Entries of a cantilever of one equilibrium; where each step begins is remembered as a tangent, too."""
 
-def scene_with(time: dict[str, Any]) -> dict[str, Any]:
-    scene = SCENE | {"time": time}
+
+def scene_with(way: str) -> dict[str, Any]:
+    time = WAYS[way]
+    scene = SCENE | {"time": time} | (PLATE if "directors" in way else {})
     if "analysis" in time:
         del scene["wind"]  # which turns with the sheet, and takes ten times as long to balance
     return scene
@@ -142,7 +151,7 @@ def same_files(resumed: Path, straight: Path, tolerance: float, *, exact: bool =
         for column, values in others.items():
             if exact or column not in OF_THE_SOLVER:
                 unit = float(np.abs(values).max())
-                within = 0.0 if column in OF_THE_SOLVER else tolerance * unit
+                within = 0.0 if column in OF_THE_SOLVER else max(tolerance * unit, 1e-15)
                 np.testing.assert_allclose(columns[column], values, rtol=0, atol=within, err_msg=column)
     told, others = summary(resumed), summary(straight)
     for content in (told, others):  # the machine may be busy in one of them
@@ -170,25 +179,26 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     @cache
     def ran(way: str) -> Path:
         folder = tmp_path_factory.mktemp("unbroken") / "straight"
-        journey(MPI.COMM_SELF, scene_with(WAYS[way]), folder, None)
+        journey(MPI.COMM_SELF, scene_with(way), folder, None)
         return folder
 
     return ran
 
 
 # before there is a history of two steps, and after
-STOPS = [(way, stop) for way in WAYS for stop in ([2] if way == "static" else [1, 9])] + [("bdf2", 2)]
+STOPS = [(way, stop) for way in WAYS for stop in ([2] if "static" in way else [1, 9])] + [("bdf2", 2)]
 
 
 @pytest.mark.parametrize(("way", "stop"), STOPS)
 def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path, unbroken: Callable[[str], Path]) -> None:
     """To round-off, on the same ranks with a direct solver."""
-    scene = scene_with(WAYS[way])
+    scene = scene_with(way)
     straight, halted = unbroken(way), tmp_path / "halted"
     end = last(straight)
     assert journey(MPI.COMM_SELF, scene, halted, stop)[0] == stop
     assert journey(MPI.COMM_SELF, scene, halted, None, resume=True) == end
-    same_files(halted, straight, 1e-11)
+    # frames of directors are made anew from the shape, by which round-off may decide on a linear iteration
+    same_files(halted, straight, 1e-11, exact="directors" not in way)
 
 
 @pytest.mark.parametrize(
@@ -197,14 +207,16 @@ def test_the_way_is_the_same(way: str, stop: int, tmp_path: Path, unbroken: Call
         pytest.param("bdf2", marks=pytest.mark.parallel(3, alone=False)),
         pytest.param("alpha2, adaptive", marks=pytest.mark.parallel(2, alone=False)),
         pytest.param("static", marks=pytest.mark.parallel(2, alone=False)),
+        pytest.param("static, directors", marks=pytest.mark.parallel(2, alone=False)),
     ],
 )
 def test_on_the_same_and_on_another_number_of_ranks(comm: MPI.Comm, way: str, shared_tmp: Path) -> None:
-    time = WAYS[way] if way == "static" else WAYS[way] | {"end": 0.06}
-    scene = scene_with(time)
+    scene = scene_with(way)
+    if "static" not in way:
+        scene["time"] = WAYS[way] | {"end": 0.06}
     straight, halted, alone = (shared_tmp / name for name in ("straight", "halted", "alone"))
     end = journey(comm, scene, straight, None)
-    journey(comm, scene, halted, 2 if way == "static" else 9)
+    journey(comm, scene, halted, 2 if "static" in way else 9)
     if comm.rank == 0:
         shutil.copytree(halted, alone)
     assert journey(comm, scene, halted, None, resume=True) == end
@@ -236,7 +248,8 @@ def test_resuming_twice_at_every_step(tmp_path: Path) -> None:
 @pytest.mark.parallel
 def test_displacement_is_from_the_first_state_also_after_resuming(comm: MPI.Comm, shared_tmp: Path) -> None:
     """Whatever start the scene says by then."""
-    scene = scene_with({"end": 0.02, "step": 0.004}) | {
+    scene = SCENE | {
+        "time": {"end": 0.02, "step": 0.004},
         "output": {"every": 0.004, "fields": ["displacement"]},
         "initial": {"noise": 1e-3},
     }
