@@ -6,10 +6,13 @@ G. E. Cusick, The measurement of fabric drape, Journal of the Textile Institute 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from lyra_petsc.arrays import Array, Ints, Mask
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.fabric.specimens import G
 
 Picture = Mask
 
@@ -19,6 +22,12 @@ CLOTH, DISC, DRAPE_GAP = 0.15, 0.09, 2e-3
 STARTS, NOISE = 5, 2e-4
 """How many, and the standard deviation [m] of their heights"""
 
+STEP, STEPS = 0.04, 40
+"""Δt [s], and how many: backward Euler damps what moves."""
+
+SPEED = 0.01
+"""Of the fastest vertex [m/s], at which a cloth rests before"""
+
 LEAST_FOLD = 1e-3
 """Amplitude [m] of a rim below which it has no folds"""
 
@@ -27,23 +36,53 @@ MARGIN = 1.05
 
 
 def disc_of(angle: Array) -> tuple[Array, Ints]:
-    """The disc, or a sector of it with a rim at these angles: vertices (n, 3) [m] and triangles (m, 3)."""
+    """The disc with a rim at these angles: vertices (n, 3) [m] and triangles (m, 3)."""
     rim = DISC * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
     fan = np.array([[k, k + 1, len(rim)] for k in range(len(rim) - 1)])
     return np.vstack([rim, np.zeros((1, 3))]), fan
 
 
-def _middles(low: float, pixels: int) -> Array:
-    half = MARGIN * CLOTH
-    return half * (low + (1.0 - low) * (np.arange(pixels) + 0.5) / pixels)
+def draped(
+    bench: Bench, start: Array, faces: Ints, rest: Array, material: dict[str, Any], seed: int
+) -> Array:
+    """Positions (V, 3) [m] of a cloth that rests on the disc; collective.
 
-
-def shadow(x: Array, faces: Ints, pixels: int, low: float = -1.0) -> Picture:
-    """Which pixels (pixels, pixels), rows along y, lie below the disc or triangles of vertices x (V, 3) [m].
-
-    The picture goes from ``low`` to 1 times half its side in both directions.
+    Parameters
+    ----------
+    start : (V, 3)
+        Positions [m] over the disc.
+    faces : (F, 3)
+    rest : (V, 2)
+        Material coordinates [m].
+    material : dict
+        As in a scene.
+    seed : int
+        Of the noise of the start.
     """
-    middles = _middles(low, pixels)
+    disc = {"mesh": bench.mesh(*disc_of(np.radians(np.linspace(0.0, 360.0, 49))))}
+    content = {
+        "mesh": bench.mesh(start + [0.0, 0.0, 0.95 * DRAPE_GAP], faces, rest=rest),
+        "material": material,
+        "time": {"end": STEP * STEPS, "step": STEP},
+        "gravity": [0.0, 0.0, -G],
+        "initial": {"noise": NOISE, "seed": seed},
+        "contact": {"gap": DRAPE_GAP, "friction": 0.3, "self": False},
+        "obstacles": {"disc": disc},
+        # stiff sheets are slow to fold, but shorter steps cost more
+        "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
+    }
+    with bench.simulation(content) as trial:
+        while not trial.simulation.finished:
+            trial.step()
+            # by time, not by steps: those of stiff sheets are cut into many
+            if trial.simulation.time > 0.5 * STEP * STEPS and np.abs(trial.v).max() < SPEED:
+                break
+        return trial.x
+
+
+def shadow(x: Array, faces: Ints, pixels: int) -> Picture:
+    """Pixels (pixels, pixels), rows along y, below the disc or the triangles of vertices x (V, 3) [m]."""
+    middles = MARGIN * CLOTH * ((2.0 * np.arange(pixels) + 1.0) / pixels - 1.0)
     dark = np.hypot(middles, middles[:, None]) < DISC
     for corners in x[faces][:, :, :2]:
         first, last = (
@@ -56,13 +95,6 @@ def shadow(x: Array, faces: Ints, pixels: int, low: float = -1.0) -> Picture:
         turn = sides[:, 0] * beside[..., 1] - sides[:, 1] * beside[..., 0]
         dark[rows, columns] |= (turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1)
     return dark
-
-
-def quarter_shadow(x: Array, faces: Ints, pixels: int) -> Picture:
-    """The whole shadow of which a mesh (V, 3) [m] is the quarter x, y ≥ 0."""
-    quarter = shadow(x, faces, pixels // 2, 0.0)
-    half = np.concatenate([quarter[:, ::-1], quarter], axis=1)
-    return np.concatenate([half[::-1], half])
 
 
 def drape_coefficient(dark: Picture) -> float:

@@ -25,12 +25,10 @@ from lyra_petsc.experiments.bench import Bench, Trial, problem_of
 from lyra_petsc.experiments.case import Launcher, Watch
 from lyra_petsc.experiments.drape import (
     CLOTH,
-    DRAPE_GAP,
     MARGIN,
-    NOISE,
     STARTS,
-    disc_of,
     drape_coefficient,
+    draped,
     folds,
     shadow,
 )
@@ -505,11 +503,8 @@ def loop(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     return record
 
 
-ACROSS, STEP, STEPS = 12, 0.04, 40
-"""Along the diameter; Δt [s], and how many: backward Euler damps what moves."""
-
-REST = 0.01
-"""Speed [m/s] of the fastest vertex at which a cloth rests before"""
+ACROSS = 12
+"""Along the diameter"""
 
 PIXELS = 240
 
@@ -524,28 +519,10 @@ def cusick(bench: Bench, fabric: Fabric, degrees: float) -> Record:
     """A cloth of 30 cm on a disc of 18 cm: drape coefficient and folds, mean and scatter of five starts."""
     fabric.needs_bending("cusick")
     record, coefficients, counts = Record(), [], []
-    disc = {"mesh": bench.mesh(*disc_of(np.radians(np.linspace(0.0, 360.0, 49))))}
     dark = np.zeros((1, 1), dtype=np.bool_)
     for start in range(STARTS):
         flat, faces = _disc(ACROSS, start)
-        content = {
-            "mesh": bench.mesh(CLOTH * flat + [0.0, 0.0, 0.95 * DRAPE_GAP], faces, rest=CLOTH * flat[:, :2]),
-            "material": fabric.turned(degrees),
-            "time": {"end": STEP * STEPS, "step": STEP},
-            "gravity": [0.0, 0.0, -G],
-            "initial": {"noise": NOISE, "seed": start},
-            "contact": {"gap": DRAPE_GAP, "friction": 0.3, "self": False},
-            "obstacles": {"disc": disc},
-            # stiff sheets are slow to fold, but shorter steps cost more
-            "solver": {"force_tolerance": 1e-5, "step_tolerance": 1e-5, "max_iterations": 200},
-        }
-        with bench.simulation(content) as trial:
-            while not trial.simulation.finished:
-                trial.step()
-                # by time, not by steps: those of stiff sheets are cut into many
-                if trial.simulation.time > 0.5 * STEP * STEPS and np.abs(trial.v).max() < REST:
-                    break
-            x = trial.x
+        x = draped(bench, CLOTH * flat, faces, CLOTH * flat[:, :2], fabric.turned(degrees), start)
         dark = shadow(x, faces, PIXELS)
         coefficients.append(100.0 * drape_coefficient(dark))
         counts.append(float(folds(dark)))
