@@ -163,10 +163,10 @@ def midedge_blocks(
     """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
-        (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
+        (stiffness, rest, tilt, limit, _), edges = term._constants, term.of_edges.of_triangles
         shape, length = term.shape(x, frames), term.of_edges.length
     else:
-        stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
+        stiffness, rest, tilt, limit, friction = term._constants(term._sliding(x, frames))
         edges, shape = term._edges, term._sheet.shape(x, frames)
         length = term._sheet.of_edges.length
     rest = rest if len(rest) else np.zeros((term.n_elements, 3))
@@ -178,6 +178,9 @@ def midedge_blocks(
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
         director, spin = shape[edges[e]].reshape(3, 2, 3).transpose(1, 0, 2)
+        if len(tilt):
+            back = np.arctan(tilt[e])[:, None]
+            director = np.cos(back) * director - np.sin(back) * np.cross(sides / along[:, None], director)
         tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
         beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
         about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)

@@ -3,14 +3,15 @@
 An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per
 triangle of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
 
-    κ = −Σ_i (T(α_i) − T(ᾱ_i)) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
+    κ = −Σ_i T(α_i − ᾱ_i) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
     energy = ½ A (κ − κ̄)ᵀ D (κ − κ̄)
 
-κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is
-the material's rest curvature and D its stiffness [N·m]. T is the tangent of angles up to 45° and grows less
-beyond, where other edges than its own feel less of it (``midedge_shape``). As κ is linear in the three T the
-energy is a quadratic form of theirs. The director's angle has no mass: it is where moments balance, which
-makes edges of one, two or more triangles alike. A triangle's stencil is its own corners and edges.
+κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles of the rest
+shape, κ̄ is the material's rest curvature and D its stiffness [N·m]. T is the tangent of angles up to 45° and
+grows less beyond, where other edges than its own feel less of it (``midedge_shape``). As κ is linear in the
+three T the energy is a quadratic form of theirs. The director's angle has no mass: it is where moments
+balance, which makes edges of one, two or more triangles alike. A triangle's stencil is its own corners and
+edges.
 
 Sources: constant curvatures from rotations of the edges are Morley's plate (Aeronautical Quarterly 19 (1968)
 149-169); on curved sheets Grinspun, Gingold, Reisman & Zorin, Computing discrete shape operators on general
@@ -93,16 +94,16 @@ class MidEdge(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3), edges (E, 3) opposite the corners; data ``stiffness`` (E, 6) of the tangents [N·m],
-        ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) int8 1 where the triangle runs along an edge,
-        else −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of
-        edges and directors before the start, ``material`` (E, 2, 2) the ways from the first corner to the
-        others in material axes [m], ``triangle`` (E,) int32 numbers in the mesh, ``height`` (E,) the smallest
-        [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
+        ``rest`` (E, 3) tangents without energy, ``tilt`` (E, 3) tan ᾱ, ``sign`` (E, 3) int8 1 where the
+        triangle runs along an edge, else −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director``
+        (E, 3, 3) directions of edges and directors before the start, ``material`` (E, 2, 2) the ways from the
+        first corner to the others in material axes [m], ``triangle`` (E,) int32 numbers in the mesh,
+        ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
     """
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
+        super().__init__(elements.without("tangent", "director", "length", "rest", "tilt", "height"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -112,8 +113,8 @@ class MidEdge(Elastic):
         index = index.reshape(-1, 3).astype(np.int32)
         self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
-        rest = data["rest"] if data["rest"].any() else FLAT
-        self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
+        rest, tilt = (data[name] if data[name].any() else FLAT for name in ("rest", "tilt"))
+        self._constants = data["stiffness"], rest, tilt, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
         self._at_end: Frames | None = None  # which have followed already
@@ -209,7 +210,7 @@ class MidEdge(Elastic):
             expected = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
             expected += np.sum(before[:, :, 3:6] * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
             turn = np.remainder(turned - angle + np.pi, 2.0 * np.pi) - np.pi
-        weight = np.minimum(np.minimum(square, left) / self._constants[2][chosen], 1.0)[:, None]
+        weight = np.minimum(np.minimum(square, left) / self._constants[3][chosen], 1.0)[:, None]
         weight = np.where(np.isfinite(turn) & np.isfinite(expected), weight, 0.0)
 
         def mean(values: Array) -> Array:
@@ -414,23 +415,18 @@ def elements(rest: RestShape) -> Elements:
     length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
 
     surface = ~mesh.flat_rest[chosen]
-    at_rest = np.zeros_like(size)
+    tilt = np.zeros_like(size)
     if surface.any():
         director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges)
         _mirror(director, rest, triangles, number, mesh.rest)
         angle = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
         _check(angle, number[surface], edges, rest, "rest shape")
-        at_rest[surface] = tangents_at(angle)
-        smooth = np.abs(at_rest).max(axis=1) < CREASED
-        rest.notes += _coarse(
-            rest,
-            chosen[smooth],
-            np.einsum("eki,ei->ek", curvature[smooth], at_rest[smooth]),
-            size[smooth].max(axis=1),
-        )
+        tilt[surface] = np.tan(angle)
+        rest.notes += _coarse(rest, chosen, np.einsum("eki,ei->ek", curvature, tilt), tilt, size.max(axis=1))
+    at_rest = np.zeros_like(size)
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
-        at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
+        at_rest[:] = np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
         _check_curved(at_rest, rest, chosen, size)
     director = mean_directors(mesh.positions, triangles, number, n_edges)
     _mirror(director, rest, triangles, number, mesh.positions)
@@ -440,6 +436,7 @@ def elements(rest: RestShape) -> Elements:
     data = {
         "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
         "rest": at_rest,
+        "tilt": tilt,
         "sign": sign,
         "length": length[number],
         "tangent": unit(ends[:, :, 1] - ends[:, :, 0]),
@@ -453,18 +450,23 @@ def elements(rest: RestShape) -> Elements:
     return Elements(triangles, data, edges=number)
 
 
-def _coarse(rest: RestShape, chosen: Ints, curvature: Array, longest: Array) -> list[str]:
-    """What to say of triangles ``chosen`` with these curvatures (n, 3) at rest and longest edges (n,) [m].
+def _coarse(rest: RestShape, chosen: Ints, curvature: Array, tilt: Array, longest: Array) -> list[str]:
+    """What to say of triangles ``chosen`` with these curvatures (n, 3) at rest, tan ᾱ (n, 3) and longest
+    edges (n,) [m].
 
     Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
-    that of a sheet of bending stiffness B and membrane stiffness C.
+    that of a sheet of bending stiffness B and membrane stiffness C. Where walls meet they count as a crease:
+    a smooth surface bends at most triangles about each corner.
     """
     mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
     largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
     thickness = np.array(
         [np.sqrt(12.0 * max(s.plate[0], s.plate[2]) / max(s.c11, s.c22)) for s in rest.shells]
     )[rest.shell_of[chosen]]
-    bent = largest * longest > 1e-3
+    bent = (largest * longest > 1e-3) & (np.abs(tilt).max(axis=1) < CREASED)
+    corners, n = rest.mesh.triangles[chosen], rest.mesh.n_vertices
+    about = np.bincount(corners.ravel(), minlength=n), np.bincount(corners[bent].ravel(), minlength=n)
+    bent &= (2 * about[1] > about[0])[corners].all(axis=1)
     coarse = bent & (largest * longest**2 > thickness)
     if not 2 * coarse.sum() > bent.sum():
         return []

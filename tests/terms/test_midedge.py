@@ -173,7 +173,7 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         shape, length, weight = term.shape(x, term.frames), term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
         angle = np.empty((term.n_elements, 3))
-        tangents(x, term.stencil, term.of_edges.of_triangles, shape, angle)
+        tangents(x, term.stencil, term.of_edges.of_triangles, shape, midedge.FLAT, angle)
         assert 0.1 < np.mean(np.abs(angle) > 1.0) < 0.9
         assert term.n_elements % midedge_energy.BATCH
 
@@ -184,7 +184,8 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 part = slice(first, first + size)
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
-                constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
+                flat = midedge.FLAT, midedge.FLAT
+                constants = data["stiffness"][part], *flat, data["limit"][part], midedge.NO_FRICTION
                 midedge_energy.energies(x, triangles, edges, shape, *constants, energies[part])
                 midedge_energy.add_gradient(x, triangles, edges, at, sign, shape, *constants, length, pull)
                 corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
@@ -403,6 +404,54 @@ def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp:
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
 
 
+def walls(*each: tuple[Sequence[float], Sequence[float]], n: int, width: float = 0.25) -> tuple[Array, Any]:
+    """Strips of n cells along, from (x, z) to (x, z), which share the edges at which they meet: V, F."""
+    flat, faces = rectangle(n, max(1, round(n * width)), 1.0, width)
+    along, across = flat[:, :1], flat[:, 1]
+    places = [np.asarray(one) + along * np.subtract(two, one) for one, two in each]
+    vertices = np.concatenate([np.column_stack([place[:, 0], across, place[:, 1]]) for place in places])
+    _, first, number = np.unique(vertices.round(9), axis=0, return_index=True, return_inverse=True)
+    triangles = np.concatenate([faces + k * len(flat) for k in range(len(each))])
+    return vertices[first], number.ravel()[triangles]
+
+
+CORNER, LEAN = (0.0, 1.0), (np.sin(np.radians(20.0)), 1.0 - np.cos(np.radians(20.0)))
+COLUMN = ((0.0, 0.0), CORNER)
+
+
+@pytest.mark.parametrize(
+    ("beams", "axis", "compliance"),
+    [
+        ([(CORNER, (1.0, 1.0))], 2, 1.0 / 3.0 + 1.0),
+        ([(CORNER, LEAN)], 0, (LEAN[1] - 1.0) ** 2 / 3.0 + ((1.0 - LEAN[1]) ** 3 + LEAN[1] ** 3) / 3.0),
+        ([(CORNER, (1.0, 1.0)), ((-1.0, 1.0), CORNER)], 2, 1.0 / 3.0 + 1.0 / 8.0),
+    ],
+    ids=["right angle", "fold of 160°", "three at an edge"],
+)
+def test_walls_that_meet_bend_as_beams(
+    beams: list[Any], axis: int, compliance: float, tmp_path: Path
+) -> None:
+    """A clamped column, to whose top beams of the same strip are fixed, with a force at the end of one."""
+    errors = []
+    for n in (8, 16):
+        vertices, faces = walls(COLUMN, *beams, n=n)
+        end, force = np.flatnonzero(np.isclose(vertices[:, [0, 2]], beams[0][1]).all(axis=1)), np.zeros(3)
+        force[axis] = 1e-4
+        clamps = [{"box": [[x - 1e-6, -1, z - 1e-6], [x + 1e-6, 1, z + 1e-6]]} for x, z in ((0, 0), (-1, 1))]
+        content = {
+            "mesh": obj_file(tmp_path / "frame.obj", vertices, faces),
+            "material": STIFF | {"bending": PLATE | {"d12": 0.0, "d33": 0.5}},
+            "gravity": [0, 0, 0],
+            "handles": [clamp | {"clamp": True} for clamp in clamps[: len(beams)]],
+            "loads": [{"nodes": end.tolist(), "force": force.tolist()}],
+            "time": {"analysis": "static", "step": 1.0},
+        }
+        way = (outcome(MPI.COMM_SELF, content)[0] - vertices)[end, axis].mean()
+        errors.append(abs(way / (4e-4 * compliance) - 1.0))
+    assert errors[0] < 0.03
+    assert errors[1] < 0.35 * errors[0]
+
+
 # -- rest shapes and refusals --------------------------------------------------------------------------
 
 
@@ -472,19 +521,36 @@ def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
     bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
     content = {"mesh": obj_file(tmp_path / "shell.obj", bent, faces), "material": material}
-    simulation = Run(MPI.COMM_SELF, scene_of(content))
-    noted = [note for note in simulation.notes if "large for the curvature" in note]
+    noted = coarse(content)
     assert len(noted) == (1 if n == 8 else 0)
     assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in noted)
-    simulation.destroy()
 
 
 def test_creases_are_not_noted(tmp_path: Path) -> None:
     """The walls of a box are flat, however thin and whatever their triangles."""
     content = {"mesh": folded(tmp_path / "b.obj", 90.0), "material": STIFF | {"bending": PLATE}}
+    assert not coarse(content)
+
+
+def coarse(content: dict[str, Any]) -> list[str]:
+    """What is noted of triangles that are too large."""
     simulation = Run(MPI.COMM_SELF, scene_of(content))
-    assert not [note for note in simulation.notes if "large for the curvature" in note]
+    found = [note for note in simulation.notes if "large for the curvature" in note]
     simulation.destroy()
+    return found
+
+
+def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
+    """An angle of 45° is no curvature where the walls beside it are flat, nor is that of a third wall."""
+    material = {"young": 1e6, "poisson": 0.0, "thickness": 0.001, "density": 1.0}
+    half = np.sqrt(0.5)
+    tube = [(0, 0), (1, 0), (1 + half, half), (1 + half, 1 + half), (1, 1 + 2 * half)]
+    for name, parts in {
+        "tube": pairwise(tube),
+        "tee": [COLUMN, (CORNER, (1.0, 1.0)), ((-1.0, 1.0), CORNER)],
+    }.items():
+        vertices, faces = walls(*parts, n=8)
+        assert not coarse({"mesh": obj_file(tmp_path / f"{name}.obj", vertices, faces), "material": material})
 
 
 def test_one_sheet_bends_by_one_model() -> None:
