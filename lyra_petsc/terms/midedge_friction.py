@@ -66,7 +66,7 @@ class MidEdgeFriction(Elastic):
         super().__init__(elements)
         data = elements.data
         self.bent: Array = data["rest"].copy()
-        self._tilt = data["tilt"] if data["tilt"].any() else midedge.FLAT
+        self._tilt = midedge.tilt_of(data)
         self._slides: Remembered[tuple[Array, ...]] | None = None
         self._frames: Frames | None = None
 

@@ -173,12 +173,12 @@ def edges_of(x0, x1, x2):  # type: ignore[no-untyped-def]
 
 @kernel(inline="always")
 def turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
-    """The director of edge i of triangle e, turned about the edge by −ᾱ and made 1 / cos ᾱ long."""
+    """The director of edge i of triangle e, turned about the edge by −ᾱ."""
     d = row(shape, edges[e, i], 0)
     if tilt.shape[0] == 0:
         return d
-    side, factor = cross(edge, d), -tilt[e, i] / math.sqrt(dot(edge, edge))
-    return d[0] + factor * side[0], d[1] + factor * side[1], d[2] + factor * side[2]
+    side, c, s = cross(edge, d), tilt[e, i, 0], -tilt[e, i, 1] / math.sqrt(dot(edge, edge))
+    return c * d[0] + s * side[0], c * d[1] + s * side[1], c * d[2] + s * side[2]
 
 
 @kernel(inline="always")
@@ -227,7 +227,10 @@ def tangents_at(angle: Array) -> Array:
 
 @kernel()
 def tangents(x, stencil, edges, shape, tilt, out):  # type: ignore[no-untyped-def]
-    """T(α_i) of triangles (E, 3) into out (E, 3); of α_i − ᾱ_i where ``tilt`` (E, 3), tan ᾱ, is not empty."""
+    """T of triangles (E, 3) into out (E, 3), of α_i − ᾱ_i by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
+
+    It may be empty, as those of sheets that are flat at rest.
+    """
     for e in range(stencil.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, _ = edges_of(x0, x1, x2)

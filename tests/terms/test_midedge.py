@@ -173,7 +173,7 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         shape, length, weight = term.shape(x, term.frames), term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
         angle = np.empty((term.n_elements, 3))
-        tangents(x, term.stencil, term.of_edges.of_triangles, shape, midedge.FLAT, angle)
+        tangents(x, term.stencil, term.of_edges.of_triangles, shape, midedge.UPRIGHT, angle)
         assert 0.1 < np.mean(np.abs(angle) > 1.0) < 0.9
         assert term.n_elements % midedge_energy.BATCH
 
@@ -184,7 +184,7 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 part = slice(first, first + size)
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
-                flat = midedge.FLAT, midedge.FLAT
+                flat = midedge.FLAT, midedge.UPRIGHT
                 constants = data["stiffness"][part], *flat, data["limit"][part], midedge.NO_FRICTION
                 midedge_energy.energies(x, triangles, edges, shape, *constants, energies[part])
                 midedge_energy.add_gradient(x, triangles, edges, at, sign, shape, *constants, length, pull)
@@ -482,24 +482,48 @@ def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
     assert energies[2] < 1e-3 * 0.5 * 0.25 * 0.25
 
 
-def folded(path: Path, degrees: float) -> dict[str, Any]:
-    """Two triangles, folded by so many degrees at the edge of vertices 0 and 1."""
-    angle = np.radians(180.0 - degrees)
-    corners: Sequence[Sequence[float]] = [
-        (0, 0, 0), (0, 1, 0), (1, 0.5, 0), (np.cos(angle), 0.5, np.sin(angle)),
-    ]  # fmt: skip
-    return obj_file(path, corners, [(0, 2, 1), (0, 1, 3)])
+def fan(path: Path, *degrees: float, flat: bool = False) -> dict[str, Any]:
+    """Triangles in such directions about the edge of vertices 0 and 1; ``flat``: at rest side by side."""
+    angles = np.radians(degrees)
+    corners = [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), *((np.cos(a), 0.5, np.sin(a)) for a in angles)]
+    # those of half a turn run along the edge as the others do
+    faces = [(0, 2 + k, 1) if k % 2 == 0 else (0, 1, 2 + k) for k in range(len(angles))]
+    mesh = obj_file(path, corners, faces)
+    if flat:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = [*lines[:4], "vt 0 0", "vt 0 1", "vt 1 0.5", "vt -1 0.5", "f 1/1 3/3 2/2", "f 1/1 2/2 4/4"]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return mesh
 
 
-def test_a_fold_of_nearly_180_degrees_is_refused(tmp_path: Path) -> None:
+def test_a_start_folded_by_180_degrees_is_refused(tmp_path: Path) -> None:
+    """Where the rest shape is flat nothing says to which side."""
     material = STIFF | {"bending_model": "midedge"}
-    with Simulation({"mesh": folded(tmp_path / "a.obj", 170.0), "material": material}, MPI.COMM_SELF):
+    with Simulation(
+        {"mesh": fan(tmp_path / "a.obj", 0, 0.2, flat=True), "material": material}, MPI.COMM_SELF
+    ):
         pass
-    with Simulation({"mesh": folded(tmp_path / "c.obj", 179.8), "material": material}, MPI.COMM_SELF) as one:
-        assert np.abs(gradient(midedge_of(one), one.system.x, midedge_of(one).frames)).max() < 1e-9
-    content = scene_of({"mesh": folded(tmp_path / "b.obj", 179.95), "material": material})
+    content = scene_of({"mesh": fan(tmp_path / "b.obj", 0, 0.05, flat=True), "material": material})
     with pytest.raises(InputError, match=r"folded by 179.9° or more at the edge of vertices 0 and 1"):
         Run(MPI.COMM_SELF, content)
+
+
+@pytest.mark.parametrize(
+    "degrees", [(0, 0), (0, 10), (0, 120, 240), (0, 90, 180, 270), (0, 180, 90)], ids=str
+)
+def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) -> None:
+    """Triangles resist being turned against the others as much as in a flat pair, however they meet."""
+    stiffness = []
+    for number, each in enumerate((degrees, (0, 180))):
+        content = {"mesh": fan(tmp_path / f"{number}.obj", *each), "material": STIFF | {"bending": PLATE}}
+        with Simulation(content, MPI.COMM_SELF) as simulation:
+            term, x = midedge_of(simulation), simulation.system.x.copy()
+            assert np.abs(gradient(term, x, term.frames)).max() < 1e-12
+            x.ravel()[term.edge_places] = term.anew(x)
+            assert term.energies(x, term.frames).max() < 1e-24
+            tip = np.flatnonzero(np.isclose(x, [1.0, 0.5, 0.0]).all(axis=1))[0]
+            stiffness.append(hessian(term, x, term.frames)[tip, 2, tip, 2])
+    assert stiffness[0] == pytest.approx(stiffness[1])
 
 
 def test_curvature_that_no_edge_can_turn_is_refused() -> None:
@@ -528,7 +552,7 @@ def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
 
 def test_creases_are_not_noted(tmp_path: Path) -> None:
     """The walls of a box are flat, however thin and whatever their triangles."""
-    content = {"mesh": folded(tmp_path / "b.obj", 90.0), "material": STIFF | {"bending": PLATE}}
+    content = {"mesh": fan(tmp_path / "b.obj", 0, 90), "material": STIFF | {"bending": PLATE}}
     assert not coarse(content)
 
 
