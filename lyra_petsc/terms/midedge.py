@@ -32,6 +32,7 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.scene.materials.library import is_isotropic
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
@@ -66,6 +67,9 @@ UPRIGHT = np.empty((0, 3, 2))
 
 CANCELLED = 1e-4
 """Length of a sum of unit normals below which rounding would tell its direction."""
+
+NARROW = 0.02
+"""Part of the stiffness against twist from which on it is said that free edges would have less."""
 
 CREASED = np.radians(30.0)
 """α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
@@ -432,6 +436,7 @@ def elements(rest: RestShape) -> Elements:
     curvature = curvatures_of_tangents(material)
     stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
+    rest.notes += _narrow(rest, chosen, number, size, area)
     # the two faces of a seam may have edges of different lengths
     count = np.bincount(number.ravel(), minlength=n_edges)
     length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
@@ -498,6 +503,38 @@ def _coarse(rest: RestShape, chosen: Ints, of_tangents: Array, angle: Array, lon
         f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
         f"{np.median(longest[coarse]):.3g} m: flat triangles make such a shell too stiff, or too soft under "
         f"point loads, unless their edges are well below √(t R) = {fine:.3g} m"
+    ]
+
+
+def _narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
+    """What to say of sheets with free edges that are hardly wider than thick.
+
+    Beside a free edge a shell of thickness t twists as if 0.315 t of its width were missing, which needs
+    transverse shear: a strip of width b has the torsional stiffness G b t³/3 (1 − 0.63 t/b).
+
+    Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity, 3rd ed. 1970, § 109.
+    """
+    mesh, materials = rest.mesh, rest.scene.material
+    thickness = np.array(
+        [
+            np.sqrt(12.0 * shell.plate[0] / shell.c11)
+            if material.young is not None or is_isotropic(material.cloth)
+            else 0.0
+            for shell, material in zip(rest.shells, materials, strict=True)
+        ]
+    )[rest.shell_of[chosen]]
+    free = np.bincount(number.ravel())[number] == 1
+    for handle, each in enumerate(rest.scene.handles):
+        if each.clamp or each.symmetry is not None:
+            held = select_vertices(mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
+            ends = mesh.triangles[chosen][:, [[1, 2], [2, 0], [0, 1]]]
+            free &= ~np.isin(ends, held).all(axis=2)
+    lost = 0.315 * float(thickness @ np.sum(size * free, axis=1)) / float(area[thickness > 0.0].sum() or 1.0)
+    if lost < NARROW:
+        return []
+    return [
+        f"beside free edges of sheets as thick as these transverse shear, which there is none of, would let "
+        f"them twist by {lost:.0%} more"
     ]
 
 

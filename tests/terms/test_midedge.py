@@ -545,9 +545,9 @@ def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
     bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
     content = {"mesh": obj_file(tmp_path / "shell.obj", bent, faces), "material": material}
-    noted = coarse(content)
-    assert len(noted) == (1 if n == 8 else 0)
-    assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in noted)
+    found = coarse(content)
+    assert len(found) == (1 if n == 8 else 0)
+    assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in found)
 
 
 def test_creases_are_not_noted(tmp_path: Path) -> None:
@@ -558,10 +558,29 @@ def test_creases_are_not_noted(tmp_path: Path) -> None:
 
 def coarse(content: dict[str, Any]) -> list[str]:
     """What is noted of triangles that are too large."""
+    return noted(content, "large for the curvature")
+
+
+def noted(content: dict[str, Any], words: str) -> list[str]:
     simulation = Run(MPI.COMM_SELF, scene_of(content))
-    found = [note for note in simulation.notes if "large for the curvature" in note]
+    found = [note for note in simulation.notes if words in note]
     simulation.destroy()
     return found
+
+
+@pytest.mark.parametrize("thickness", [0.01, 0.1])
+def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
+    """Ten times as wide as thick they twist 0.63/10 too little; clamped and symmetric edges are not free."""
+    content = {
+        "mesh": grid(8.0, 1.0, 16, 2),
+        "material": {"young": 1e6, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+        "handles": [{"group": "left", "clamp": True}, {"group": "right", "symmetry": "x"}],
+    }
+    found = noted(content, "transverse shear")
+    assert len(found) == (1 if thickness == 0.1 else 0)
+    assert all("twist by 6% more" in note for note in found)
+    everywhere = [{"group": "sheet", "clamp": True}]
+    assert not noted(content | {"handles": everywhere}, "transverse shear")
 
 
 def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
