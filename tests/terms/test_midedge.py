@@ -27,7 +27,7 @@ from physics import (
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.meshes import rectangle, walls
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
@@ -404,17 +404,6 @@ def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp:
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
 
 
-def walls(*each: tuple[Sequence[float], Sequence[float]], n: int, width: float = 0.25) -> tuple[Array, Any]:
-    """Strips of n cells along, from (x, z) to (x, z), which share the edges at which they meet: V, F."""
-    flat, faces = rectangle(n, max(1, round(n * width)), 1.0, width)
-    along, across = flat[:, :1], flat[:, 1]
-    places = [np.asarray(one) + along * np.subtract(two, one) for one, two in each]
-    vertices = np.concatenate([np.column_stack([place[:, 0], across, place[:, 1]]) for place in places])
-    _, first, number = np.unique(vertices.round(9), axis=0, return_index=True, return_inverse=True)
-    triangles = np.concatenate([faces + k * len(flat) for k in range(len(each))])
-    return vertices[first], number.ravel()[triangles]
-
-
 CORNER, LEAN = (0.0, 1.0), (np.sin(np.radians(20.0)), 1.0 - np.cos(np.radians(20.0)))
 COLUMN = ((0.0, 0.0), CORNER)
 
@@ -434,7 +423,7 @@ def test_walls_that_meet_bend_as_beams(
     """A clamped column, to whose top beams of the same strip are fixed, with a force at the end of one."""
     errors = []
     for n in (8, 16):
-        vertices, faces = walls(COLUMN, *beams, n=n)
+        vertices, faces = walls([COLUMN, *beams], n, n // 4, 0.25)
         end, force = np.flatnonzero(np.isclose(vertices[:, [0, 2]], beams[0][1]).all(axis=1)), np.zeros(3)
         force[axis] = 1e-4
         clamps = [{"box": [[x - 1e-6, -1, z - 1e-6], [x + 1e-6, 1, z + 1e-6]]} for x, z in ((0, 0), (-1, 1))]
@@ -592,7 +581,7 @@ def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
         "tube": pairwise(tube),
         "tee": [COLUMN, (CORNER, (1.0, 1.0)), ((-1.0, 1.0), CORNER)],
     }.items():
-        vertices, faces = walls(*parts, n=8)
+        vertices, faces = walls(list(parts), 8, 2, 0.25)
         assert not coarse({"mesh": obj_file(tmp_path / f"{name}.obj", vertices, faces), "material": material})
 
 
