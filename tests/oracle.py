@@ -14,7 +14,7 @@ from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.terms.bending import Bending, dihedral_angles
 from lyra_petsc.terms.hinge_energy import add_square_hessian, fade, hinge_hessian
 from lyra_petsc.terms.membrane import Membrane
-from lyra_petsc.terms.midedge import MidEdge, mean_directors
+from lyra_petsc.terms.midedge import UPRIGHT, MidEdge, mean_directors
 from lyra_petsc.terms.midedge_friction import MidEdgeFriction
 from lyra_petsc.terms.midedge_shape import Frames, carried, fading_tangent, tangent_of, unit
 from lyra_petsc.terms.term import Elastic, UpcomingStep, Viscous
@@ -102,7 +102,7 @@ def directors_along_normals(term: MidEdge, x: Array) -> Array:
     edges = term.of_edges
     tangent = unit(x[edges.ends[:, 1]] - x[edges.ends[:, 0]])
     across = carried(term.frames, tangent)
-    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length))
+    mean = mean_directors(x, term.stencil, edges.of_triangles, len(edges.length), UPRIGHT)
     sine = np.sum(np.cross(tangent, across) * mean, axis=1)
     return np.asarray(edges.length * np.arctan2(sine, np.sum(across * mean, axis=1)))
 
@@ -163,10 +163,10 @@ def midedge_blocks(
     """Element Hessians (E, 12, 12) of triangles that bend by directors, each on its own."""
     data, friction = term.elements.data, np.zeros((term.n_elements, 2))
     if isinstance(term, MidEdge):
-        (stiffness, rest, limit, _), edges = term._constants, term.of_edges.of_triangles
+        (stiffness, rest, tilt, limit, _), edges = term._constants, term.of_edges.of_triangles
         shape, length = term.shape(x, frames), term.of_edges.length
     else:
-        stiffness, rest, limit, friction = term._constants(term._sliding(x, frames))
+        stiffness, rest, tilt, limit, friction = term._constants(term._sliding(x, frames))
         edges, shape = term._edges, term._sheet.shape(x, frames)
         length = term._sheet.of_edges.length
     rest = rest if len(rest) else np.zeros((term.n_elements, 3))
@@ -178,6 +178,9 @@ def midedge_blocks(
         double = np.linalg.norm(area)
         n, along = area / double, np.linalg.norm(sides, axis=1)
         director, spin = shape[edges[e]].reshape(3, 2, 3).transpose(1, 0, 2)
+        if len(tilt):
+            cosine, sine = tilt[e].T[:, :, None]
+            director = cosine * director - sine * np.cross(sides / along[:, None], director)
         tangent, before = data["sign"][e][:, None] * sides / along[:, None], frames.tangent[edges[e]]
         beside = 1.0 + np.sum(tangent * before, axis=1, keepdims=True)
         about = ((1.0 + beside) * tangent + before) / (along[:, None] * beside)

@@ -36,6 +36,30 @@ def irregular_rectangle(nx: int, ny: int, width: float, height: float, seed: int
     return vertices, _halved(nx, column, row, random.integers(0, 2, nx * ny) == 1)
 
 
+def walls(
+    section: Sequence[tuple[Sequence[float], Sequence[float]]],
+    n: int,
+    rows: int,
+    depth: float,
+    *,
+    alternating: bool = True,
+) -> tuple[Array, Ints]:
+    """Plane walls of n × rows cells, from (x, z) to (x, z) each and from y = 0 to ``depth``.
+
+    Where two or more of them meet they share vertices and edges.
+    """
+    flat, faces = rectangle(n, rows, 1.0, depth, alternating=alternating)
+    each = []
+    for start, end in section:
+        x, z = (np.asarray(start)[:, None] + np.subtract(end, start)[:, None] * flat[:, 0]).tolist()
+        each.append(np.column_stack([x, flat[:, 1], z]))
+    vertices = np.concatenate(each)
+    size = np.ptp(vertices, axis=0).max()
+    _, first, number = np.unique((vertices / size).round(9), axis=0, return_index=True, return_inverse=True)
+    triangles = np.concatenate([faces + k * len(flat) for k in range(len(each))])
+    return vertices[first], number.ravel()[triangles]
+
+
 SIDES = ("left", "right", "bottom", "top")
 
 

@@ -157,7 +157,8 @@ class ScriptFiles:
             line = text.count("\n", 0, found.start()) + 1
             raise InputError(f"line {line}: is no text file, hence no gmsh script", file=path)
         script = _Script(path, list(_code(text, path)))
-        self._keep(path, place, _without_comments(text).encode("latin-1"))
+        # gmsh leaves out a last line that does not end
+        self._keep(path, place, (_without_comments(text) + "\n").encode("latin-1"))
         _check_jumps(script, self.contents[place].decode("latin-1"))
         _collect_names(script)
         self.scripts.append(script)

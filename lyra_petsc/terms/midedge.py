@@ -3,14 +3,15 @@
 An edge carries a director (``midedge_shape``), which stands for the sheet's normal in its middle. Per
 triangle of rest area A, with rest lengths l_i and rest normals m_i of the edges in material axes::
 
-    κ = −Σ_i (T(α_i) − T(ᾱ_i)) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
+    κ = −Σ_i T(α_i − ᾱ_i) (l_i / A) (m_x², m_y², 2 m_x m_y)_i
     energy = ½ A (κ − κ̄)ᵀ D (κ − κ̄)
 
-κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles at rest, κ̄ is
-the material's rest curvature and D its stiffness [N·m]. T is the tangent of angles up to 45° and grows less
-beyond, where other edges than its own feel less of it (``midedge_shape``). As κ is linear in the three T the
-energy is a quadratic form of theirs. The director's angle has no mass: it is where moments balance, which
-makes edges of one, two or more triangles alike. A triangle's stencil is its own corners and edges.
+κ = (κ11, κ22, 2 κ12) is positive where the sheet bends towards its normal; ᾱ are the angles of the rest
+shape, κ̄ is the material's rest curvature and D its stiffness [N·m]. T is the tangent of angles up to 45° and
+grows less beyond, where other edges than its own feel less of it (``midedge_shape``). As κ is linear in the
+three T the energy is a quadratic form of theirs. The director's angle has no mass: it is where moments
+balance, which makes edges of one, two or more triangles alike. A triangle's stencil is its own corners and
+edges.
 
 Sources: constant curvatures from rotations of the edges are Morley's plate (Aeronautical Quarterly 19 (1968)
 149-169); on curved sheets Grinspun, Gingold, Reisman & Zorin, Computing discrete shape operators on general
@@ -31,6 +32,7 @@ from lyra_petsc.arrays import Array, Ints, Mask
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
+from lyra_petsc.scene.materials.library import is_isotropic
 from lyra_petsc.scene.schema import AXES, Scene
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
@@ -54,15 +56,23 @@ from lyra_petsc.terms.term import LARGEST_TURN, Elastic, Offsets, Term, Upcoming
 AnyInts = NDArray[np.int32] | NDArray[np.int64]
 
 STEEPEST = np.radians(89.95)
-"""Angle of a director at rest or at the start from which on a scene is refused: rounding would tell which way
-it is folded."""
+"""Angle of a director at the start from which on a scene is refused: rounding would tell which way it is
+folded."""
 
 (NO_FRICTION,) = unwritable(np.empty((0, 2)))
 FLAT = np.empty((0, 3))
 """In place of tangents without energy that are all 0."""
+UPRIGHT = np.empty((0, 3, 2))
+"""In place of cos ᾱ and sin ᾱ of angles that are all 0."""
 
-CREASED = np.tan(np.radians(30.0))
-"""tan α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
+CANCELLED = 1e-4
+"""Length of a sum of unit normals below which rounding would tell its direction."""
+
+NARROW = 0.02
+"""Part of the stiffness against twist from which on it is said that free edges would have less."""
+
+CREASED = np.radians(30.0)
+"""α of directors at rest, from which on an edge is a crease and no part of a smooth surface."""
 
 
 class Edges(NamedTuple):
@@ -93,16 +103,16 @@ class MidEdge(Elastic):
     ----------
     elements : Elements
         Stencil (E, 3), edges (E, 3) opposite the corners; data ``stiffness`` (E, 6) of the tangents [N·m],
-        ``rest`` (E, 3) tangents without energy, ``sign`` (E, 3) int8 1 where the triangle runs along an edge,
-        else −1, ``length`` (E, 3) of the edges [m], ``tangent`` and ``director`` (E, 3, 3) directions of
-        edges and directors before the start, ``material`` (E, 2, 2) the ways from the first corner to the
-        others in material axes [m], ``triangle`` (E,) int32 numbers in the mesh, ``height`` (E,) the smallest
-        [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
+        ``rest`` (E, 3) tangents without energy, ``tilt`` (E, 3, 2) cos ᾱ and sin ᾱ, ``sign`` (E, 3) int8 1
+        where the triangle runs along an edge, else −1, ``length`` (E, 3) of the edges [m], ``tangent`` and
+        ``director`` (E, 3, 3) directions of edges and directors before the start, ``material`` (E, 2, 2) the
+        ways from the first corner to the others in material axes [m], ``triangle`` (E,) int32 numbers in the
+        mesh, ``height`` (E,) the smallest [m], ``limit`` (E,) of |n|² [m⁴], ``damping`` (E,) [s].
     """
 
     def __init__(self, elements: Elements) -> None:
         data = elements.data
-        super().__init__(elements.without("tangent", "director", "length", "rest", "height"))
+        super().__init__(elements.without("tangent", "director", "length", "rest", "tilt", "height"))
         assert self.edges is not None
         places, first, index = np.unique(self.edges, return_index=True, return_inverse=True)
         triangle, side = np.divmod(first, 3)
@@ -113,7 +123,8 @@ class MidEdge(Elastic):
         self.of_edges = Edges(places, ends, data["length"].ravel()[first], index)
         self.frames = Frames(*(data[name].reshape(-1, 3)[first] for name in ("tangent", "director")))
         rest = data["rest"] if data["rest"].any() else FLAT
-        self._constants = data["stiffness"], rest, data["limit"], NO_FRICTION
+        tilt = tilt_of(data)
+        self._constants = data["stiffness"], rest, tilt, data["limit"], NO_FRICTION
         self._shapes: Remembered[Array] | None = None
         self._shapes_of: Frames | None = None
         self._at_end: Frames | None = None  # which have followed already
@@ -209,7 +220,7 @@ class MidEdge(Elastic):
             expected = -np.einsum("eij,ekj,ek->ei", e, e, height) / size
             expected += np.sum(before[:, :, 3:6] * (moved[:, [2, 0, 1]] - moved[:, [1, 2, 0]]), axis=2)
             turn = np.remainder(turned - angle + np.pi, 2.0 * np.pi) - np.pi
-        weight = np.minimum(np.minimum(square, left) / self._constants[2][chosen], 1.0)[:, None]
+        weight = np.minimum(np.minimum(square, left) / self._constants[3][chosen], 1.0)[:, None]
         weight = np.where(np.isfinite(turn) & np.isfinite(expected), weight, 0.0)
 
         def mean(values: Array) -> Array:
@@ -226,7 +237,7 @@ class MidEdge(Elastic):
         tangent = self._tangents(x)
         base = some_perpendicular(tangent)
         self.frames = Frames(tangent, base)
-        mean = mean_directors(x, self.stencil, self.of_edges.of_triangles, len(tangent))
+        mean = mean_directors(x, self.stencil, self.of_edges.of_triangles, len(tangent), self._constants[2])
         angle = np.arctan2(np.sum(np.cross(tangent, base) * mean, axis=1), np.sum(base * mean, axis=1))
         return np.asarray(self.of_edges.length * np.nan_to_num(angle))
 
@@ -376,10 +387,26 @@ def _angles(corners: Array, director: Array) -> tuple[Array, Array, Array, Array
     return np.arctan2(side, np.sum(director * normal[:, None, :], axis=2)), normal, square, edges
 
 
-def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int) -> Array:
-    """Means (n_edges, 3) of the unit normals of the triangles that have an edge, ``number`` (F, 3) of it."""
-    normals = np.repeat(normals_of(x, triangles), 3, axis=0)
-    total: Array = np.stack([np.bincount(number.ravel(), normals[:, i], n_edges) for i in range(3)], axis=1)
+def tilt_of(data: Mapping[str, Array]) -> Array:
+    """cos ᾱ and sin ᾱ (E, 3, 2) of elements, or nothing where all sheets are flat at rest."""
+    return data["tilt"] if data["tilt"][..., 1].any() else UPRIGHT
+
+
+def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, tilt: Array) -> Array:
+    """Means (n_edges, 3) of the directors without energy of the triangles that have an edge, ``number``
+    (F, 3) of it: of their unit normals, turned about the edge by ᾱ.
+
+    Where they cancel each other, as in a fold of 180° or a cross, that of the first triangle.
+    """
+    ways = np.repeat(normals_of(x, triangles)[:, None, :], 3, axis=1)
+    if len(tilt):
+        along = unit(x[triangles[:, [2, 0, 1]]] - x[triangles[:, [1, 2, 0]]])
+        ways = tilt[..., :1] * ways + tilt[..., 1:] * np.cross(along, ways)
+    ways, edges = ways.reshape(-1, 3), number.ravel()
+    total: Array = np.stack([np.bincount(edges, ways[:, i], n_edges) for i in range(3)], axis=1)
+    found, first = np.unique(edges, return_index=True)
+    lost = np.linalg.norm(total[found], axis=1) < CANCELLED
+    total[found[lost]] = ways[first[lost]]
     return unit(total)
 
 
@@ -398,7 +425,7 @@ def elements(rest: RestShape) -> Elements:
     Raises
     ------
     InputError
-        Where a shape is folded by 180°, at rest or at the start.
+        Where the start shape is folded by 180° and the rest shape is not.
     """
     chosen = np.flatnonzero(rest.bends_by("midedge"))
     mesh, triangles = rest.mesh, rest.mesh.triangles[chosen]
@@ -409,37 +436,33 @@ def elements(rest: RestShape) -> Elements:
     curvature = curvatures_of_tangents(material)
     stiffness = np.array([shell.plate_matrix for shell in rest.shells])[rest.shell_of[chosen]]
     form = area[:, None, None] * np.einsum("eki,ekl,elj->eij", curvature, stiffness, curvature)
+    rest.notes += _narrow(rest, chosen, number, size, area)
     # the two faces of a seam may have edges of different lengths
     count = np.bincount(number.ravel(), minlength=n_edges)
     length = np.bincount(number.ravel(), size.ravel(), n_edges) / np.maximum(count, 1)
 
     surface = ~mesh.flat_rest[chosen]
-    at_rest = np.zeros_like(size)
+    angle = np.zeros_like(size)  # at rest
     if surface.any():
-        director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges)
+        director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges, UPRIGHT)
         _mirror(director, rest, triangles, number, mesh.rest)
-        angle = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
-        _check(angle, number[surface], edges, rest, "rest shape")
-        at_rest[surface] = tangents_at(angle)
-        smooth = np.abs(at_rest).max(axis=1) < CREASED
-        rest.notes += _coarse(
-            rest,
-            chosen[smooth],
-            np.einsum("eki,ei->ek", curvature[smooth], at_rest[smooth]),
-            size[smooth].max(axis=1),
-        )
+        angle[surface] = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
+        rest.notes += _coarse(rest, chosen, curvature, angle, size.max(axis=1))
+    tilt = np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    at_rest = np.zeros_like(size)
     curved = np.array([shell.rest_curvature or (0.0, 0.0, 0.0) for shell in rest.shells]) * [1.0, 1.0, 2.0]
     if curved.any():
-        at_rest += np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
+        at_rest[:] = np.linalg.solve(curvature, curved[rest.shell_of[chosen]][:, :, None])[:, :, 0]
         _check_curved(at_rest, rest, chosen, size)
-    director = mean_directors(mesh.positions, triangles, number, n_edges)
+    director = mean_directors(mesh.positions, triangles, number, n_edges, tilt)
     _mirror(director, rest, triangles, number, mesh.positions)
     director = director[number]
-    _check(_angles_of(mesh.positions, triangles, director), number, edges, rest, "start shape")
+    _check(_angles_of(mesh.positions, triangles, director) - angle, number, edges, rest)
     ends: Array = mesh.positions[edges[number]]
     data = {
         "stiffness": np.stack([form[:, i, j] for i in range(3) for j in range(i, 3)], axis=1),
         "rest": at_rest,
+        "tilt": tilt,
         "sign": sign,
         "length": length[number],
         "tangent": unit(ends[:, :, 1] - ends[:, :, 0]),
@@ -453,18 +476,25 @@ def elements(rest: RestShape) -> Elements:
     return Elements(triangles, data, edges=number)
 
 
-def _coarse(rest: RestShape, chosen: Ints, curvature: Array, longest: Array) -> list[str]:
-    """What to say of triangles ``chosen`` with these curvatures (n, 3) at rest and longest edges (n,) [m].
+def _coarse(rest: RestShape, chosen: Ints, of_tangents: Array, angle: Array, longest: Array) -> list[str]:
+    """What to say of triangles ``chosen`` with these curvatures of tangents (n, 3, 3), angles (n, 3) at rest
+    and longest edges (n,) [m].
 
     Flat triangles resolve a shell of thickness t and radius R with edges below √(t R); t = √(12 B / C) is
-    that of a sheet of bending stiffness B and membrane stiffness C.
+    that of a sheet of bending stiffness B and membrane stiffness C. Where walls meet they count as a crease:
+    a smooth surface bends at most triangles about each corner.
     """
+    creased = np.abs(angle).max(axis=1) >= CREASED
+    curvature = np.einsum("eki,ei->ek", of_tangents, np.tan(np.where(creased[:, None], 0.0, angle)))
     mean, half = 0.5 * (curvature[:, 0] + curvature[:, 1]), 0.5 * (curvature[:, 0] - curvature[:, 1])
     largest = np.abs(mean) + np.hypot(half, 0.5 * curvature[:, 2])
     thickness = np.array(
         [np.sqrt(12.0 * max(s.plate[0], s.plate[2]) / max(s.c11, s.c22)) for s in rest.shells]
     )[rest.shell_of[chosen]]
     bent = largest * longest > 1e-3
+    corners, n = rest.mesh.triangles[chosen], rest.mesh.n_vertices
+    about = np.bincount(corners.ravel(), minlength=n), np.bincount(corners[bent].ravel(), minlength=n)
+    bent &= (2 * about[1] > about[0])[corners].all(axis=1)
     coarse = bent & (largest * longest**2 > thickness)
     if not 2 * coarse.sum() > bent.sum():
         return []
@@ -473,6 +503,38 @@ def _coarse(rest: RestShape, chosen: Ints, curvature: Array, longest: Array) -> 
         f"{coarse.sum()} triangles are large for the curvature of their rest shape, with edges of "
         f"{np.median(longest[coarse]):.3g} m: flat triangles make such a shell too stiff, or too soft under "
         f"point loads, unless their edges are well below √(t R) = {fine:.3g} m"
+    ]
+
+
+def _narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Array) -> list[str]:
+    """What to say of sheets with free edges that are hardly wider than thick.
+
+    Beside a free edge a shell of thickness t twists as if 0.315 t of its width were missing, which needs
+    transverse shear: a strip of width b has the torsional stiffness G b t³/3 (1 − 0.63 t/b).
+
+    Source: S. P. Timoshenko, J. N. Goodier, Theory of Elasticity, 3rd ed. 1970, § 109.
+    """
+    mesh, materials = rest.mesh, rest.scene.material
+    thickness = np.array(
+        [
+            np.sqrt(12.0 * shell.plate[0] / shell.c11)
+            if material.young is not None or is_isotropic(material.cloth)
+            else 0.0
+            for shell, material in zip(rest.shells, materials, strict=True)
+        ]
+    )[rest.shell_of[chosen]]
+    free = np.bincount(number.ravel())[number] == 1
+    for handle, each in enumerate(rest.scene.handles):
+        if each.clamp or each.symmetry is not None:
+            held = select_vertices(mesh, each, key=f"handles[{handle}]", file=rest.scene.source)
+            ends = mesh.triangles[chosen][:, [[1, 2], [2, 0], [0, 1]]]
+            free &= ~np.isin(ends, held).all(axis=2)
+    lost = 0.315 * float(thickness @ np.sum(size * free, axis=1)) / float(area[thickness > 0.0].sum() or 1.0)
+    if lost < NARROW:
+        return []
+    return [
+        f"beside free edges of sheets as thick as these transverse shear, which there is none of, would let "
+        f"them twist by {lost:.0%} more"
     ]
 
 
@@ -507,15 +569,16 @@ def _angles_of(x: Array, triangles: Ints, director: Array) -> Array:
     return _angles(x[triangles], director)[0]
 
 
-def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape, what: str) -> None:
-    """Refuse edges at which a shape is folded by nearly 180°."""
-    steep = np.flatnonzero(~(np.abs(angle.ravel()) < STEEPEST))
+def _check(angle: Array, number: Ints, edges: Ints, rest: RestShape) -> None:
+    """Refuse edges at which the start shape is folded by nearly 180° from the rest shape."""
+    turned = np.abs(np.remainder(angle.ravel() + np.pi, 2.0 * np.pi) - np.pi)
+    steep = np.flatnonzero(~(turned < STEEPEST))
     if len(steep):
         a, b = edges[number.ravel()[steep[0]]]
         raise InputError(
-            f"the {what} is folded by 179.9° or more at the edge of vertices {a} and {b}, and bending_model: "
-            "midedge cannot tell to which side; open the fold (or, where sheets meet, turn one over), "
-            "or take bending_model: hinge",
+            f"the start shape is folded by 179.9° or more at the edge of vertices {a} and {b}, the rest "
+            "shape is not, and bending_model: midedge cannot tell to which side; open the fold (or, where "
+            "sheets meet, turn one over), or take bending_model: hinge",
             file=rest.scene.source,
             key="mesh",
         )

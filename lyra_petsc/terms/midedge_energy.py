@@ -20,7 +20,8 @@ against it. The second derivatives are, as for the angle of a hinge (``hinge.tri
 with σ = 1 and −1 at the ends of the edge and 0 opposite it. ``blend`` 0 is exact, 1 the positive-semidefinite
 ∇f K ∇fᵀ.
 
-Where ``rest``, T̄, is empty all of it is 0. With friction, ``friction`` (E, 2) has for each triangle a factor
+Where ``rest``, T̄, is empty all of it is 0. Angles are those from the rest shape's: ``tilt`` is as for
+``midedge_shape.tangents``. With friction, ``friction`` (E, 2) has for each triangle a factor
 c and an energy [J]: by the latter the energy is more, and by c p pᵀ, of the pulls p_i = ∂E/∂α_i, the exact
 Hessian; without, it is empty.
 """
@@ -36,7 +37,7 @@ from lyra_petsc.kernels.element import kernel
 from lyra_petsc.kernels.vectors import add_corners, fetch
 from lyra_petsc.terms.hinge import cross, dot, minus, point, scaled
 from lyra_petsc.terms.hinge_energy import GONE, add_square_hessian, fade
-from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of
+from lyra_petsc.terms.midedge_shape import edges_of, fading_tangent, row, tangent_of, turned_back
 
 AHEAD = 4
 """Triangles by which blocks are fetched before they are added to: each takes longer than other elements."""
@@ -108,18 +109,22 @@ def _got(batch, at, i):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _load(x, stencil, edges, shape, first, batch):  # type: ignore[no-untyped-def]
-    """Into rows 0 to 26 of a batch e_i, directors, γ_i of triangles from ``first`` on; the last fills it."""
+def _load(x, stencil, edges, shape, tilt, first, batch):  # type: ignore[no-untyped-def]
+    """Into rows 0 to 26 of a batch e_i, directors, γ_i of triangles from ``first`` on; the last fills it.
+
+    Directors are those that ``turned_back`` makes of them.
+    """
     last = stencil.shape[0] - 1
     for number in range(BATCH):
         e, i = min(first + number, last), Index(number)
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
-        _put(batch, 0, i, minus(x2, x1))
-        _put(batch, 3, i, minus(x0, x2))
-        _put(batch, 6, i, minus(x1, x0))
-        _put(batch, 9, i, row(shape, edges[e, 0], 0))
-        _put(batch, 12, i, row(shape, edges[e, 1], 0))
-        _put(batch, 15, i, row(shape, edges[e, 2], 0))
+        e0, e1, e2 = minus(x2, x1), minus(x0, x2), minus(x1, x0)
+        _put(batch, 0, i, e0)
+        _put(batch, 3, i, e1)
+        _put(batch, 6, i, e2)
+        _put(batch, 9, i, turned_back(shape, edges, tilt, e, 0, e0))
+        _put(batch, 12, i, turned_back(shape, edges, tilt, e, 1, e1))
+        _put(batch, 15, i, turned_back(shape, edges, tilt, e, 2, e2))
         _put(batch, 18, i, row(shape, edges[e, 0], 3))
         _put(batch, 21, i, row(shape, edges[e, 1], 3))
         _put(batch, 24, i, row(shape, edges[e, 2], 3))
@@ -150,13 +155,13 @@ def _compute_tangents(batch):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  # type: ignore[no-untyped-def]
+def energies(x, stencil, edges, shape, stiffness, rest, tilt, limit, friction, out):  # type: ignore[no-untyped-def]
     """Energy [J] of the first len(out) triangles; infinite where an edge is too far from its frame."""
     batch = np.empty(31 * BATCH)
     for e in range(out.shape[0]):
         i = Index(e % BATCH)
         if i == 0:
-            _load(x, stencil, edges, shape, e, batch)
+            _load(x, stencil, edges, shape, tilt, e, batch)
             _compute_tangents(batch)
         square = batch[Index(BATCH * 30) + i]
         k, bar = _six(stiffness, e), _at_rest(rest, e)
@@ -171,9 +176,9 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  
         if square <= GONE * limit[e]:
             out[e] = 0.0
             continue
-        t0, _, _, s0, _, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-        t1, _, _, s1, _, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-        t2, _, _, s2, _, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+        t0, _, _, s0, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)
+        t1, _, _, s1, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)
+        t2, _, _, s2, _, _ = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)
         out[e] = 0.5 * _twice(_own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2))
         if friction.shape[0] > 0:
             out[e] += friction[e, 1]
@@ -185,14 +190,14 @@ def energies(x, stencil, edges, shape, stiffness, rest, limit, friction, out):  
 
 @kernel()
 def add_gradient(  # type: ignore[no-untyped-def]
-    x, stencil, edges, places, sign, shape, stiffness, rest, limit, friction, length, out
+    x, stencil, edges, places, sign, shape, stiffness, rest, tilt, limit, friction, length, out
 ):
     """Add the energy's gradient [N] to out (n_local, 3); edge unknowns are φ times ``length`` (n_edges,)."""
     flat, batch = out.reshape(-1), np.empty(31 * BATCH)
     for e in range(stencil.shape[0]):
         at = Index(e % BATCH)
         if at == 0:
-            _load(x, stencil, edges, shape, e, batch)
+            _load(x, stencil, edges, shape, tilt, e, batch)
             _compute_tangents(batch)
         e0, e1, e2 = _got(batch, 0, at), _got(batch, 3, at), _got(batch, 6, at)
         normal, square = cross(e1, e2), batch[Index(BATCH * 30) + at]
@@ -203,9 +208,9 @@ def add_gradient(  # type: ignore[no-untyped-def]
             square = dot(normal, normal)
             if square <= GONE * limit[e]:
                 continue
-            t0, a0, _, s0, b0, _ = tangent_of(row(shape, edges[e, 0], 0), e0, normal)
-            t1, a1, _, s1, b1, _ = tangent_of(row(shape, edges[e, 1], 0), e1, normal)
-            t2, a2, _, s2, b2, _ = tangent_of(row(shape, edges[e, 2], 0), e2, normal)
+            t0, a0, _, s0, b0, _ = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)
+            t1, a1, _, s1, b1, _ = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)
+            t2, a2, _, s2, b2, _ = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)
         k, bar = _six(stiffness, e), _at_rest(rest, e)
         own, others = _own(k, bar, t0, t1, t2), _others(k, bar, s0, s1, s2)
         p0, p1, p2 = own[0] * a0 + others[0] * b0, own[1] * a1 + others[1] * b1, own[2] * a2 + others[2] * b2
@@ -538,6 +543,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
     shape,
     stiffness,
     rest,
+    tilt,
     limit,
     friction,
     length,
@@ -556,7 +562,7 @@ def add_hessian(  # type: ignore[no-untyped-def]
         _fetch_ahead(e, corners, offsets, values)
         i = Index(e % BATCH)
         if i == 0:
-            _load(x, stencil, edges, shape, e, batch)
+            _load(x, stencil, edges, shape, tilt, e, batch)
             _load_constants(edges, sign, stiffness, rest, friction, length, e, batch)
             _compute(exact, batch)
         square = batch[Index(BATCH * 94) + i]
@@ -572,9 +578,9 @@ def add_hessian(  # type: ignore[no-untyped-def]
             if square <= GONE * limit[e]:
                 continue
             tangents = (
-                tangent_of(row(shape, edges[e, 0], 0), e0, normal),
-                tangent_of(row(shape, edges[e, 1], 0), e1, normal),
-                tangent_of(row(shape, edges[e, 2], 0), e2, normal),
+                tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal),
+                tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal),
+                tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal),
             )
             spins = row(shape, edges[e, 0], 3), row(shape, edges[e, 1], 3), row(shape, edges[e, 2], 3)
             k, bar, q = _six(stiffness, e), _at_rest(rest, e), _got(batch, 39, i)

@@ -66,6 +66,7 @@ class MidEdgeFriction(Elastic):
         super().__init__(elements)
         data = elements.data
         self.bent: Array = data["rest"].copy()
+        self._tilt = midedge.tilt_of(data)
         self._slides: Remembered[tuple[Array, ...]] | None = None
         self._frames: Frames | None = None
 
@@ -92,7 +93,7 @@ class MidEdgeFriction(Elastic):
 
     def _computed(self, x: Array, frames: Frames) -> Sliding:
         half, data = np.empty(self.n_elements), self.elements.data
-        constants = data["stiffness"], self.bent, np.zeros(self.n_elements), NO_FRICTION
+        constants = data["stiffness"], self.bent, self._tilt, np.zeros(self.n_elements), NO_FRICTION
         shape = self._sheet.shape(x, frames)
         midedge_energy.energies(x, self.stencil, self._edges, shape, *constants, half)
         reach, size = data["reach"], np.sqrt(2.0 * np.maximum(half, 0.0))
@@ -104,7 +105,7 @@ class MidEdgeFriction(Elastic):
     def _constants(self, sliding: Sliding) -> tuple[Array, ...]:
         data = self.elements.data
         stiffness = data["stiffness"] * sliding.part[:, None]
-        return stiffness, self.bent, data["limit"], sliding.friction
+        return stiffness, self.bent, self._tilt, data["limit"], sliding.friction
 
     def energies(self, x: Array, frozen: Frames) -> Array:
         out, shape = np.empty(self.n_owned), self._sheet.shape(x, frozen)
@@ -150,7 +151,7 @@ class MidEdgeFriction(Elastic):
     def _bent_at(self, x: Array, frames: Frames) -> Array:
         """What ``bent`` is to be where the step ends at x."""
         found, part = np.empty((self.n_elements, 3)), self._sliding(x, frames).part[:, None]
-        tangents(x, self.stencil, self._edges, self._sheet.shape(x, frames), found)
+        tangents(x, self.stencil, self._edges, self._sheet.shape(x, frames), self._tilt, found)
         return np.where((part < 1.0) & np.isfinite(found), found - part * (found - self.bent), self.bent)
 
     def _become(self, bent: Array) -> None:

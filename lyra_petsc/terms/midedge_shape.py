@@ -13,6 +13,9 @@ normals m_i = t_i × n in its plane, α_i is the angle about t_i from n to the d
 
     tan α_i = (d_i · m_i) / (d_i · n)
 
+Where the rest shape has an angle ᾱ_i, what bends is α_i − ᾱ_i, which stands for α_i in all that follows: by
+tan α_i − tan ᾱ_i the triangles beside a crease of 90° would be four times too stiff.
+
 Up to 45° T(α) = S(α) = tan α. Beyond, T goes on along its tangent, ± (1 + 2 (|α| − π/4)) to 180°, and S,
 which couples the edges, returns to 0 there: no mesh resolves folds of more than 90° at one edge, and
 triangles that turn over, which lose their normal for a moment, must be able to pass their directors.
@@ -169,6 +172,16 @@ def edges_of(x0, x1, x2):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline="always")
+def turned_back(shape, edges, tilt, e, i, edge):  # type: ignore[no-untyped-def]
+    """The director of edge i of triangle e, turned about the edge by −ᾱ."""
+    d = row(shape, edges[e, i], 0)
+    if tilt.shape[0] == 0:
+        return d
+    side, c, s = cross(edge, d), tilt[e, i, 0], -tilt[e, i, 1] / math.sqrt(dot(edge, edge))
+    return c * d[0] + s * side[0], c * d[1] + s * side[1], c * d[2] + s * side[2]
+
+
+@kernel(inline="always")
 def tangent_of(d, e, normal):  # type: ignore[no-untyped-def]
     """T, T', T'', S, S', S'' at α of a director on an edge of a triangle with this normal N."""
     height, side = dot(d, normal), dot(d, cross(e, normal)) / math.sqrt(dot(e, e))
@@ -213,11 +226,14 @@ def tangents_at(angle: Array) -> Array:
 
 
 @kernel()
-def tangents(x, stencil, edges, shape, out):  # type: ignore[no-untyped-def]
-    """T(α_i) of triangles (E, 3) into out (E, 3)."""
+def tangents(x, stencil, edges, shape, tilt, out):  # type: ignore[no-untyped-def]
+    """T of triangles (E, 3) into out (E, 3), of α_i − ᾱ_i by ``tilt`` (E, 3, 2), cos ᾱ and sin ᾱ.
+
+    It may be empty, as those of sheets that are flat at rest.
+    """
     for e in range(stencil.shape[0]):
         x0, x1, x2 = point(x, stencil[e, 0]), point(x, stencil[e, 1]), point(x, stencil[e, 2])
         e0, e1, e2, normal, _ = edges_of(x0, x1, x2)
-        out[e, 0] = tangent_of(row(shape, edges[e, 0], 0), e0, normal)[0]
-        out[e, 1] = tangent_of(row(shape, edges[e, 1], 0), e1, normal)[0]
-        out[e, 2] = tangent_of(row(shape, edges[e, 2], 0), e2, normal)[0]
+        out[e, 0] = tangent_of(turned_back(shape, edges, tilt, e, 0, e0), e0, normal)[0]
+        out[e, 1] = tangent_of(turned_back(shape, edges, tilt, e, 1, e1), e1, normal)[0]
+        out[e, 2] = tangent_of(turned_back(shape, edges, tilt, e, 2, e2), e2, normal)[0]

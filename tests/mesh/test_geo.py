@@ -96,6 +96,12 @@ def test_fixed_divisions_win_and_are_told(script: Path) -> None:
     assert "fixes its divisions" in note
 
 
+def test_a_last_line_counts_however_it_ends(script: Path) -> None:
+    """gmsh on its own leaves it out without a word."""
+    script.write_text(SQUARE + 'Physical Surface("square") = {1}; Physical Curve("west") = {4};')
+    assert set(mesh_of(script).groups) == {"west", "square"}
+
+
 def test_a_script_may_mesh_by_itself_and_have_groups_on_parts_only(script: Path) -> None:
     script.write_text(SQUARE + 'Physical Curve("west") = {4};\nMesh.ElementOrder = 2;\nMesh 2;\n')
     mesh = mesh_of(script)

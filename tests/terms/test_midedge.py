@@ -27,7 +27,7 @@ from physics import (
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.bench import Bench
-from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.meshes import rectangle, walls
 from lyra_petsc.experiments.verification.cases.shells import open_cylinder_scene, slit_annulus_scene
 from lyra_petsc.output.recorder import Recorder
 from lyra_petsc.stepping.simulation import SteppedScene as Run
@@ -173,7 +173,7 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
         shape, length, weight = term.shape(x, term.frames), term.of_edges.length, np.ones(term.n_elements)
         data, offsets = term.elements.data, rows.pattern.offsets
         angle = np.empty((term.n_elements, 3))
-        tangents(x, term.stencil, term.of_edges.of_triangles, shape, angle)
+        tangents(x, term.stencil, term.of_edges.of_triangles, shape, midedge.UPRIGHT, angle)
         assert 0.1 < np.mean(np.abs(angle) > 1.0) < 0.9
         assert term.n_elements % midedge_energy.BATCH
 
@@ -184,7 +184,8 @@ def test_triangles_that_are_computed_together_do_not_mix() -> None:
                 part = slice(first, first + size)
                 triangles, edges = term.stencil[part], term.of_edges.of_triangles[part]
                 sign, at = data["sign"][part], term.edges[part]
-                constants = data["stiffness"][part], midedge.FLAT, data["limit"][part], midedge.NO_FRICTION
+                flat = midedge.FLAT, midedge.UPRIGHT
+                constants = data["stiffness"][part], *flat, data["limit"][part], midedge.NO_FRICTION
                 midedge_energy.energies(x, triangles, edges, shape, *constants, energies[part])
                 midedge_energy.add_gradient(x, triangles, edges, at, sign, shape, *constants, length, pull)
                 corners, mixed = offsets["midedge vertices"][part], offsets["midedge"][part]
@@ -403,6 +404,43 @@ def test_a_run_goes_on_with_other_ranks(comm: MPI.Comm, scheme: str, shared_tmp:
         np.testing.assert_allclose(x, whole, rtol=0.0, atol=1e-8)
 
 
+CORNER, LEAN = (0.0, 1.0), (np.sin(np.radians(20.0)), 1.0 - np.cos(np.radians(20.0)))
+COLUMN = ((0.0, 0.0), CORNER)
+
+
+@pytest.mark.parametrize(
+    ("beams", "axis", "compliance"),
+    [
+        ([(CORNER, (1.0, 1.0))], 2, 1.0 / 3.0 + 1.0),
+        ([(CORNER, LEAN)], 0, (LEAN[1] - 1.0) ** 2 / 3.0 + ((1.0 - LEAN[1]) ** 3 + LEAN[1] ** 3) / 3.0),
+        ([(CORNER, (1.0, 1.0)), ((-1.0, 1.0), CORNER)], 2, 1.0 / 3.0 + 1.0 / 8.0),
+    ],
+    ids=["right angle", "fold of 160°", "three at an edge"],
+)
+def test_walls_that_meet_bend_as_beams(
+    beams: list[Any], axis: int, compliance: float, tmp_path: Path
+) -> None:
+    """A clamped column, to whose top beams of the same strip are fixed, with a force at the end of one."""
+    errors = []
+    for n in (8, 16):
+        vertices, faces = walls([COLUMN, *beams], n, n // 4, 0.25)
+        end, force = np.flatnonzero(np.isclose(vertices[:, [0, 2]], beams[0][1]).all(axis=1)), np.zeros(3)
+        force[axis] = 1e-4
+        clamps = [{"box": [[x - 1e-6, -1, z - 1e-6], [x + 1e-6, 1, z + 1e-6]]} for x, z in ((0, 0), (-1, 1))]
+        content = {
+            "mesh": obj_file(tmp_path / "frame.obj", vertices, faces),
+            "material": STIFF | {"bending": PLATE | {"d12": 0.0, "d33": 0.5}},
+            "gravity": [0, 0, 0],
+            "handles": [clamp | {"clamp": True} for clamp in clamps[: len(beams)]],
+            "loads": [{"nodes": end.tolist(), "force": force.tolist()}],
+            "time": {"analysis": "static", "step": 1.0},
+        }
+        way = (outcome(MPI.COMM_SELF, content)[0] - vertices)[end, axis].mean()
+        errors.append(abs(way / (4e-4 * compliance) - 1.0))
+    assert errors[0] < 0.03
+    assert errors[1] < 0.35 * errors[0]
+
+
 # -- rest shapes and refusals --------------------------------------------------------------------------
 
 
@@ -433,24 +471,48 @@ def test_rest_curvature_rolls_a_strip_up(pattern: str) -> None:
     assert energies[2] < 1e-3 * 0.5 * 0.25 * 0.25
 
 
-def folded(path: Path, degrees: float) -> dict[str, Any]:
-    """Two triangles, folded by so many degrees at the edge of vertices 0 and 1."""
-    angle = np.radians(180.0 - degrees)
-    corners: Sequence[Sequence[float]] = [
-        (0, 0, 0), (0, 1, 0), (1, 0.5, 0), (np.cos(angle), 0.5, np.sin(angle)),
-    ]  # fmt: skip
-    return obj_file(path, corners, [(0, 2, 1), (0, 1, 3)])
+def fan(path: Path, *degrees: float, flat: bool = False) -> dict[str, Any]:
+    """Triangles in such directions about the edge of vertices 0 and 1; ``flat``: at rest side by side."""
+    angles = np.radians(degrees)
+    corners = [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), *((np.cos(a), 0.5, np.sin(a)) for a in angles)]
+    # those of half a turn run along the edge as the others do
+    faces = [(0, 2 + k, 1) if k % 2 == 0 else (0, 1, 2 + k) for k in range(len(angles))]
+    mesh = obj_file(path, corners, faces)
+    if flat:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = [*lines[:4], "vt 0 0", "vt 0 1", "vt 1 0.5", "vt -1 0.5", "f 1/1 3/3 2/2", "f 1/1 2/2 4/4"]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return mesh
 
 
-def test_a_fold_of_nearly_180_degrees_is_refused(tmp_path: Path) -> None:
+def test_a_start_folded_by_180_degrees_is_refused(tmp_path: Path) -> None:
+    """Where the rest shape is flat nothing says to which side."""
     material = STIFF | {"bending_model": "midedge"}
-    with Simulation({"mesh": folded(tmp_path / "a.obj", 170.0), "material": material}, MPI.COMM_SELF):
+    with Simulation(
+        {"mesh": fan(tmp_path / "a.obj", 0, 0.2, flat=True), "material": material}, MPI.COMM_SELF
+    ):
         pass
-    with Simulation({"mesh": folded(tmp_path / "c.obj", 179.8), "material": material}, MPI.COMM_SELF) as one:
-        assert np.abs(gradient(midedge_of(one), one.system.x, midedge_of(one).frames)).max() < 1e-9
-    content = scene_of({"mesh": folded(tmp_path / "b.obj", 179.95), "material": material})
+    content = scene_of({"mesh": fan(tmp_path / "b.obj", 0, 0.05, flat=True), "material": material})
     with pytest.raises(InputError, match=r"folded by 179.9° or more at the edge of vertices 0 and 1"):
         Run(MPI.COMM_SELF, content)
+
+
+@pytest.mark.parametrize(
+    "degrees", [(0, 0), (0, 10), (0, 120, 240), (0, 90, 180, 270), (0, 180, 90)], ids=str
+)
+def test_folds_and_branches_at_rest(degrees: Sequence[float], tmp_path: Path) -> None:
+    """Triangles resist being turned against the others as much as in a flat pair, however they meet."""
+    stiffness = []
+    for number, each in enumerate((degrees, (0, 180))):
+        content = {"mesh": fan(tmp_path / f"{number}.obj", *each), "material": STIFF | {"bending": PLATE}}
+        with Simulation(content, MPI.COMM_SELF) as simulation:
+            term, x = midedge_of(simulation), simulation.system.x.copy()
+            assert np.abs(gradient(term, x, term.frames)).max() < 1e-12
+            x.ravel()[term.edge_places] = term.anew(x)
+            assert term.energies(x, term.frames).max() < 1e-24
+            tip = np.flatnonzero(np.isclose(x, [1.0, 0.5, 0.0]).all(axis=1))[0]
+            stiffness.append(hessian(term, x, term.frames)[tip, 2, tip, 2])
+    assert stiffness[0] == pytest.approx(stiffness[1])
 
 
 def test_curvature_that_no_edge_can_turn_is_refused() -> None:
@@ -472,19 +534,55 @@ def test_a_coarse_shell_is_noted(tmp_path: Path, n: int) -> None:
     bent = np.column_stack([np.sin(flat[:, 0]), flat[:, 1], np.cos(flat[:, 0])])
     material = {"young": 1e6, "poisson": 0.0, "thickness": 0.01, "density": 1.0}
     content = {"mesh": obj_file(tmp_path / "shell.obj", bent, faces), "material": material}
-    simulation = Run(MPI.COMM_SELF, scene_of(content))
-    noted = [note for note in simulation.notes if "large for the curvature" in note]
-    assert len(noted) == (1 if n == 8 else 0)
-    assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in noted)
-    simulation.destroy()
+    found = coarse(content)
+    assert len(found) == (1 if n == 8 else 0)
+    assert all("√(t R) = 0.1 m" in note or "√(t R) = 0.0" in note for note in found)
 
 
 def test_creases_are_not_noted(tmp_path: Path) -> None:
     """The walls of a box are flat, however thin and whatever their triangles."""
-    content = {"mesh": folded(tmp_path / "b.obj", 90.0), "material": STIFF | {"bending": PLATE}}
+    content = {"mesh": fan(tmp_path / "b.obj", 0, 90), "material": STIFF | {"bending": PLATE}}
+    assert not coarse(content)
+
+
+def coarse(content: dict[str, Any]) -> list[str]:
+    """What is noted of triangles that are too large."""
+    return noted(content, "large for the curvature")
+
+
+def noted(content: dict[str, Any], words: str) -> list[str]:
     simulation = Run(MPI.COMM_SELF, scene_of(content))
-    assert not [note for note in simulation.notes if "large for the curvature" in note]
+    found = [note for note in simulation.notes if words in note]
     simulation.destroy()
+    return found
+
+
+@pytest.mark.parametrize("thickness", [0.01, 0.1])
+def test_strips_as_narrow_as_thick_are_noted(thickness: float) -> None:
+    """Ten times as wide as thick they twist 0.63/10 too little; clamped and symmetric edges are not free."""
+    content = {
+        "mesh": grid(8.0, 1.0, 16, 2),
+        "material": {"young": 1e6, "poisson": 0.3, "thickness": thickness, "density": 1.0},
+        "handles": [{"group": "left", "clamp": True}, {"group": "right", "symmetry": "x"}],
+    }
+    found = noted(content, "transverse shear")
+    assert len(found) == (1 if thickness == 0.1 else 0)
+    assert all("twist by 6% more" in note for note in found)
+    everywhere = [{"group": "sheet", "clamp": True}]
+    assert not noted(content | {"handles": everywhere}, "transverse shear")
+
+
+def test_walls_that_meet_are_not_noted(tmp_path: Path) -> None:
+    """An angle of 45° is no curvature where the walls beside it are flat, nor is that of a third wall."""
+    material = {"young": 1e6, "poisson": 0.0, "thickness": 0.001, "density": 1.0}
+    half = np.sqrt(0.5)
+    tube = [(0, 0), (1, 0), (1 + half, half), (1 + half, 1 + half), (1, 1 + 2 * half)]
+    for name, parts in {
+        "tube": pairwise(tube),
+        "tee": [COLUMN, (CORNER, (1.0, 1.0)), ((-1.0, 1.0), CORNER)],
+    }.items():
+        vertices, faces = walls(list(parts), 8, 2, 0.25)
+        assert not coarse({"mesh": obj_file(tmp_path / f"{name}.obj", vertices, faces), "material": material})
 
 
 def test_one_sheet_bends_by_one_model() -> None:

@@ -13,6 +13,7 @@ from lyra_petsc.experiments.verification.cases import CASES
 
 SOME = (
     "free-fall", "hinge-strip", "hinge-sheet", "hinge-plate", "strip-vibration", "wide-strip", "column",
+    "frames",
 )  # fmt: skip
 """Cases that are run whatever is selected: each takes no more than a second or two."""
 
@@ -24,6 +25,7 @@ LONG = (
     "table-edge", "cusick", "clamped-disc", "twisted-beam", "released-mode", "open-hemisphere",
     "hyperbolic-paraboloid", "scordelis-lo-roof", "stretched-membrane", "roll-up", "plate-curvature",
     "heavy-cantilever", "tip-load", "catenary-elastic", "sze-end-shear", "uniaxial-pull", "wind-drag",
+    "frames", "sections",
 )  # fmt: skip
 """Cases whose finest resolutions take long."""
 

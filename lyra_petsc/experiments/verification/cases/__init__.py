@@ -18,6 +18,7 @@ CASES: Registry[VerificationCase] = Registry(
         ("shells", "sze-end-shear sze-end-moment clamped-disc slit-annulus scordelis-lo-roof"),
         ("shells", "pinched-cylinder open-hemisphere hyperbolic-paraboloid twisted-beam open-cylinder"),
         ("shells", "hinged-roof"),
+        ("sections", "frames sections"),
         ("plates", "plate-curvature plate-vibration"),
         ("cantilevers", "column post-buckling lateral-buckling elastica-tip elastica-weight"),
         ("cantilevers", "elastica-roll-up elastica-overhang tip-load roll-up heavy-cantilever"),

@@ -374,7 +374,7 @@ IN_PLANE = ["x", "y"]
 SECANTS, CLOSE = 8, 1e-5
 
 
-def _critical(lowest: Callable[[float], float], first: float, second: float) -> float:
+def critical(lowest: Callable[[float], float], first: float, second: float) -> float:
     """The load at which the lowest square changes its sign, by the secant method."""
     low, high = lowest(first), lowest(second)
     for _ in range(SECANTS):
@@ -407,7 +407,7 @@ def column(bench: Bench, n: float) -> Iterator[Measured]:
                     return float(lowest_squares(trial, 1, SHIFT)[0][0])
 
                 # from below and from above
-                load = _critical(lowest, 0.9 * exact, 1.1 * exact)
+                load = critical(lowest, 0.9 * exact, 1.1 * exact)
             yield Measured(f"P L²/B, {words}, {kind}", load, exact)
 
 
@@ -545,6 +545,6 @@ def _tipping(
             mode = np.stack([trial.start[end, 1], shapes[0][end, 2]])
         return float(squares[0])
 
-    load = _critical(lowest, 0.95 * about, 1.05 * about)
+    load = critical(lowest, 0.95 * about, 1.05 * about)
     turn, deflection = np.polyfit(mode[0] - 0.5 * depth, mode[1], 1)
     return load, abs(float(turn / deflection))
