@@ -543,8 +543,8 @@ def _narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
     if lost < NARROW:
         return []
     return [
-        f"beside free edges of sheets as thick as these transverse shear, which there is none of, would let "
-        f"them twist by {lost:.0%} more"
+        f"sheets as thick for their width as these resist twist by {lost:.0%} too much: without transverse "
+        "shear, which is left out, they are not softer beside free edges"
     ]
 
 
