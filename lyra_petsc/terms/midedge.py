@@ -341,9 +341,15 @@ class MidEdge(Elastic):
         return (stiffness[:, 0] + stiffness[:, 3] + stiffness[:, 5]) * size * self._steepest
 
     def curvatures(self, x: Array, frozen: Frames) -> Array:
-        """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3)."""
-        found = np.empty((self.n_elements, 3))
-        tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), found)
+        """κ11, κ22, κ12 [1/m] of all triangles of this rank in material axes, with that at rest, (E, 3).
+
+        The angle of a crease at rest is no curvature.
+        """
+        found, tilt = np.empty((self.n_elements, 3)), self._constants[2]
+        tangents(x, self.stencil, self.of_edges.of_triangles, self.shape(x, frozen), tilt, found)
+        if len(tilt):
+            smooth = tilt[..., 0] > np.cos(CREASED)
+            found[smooth] += tilt[..., 1][smooth] / tilt[..., 0][smooth]
         of_tangents = curvatures_of_tangents(self._material)
         curvature: Array = np.einsum("eki,ei->ek", of_tangents, found)
         curvature[:, 2] *= 0.5
@@ -392,11 +398,14 @@ def tilt_of(data: Mapping[str, Array]) -> Array:
     return data["tilt"] if data["tilt"][..., 1].any() else UPRIGHT
 
 
-def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, tilt: Array) -> Array:
+def mean_directors(
+    x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, tilt: Array, most: float = np.inf
+) -> Array:
     """Means (n_edges, 3) of the directors without energy of the triangles that have an edge, ``number``
     (F, 3) of it: of their unit normals, turned about the edge by ᾱ.
 
-    Where they cancel each other, as in a fold of 180° or a cross, that of the first triangle.
+    Where they cancel each other, as in a fold of 180° or a cross, and where there are more than ``most``,
+    that of the first triangle.
     """
     ways = np.repeat(normals_of(x, triangles)[:, None, :], 3, axis=1)
     if len(tilt):
@@ -404,8 +413,8 @@ def mean_directors(x: Array, triangles: AnyInts, number: AnyInts, n_edges: int, 
         ways = tilt[..., :1] * ways + tilt[..., 1:] * np.cross(along, ways)
     ways, edges = ways.reshape(-1, 3), number.ravel()
     total: Array = np.stack([np.bincount(edges, ways[:, i], n_edges) for i in range(3)], axis=1)
-    found, first = np.unique(edges, return_index=True)
-    lost = np.linalg.norm(total[found], axis=1) < CANCELLED
+    found, first, count = np.unique(edges, return_index=True, return_counts=True)
+    lost = (np.linalg.norm(total[found], axis=1) < CANCELLED) | (count > most)
     total[found[lost]] = ways[first[lost]]
     return unit(total)
 
@@ -444,7 +453,8 @@ def elements(rest: RestShape) -> Elements:
     surface = ~mesh.flat_rest[chosen]
     angle = np.zeros_like(size)  # at rest
     if surface.any():
-        director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges, UPRIGHT)
+        # where walls meet on both sides of a third one they go on straight
+        director = mean_directors(mesh.rest, triangles[surface], number[surface], n_edges, UPRIGHT, 2)
         _mirror(director, rest, triangles, number, mesh.rest)
         angle[surface] = _angles_of(mesh.rest, triangles[surface], director[number[surface]])
         rest.notes += _coarse(rest, chosen, curvature, angle, size.max(axis=1))
@@ -533,8 +543,8 @@ def _narrow(rest: RestShape, chosen: Ints, number: Ints, size: Array, area: Arra
     if lost < NARROW:
         return []
     return [
-        f"beside free edges of sheets as thick as these transverse shear, which there is none of, would let "
-        f"them twist by {lost:.0%} more"
+        f"sheets as thick for their width as these resist twist by {lost:.0%} too much: without transverse "
+        "shear, which is left out, they are not softer beside free edges"
     ]
 
 
