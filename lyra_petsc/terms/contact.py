@@ -729,7 +729,9 @@ class ContactBarrier(Elastic):
             left = np.empty(len(may))
             contact_pairs.distances(x, frozen.now, self.kind[may], self.points[may], left)
             smallest = min(smallest, (left - self.offset[may]).min())
-        return {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
+        # without friction; else that term's takes its place
+        work = {"friction_work": 0.0}
+        return work | {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
 
 
 def _edges_of(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
