@@ -100,7 +100,7 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     turned = [
         {"time": 0.0},
         {"time": 0.3},
-        {"time": 2.8, "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 25.5}},
+        {"time": 2.8, "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 25.7}},
         {"time": 3.3, "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 29.0}},
     ]
     content = {
