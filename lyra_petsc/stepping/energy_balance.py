@@ -223,10 +223,10 @@ class Ledger:
     def column_names(self) -> list[str]:
         """Columns of history.csv that terms add, in the order of the terms."""
         of_terms = [name for term in self._system.active.elastic for name in term.registration.columns]
-        return [*self._more, *of_terms]
+        return list(dict.fromkeys([*self._more, *of_terms]))
 
     def columns(self) -> dict[str, float]:
-        """Further columns of history.csv that terms add, by name; collective."""
+        """Further columns of history.csv that terms add, by name (the last term wins); collective."""
         system = self._system
         found: dict[str, float] = dict(self.budget.more)
         for term in system.active.elastic:

@@ -61,6 +61,8 @@ class Failure:
         The last attempt's arrays, of this rank.
     near : NearPair or None
         With contact, what would meet in the last attempt, else what is nearest where it stands.
+    obstacle : NearPair or None
+        Where these are parts of sheets, the nearest obstacle that they touch.
     """
 
     step: int
@@ -74,6 +76,7 @@ class Failure:
     sources: list[Source]
     stuck: FailedSolve
     near: NearPair | None = None
+    obstacle: NearPair | None = None
 
     @property
     def now(self) -> str:
@@ -136,6 +139,7 @@ class Failure:
             "iterations": [asdict(each) for each in self.stuck.iterations],
             **asdict(self.diagnosis),
             **({} if self.near is None else {"near": asdict(self.near)}),
+            **({} if self.obstacle is None else {"obstacle": asdict(self.obstacle)}),
             "advice": self.advice,
         }
 
@@ -172,6 +176,7 @@ class Failure:
         return [
             *([f"{many} vertices have a residual that is not finite"] if many else []),
             *([f"nearest, or in the way: {_apart(self.near)}"] if self.near is not None else []),
+            *([f"nearest obstacle: {_apart(self.obstacle)}"] if self.obstacle is not None else []),
             f"{self._vertex()} at {_point(vertex.position)} m, before the step {_point(vertex.before)} m: "
             f"residual {size:.3g} N of forces [N] {forces}",
             f"{self._triangle()} of vertices {', '.join(map(str, triangle.vertices))} around "

@@ -23,6 +23,11 @@ ONCE, ONCE_IN_CONTACT = 1e-6, 1e-9
 step in which parts collide. An impact magnifies what a solve leaves, which depends on the number of ranks,
 thirty to a hundred times."""
 
+LATE, LATEST = 1e-3, 1e-5
+"""Part of a step's first residual below which a solve may be its last, and its tolerance with contact, also
+where nothing is near yet: what the last solves of a fall leave, more on some ranks than on others, adds up
+until parts meet."""
+
 COLLISION = 1.0
 """How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then
 buckle in one of many ways, and the first directions of Newton's method tell in which."""
@@ -47,10 +52,12 @@ class Forcing:
         Leave it alone.
     cycles : bool
         Whether the preconditioner is a cycle of multigrid.
+    contact : bool
+        Whether there is contact, near or not.
     """
 
-    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool) -> None:
-        self._ksp, self._fixed, self._cycles = ksp, fixed, cycles
+    def __init__(self, ksp: PETSc.KSP, *, fixed: bool, cycles: bool, contact: bool = False) -> None:
+        self._ksp, self._fixed, self._cycles, self._contact = ksp, fixed, cycles, contact
         self.tolerance = LOOSEST
         self.begin(near=False, collides=False)
 
@@ -61,12 +68,16 @@ class Forcing:
         self._slow = SLOW_IN_CONTACT if near else SLOW
         self._loosest = LOOSEST_IN_CONTACT if near and not self._cycles else LOOSEST
         self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm, self._collides = 0.0, collides
+        self._norm = self._first = 0.0
+        self._collides = collides
 
     @property
     def in_use(self) -> float:
         """The tolerance of the present solves."""
-        return ONCE_IN_CONTACT if self._collides and not self._fixed else self.tolerance
+        if self._collides and not self._fixed:
+            return ONCE_IN_CONTACT
+        late = self._contact and self._norm < LATE * self._first and not self._fixed
+        return min(self.tolerance, LATEST) if late else self.tolerance
 
     def before_solve(self, norm: float) -> None:
         """``norm`` [N] is the residual at the present iterate."""
@@ -76,5 +87,5 @@ class Forcing:
             self.tolerance = max(TIGHTEST, 0.1 * self.tolerance)
         elif norm < FAST * self._norm:
             self.tolerance = min(self._loosest, 10.0 * self.tolerance)
-        self._norm = norm
+        self._norm, self._first = norm, max(self._first, norm)
         self._ksp.setTolerances(rtol=self.in_use)

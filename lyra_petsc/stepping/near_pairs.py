@@ -16,7 +16,7 @@ from lyra_petsc.terms.term import Elastic
 TOUCHING = 2e-9
 """Gap over the skin of a search up to which there is none."""
 
-TIGHT = 3e-2
+TIGHT = 0.1
 """The same, up to which next to nothing is left."""
 
 
@@ -78,6 +78,19 @@ def worst_pair(system: StageEquations) -> NearPair | None:
         return 1.0 - term.free_parts(way.x, way.ahead, system.active.frozen[term], way.part)
 
     return _worst(system, way.x, obstruction)
+
+
+def nearest_obstacle(system: StageEquations) -> NearPair | None:
+    """The nearest pair with an obstacle that touches where the solver stands; collective."""
+
+    def nearness(term: Elastic) -> Array:
+        gaps = _gaps(system, term, system.evaluated[0])
+        touch = [row for row in np.flatnonzero(gaps < 2.0 * term.skin) if term.pair(int(row)).obstacle]
+        out = np.zeros(len(gaps))
+        out[touch] = 1.0 / np.maximum(gaps[touch], TOUCHING * term.skin)
+        return out
+
+    return _worst(system, system.evaluated[0], nearness)
 
 
 def _gaps(system: StageEquations, term: Elastic, x: Array) -> Array:

@@ -116,7 +116,9 @@ class Newton:
 
             self._arcs = Arcs(equations) if possible(equations.points.comm.size) else None
         fixed = is_set("ksp_rtol") or not equations.integrator.moves
-        self.forcing = Forcing(self._ksp, fixed=fixed, cycles=linear.cycles)
+        self.forcing = Forcing(
+            self._ksp, fixed=fixed, cycles=linear.cycles, contact=equations.discretisation.guards
+        )
 
     def begin_step(self) -> None:
         """Forget the step before."""

@@ -64,8 +64,10 @@ class Objective:
             stiffness = self.stiffnesses.get(term)
             if stiffness is None:
                 stiffness = term.force_scale(1.0)[: term.n_owned]
-            of_size = rate * self._size  # ** would raise where the square is infinite
-            square += 2.0 * of_size * of_size * float(np.vdot(each, stiffness))
+            sizes = term.sizes(self._size)
+            of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
+            # ** would raise where the square is infinite
+            square += 2.0 * float(np.vdot(each, stiffness * of_size * of_size))
         parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
         if of.damping.acts:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))

@@ -30,7 +30,7 @@ from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
-from lyra_petsc.stepping.near_pairs import worst_pair
+from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.problem import Problem, build_problem, events, refuse_contact
 from lyra_petsc.stepping.roundoff import residual_roundoff
 from lyra_petsc.stepping.stability import Stability
@@ -502,6 +502,7 @@ class SteppedScene:
             problem.points, problem.membrane, system.held, stuck, system.x, system.mass, problem.tags
         )
         near = worst_pair(system)
+        between_sheets = near is not None and not near.obstacle
         now = Circumstances(
             dt=end - self.time,
             nominal=self.control.step,
@@ -529,6 +530,7 @@ class SteppedScene:
             sources=outline.sources,
             stuck=stuck,
             near=near,
+            obstacle=nearest_obstacle(system) if between_sheets else None,
         )
 
     def memory(self) -> dict[str, Any]:

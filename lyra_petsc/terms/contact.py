@@ -62,6 +62,11 @@ SHARP = 0.5
 SKIN = 0.5
 """Over the gap, how far points may come nearer to each other between two searches."""
 
+SAG = 0.01
+"""Part of the gap by which edges of a sheet sag, at most, over spheres and rods that its vertices feel, as
+they feel planes; triangles and edges do only as two edges feel each other. On what is nearly flat nearest
+points are anywhere."""
+
 MANY, MANY_PER_VERTEX = 500_000, 100
 """Pairs above both of which shorter ways are looked at: a step of Newton's method may lead through all of a
 crumpled sheet, and none of that is gone at once. Not in a static analysis, whose first load step may lead far
@@ -82,12 +87,15 @@ class Barrier(NamedTuple):
         k.
     parallel : float
         Squared sine of the angle of edges below which their energy fades.
+    flat : float
+        Radius [m] of spheres and rods from which on a sheet's edges sag less than `SAG` over them.
     """
 
     gap: float
     thickness: float
     stiffness: float
     parallel: float
+    flat: float = np.inf
 
 
 class Places(NamedTuple):
@@ -142,7 +150,7 @@ class Obstacles:
     ----------
     triangles, edges, points, planes, segments : (n, 5)
         Numbers of the points, that of the obstacle, what is around a triangle (`surface_shares.rings`).
-        Planes are a point and a normal.
+        Planes are a point and a normal. Of spheres and rods that are nearly flat the axis is a triangle, too.
     radius : (obstacles + 1,)
         Offset [m] of each; the last, 0, is that of sheets.
     moving : bool
@@ -154,7 +162,7 @@ class Obstacles:
         higher.
     """
 
-    def __init__(self, obstacles: Sequence[Solid | Container]) -> None:
+    def __init__(self, obstacles: Sequence[Solid | Container], flat: float = np.inf) -> None:
         self.each = list(obstacles)
         parts: dict[str, list[Ints]] = {
             kind: [] for kind in ("triangles", "edges", "points", "planes", "segments")
@@ -181,6 +189,11 @@ class Obstacles:
                 parts["triangles"].append(rows(obstacle.triangles))
                 parts["edges"].append(rows(obstacle.edges))
                 parts["points"].append(rows(np.arange(n)[:, None]))
+                if obstacle.radius >= flat:
+                    points[:] = True
+                    smooth_edges.append(first + obstacle.edges)
+                    axis = np.array([[0, n - 1, n - 1]])
+                    parts["triangles"].append(np.column_stack([axis + first, [number], [0]]))
             elif obstacle.kind == "planes":
                 parts["planes"].append(rows(np.column_stack([np.arange(n), np.arange(n, 2 * n)])))
                 n *= 2
@@ -260,11 +273,11 @@ class ContactBarrier(Elastic):
         empty = {"what": np.empty((0, 7)), "number": np.empty((0, 4))}
         self.obstacles, self.itself, self.static = Obstacles([]), True, False
         self.barrier = Barrier(0.0, 0.0, 0.0, 1.0)
+        self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), empty))
         self.surface = np.ascontiguousarray(surface, dtype=np.int32)
         self.surface_marks = rings
         self._room = 0
-        self._places, self._bulge = np.empty((3, 0, 3)), np.zeros(1)
         self._extents: tuple[Array, Array] | None = None  # of obstacles in ``_places``
         self._sheets = SheetSearch(surface.astype(np.int64), uv)
         self._taken: Ints | None = None  # triangles that the search has
@@ -277,7 +290,7 @@ class ContactBarrier(Elastic):
 
         ``itself`` says whether sheets meet sheets, ``static`` whether an equilibrium is sought.
         """
-        self.barrier, self.obstacles = barrier, Obstacles(obstacles)
+        self.barrier, self.obstacles = barrier, Obstacles(obstacles, barrier.flat)
         self.itself, self.static = itself, static
         self.skin = SKIN * barrier.gap
         self.search_distance = barrier.thickness + barrier.gap + self.skin
@@ -297,6 +310,9 @@ class ContactBarrier(Elastic):
         self.gap = np.where(self._between_others(), EDGES, 1.0) * self.barrier.gap
         self._meeting = Remembered(self._meet)
         self._foreseen = np.full(self.n_elements, np.nan)
+        farthest = np.append(np.abs(self._places).max(axis=(0, 2)), 0.0)
+        theirs = farthest[np.where(self.points < 0, ~self.points, -1)]
+        self._far = np.maximum(np.abs(self.offset), theirs.max(axis=1))
         self._springs: Springs | None = None
 
     def _between_others(self) -> NDArray[np.bool_]:
@@ -530,6 +546,9 @@ class ContactBarrier(Elastic):
     def force_scale(self, size: float) -> Array:
         return np.full(self.n_elements, HALFWAY * self.barrier.stiffness * size)
 
+    def sizes(self, size: float) -> Array:
+        return np.maximum(size, self._far)
+
     def largest_step(self, x: Array, way: Array, frozen: Places) -> float:
         if not self.n_elements:
             return 1.0
@@ -710,7 +729,9 @@ class ContactBarrier(Elastic):
             left = np.empty(len(may))
             contact_pairs.distances(x, frozen.now, self.kind[may], self.points[may], left)
             smallest = min(smallest, (left - self.offset[may]).min())
-        return {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
+        # without friction; else that term's takes its place
+        work = {"friction_work": 0.0}
+        return work | {"contacts": float(met.counted.sum()), "smallest_gap": float(smallest)}
 
 
 def _edges_of(obstacle: Solid) -> tuple[Ints, NDArray[np.bool_]]:
@@ -769,7 +790,7 @@ def barrier(rest: RestShape) -> Barrier:
         )
     stiffness = max(max(shell.c11, shell.c22) for shell in rest.shells)
     stiffness *= max(1.0 / HALFWAY, STRAIN * float(length.mean()) / gap)
-    return Barrier(gap, thickness, stiffness, PARALLEL)
+    return Barrier(gap, thickness, stiffness, PARALLEL, float(length.max()) ** 2 / (8.0 * SAG * gap))
 
 
 def make(elements: Elements, scene: Scene, mass: Array) -> ContactBarrier:

@@ -35,7 +35,10 @@ SLIP = 4
 """Place of the elastic parts of the ways among what the kernels take."""
 
 ELASTIC = 0.01
-"""Part of the gap that a pair which sticks may go before it slides, at most."""
+"""Part of the gap that a pair which sticks may go before it slides, at most. Where less holds what slides
+than what sticks, all go as far: if what is pressed least, as a sheet's border, slid before the rest, the
+sheet would follow long before it has to. Else light pairs go less far, as they must again whenever they part
+and meet."""
 
 
 class Pairs(NamedTuple):
@@ -125,7 +128,10 @@ class CoulombFriction(Elastic):
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
             self._limit = np.where(what[:, SLID] > 0.5, kinetic, static) * self._force
-            self._spring = np.maximum(self._stiffest, self._limit / (ELASTIC * self._contact.barrier.gap))
+            longest = ELASTIC * self._contact.barrier.gap
+            self._spring = np.maximum(self._stiffest, self._limit / longest)
+            drops = kinetic < static
+            self._spring[drops] = static[drops] * self._force[drops] / longest
         self._of: ObstacleMoves | None = None  # what is remembered of a stage
 
     # -- pairs -------------------------------------------------------------------------------------

@@ -146,7 +146,7 @@ REGISTRY: list[Registration] = [
         lambda scene, shells: scene.contact is not None,
         Role.ELASTIC,
         "contact_energy",
-        {"contacts": "sum", "smallest_gap": "min"},
+        {"contacts": "sum", "smallest_gap": "min", "friction_work": "sum"},
         neighbours=True,
         limits_step=True,
     ),

@@ -289,6 +289,10 @@ class Elastic(Term):
         ``size`` [m] is the largest coordinate, to which it is proportional.
         """
 
+    def sizes(self, size: float) -> float | Array:
+        """Coordinates [m] that each element's energy is of differences of, where the sheet's are ``size``."""
+        return size
+
     slips: bool = False
     """Whether its force turns within so short a way that one linear solve does not follow it."""
 

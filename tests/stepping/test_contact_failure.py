@@ -9,6 +9,7 @@ from mpi4py import MPI
 from physics import grid, scene_of
 
 from lyra_petsc.errors import SolverError
+from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
 from lyra_petsc.stepping.simulation import SteppedScene
 
 pytestmark = pytest.mark.parallel(2)
@@ -229,3 +230,19 @@ def test_what_turns_past_the_sheet_is_not_let_through(comm: MPI.Comm) -> None:
     # the blade has hit what was in its way
     assert simulation.budget.kinetic > 0.01
     simulation.destroy()
+
+
+def test_the_nearest_obstacle_is_named_beside_sheets_that_are_nearer(comm: MPI.Comm) -> None:
+    far, near = ({"floor": {"plane": {"point": [0, 0, z], "normal": [0, 0, 1]}}} for z in (-9.0, -0.015))
+    other = SHEET["mesh"] | {"transform": {"translate": [0.1, 0.1, 0.006]}}
+    scene = SHEET | {"mesh": [SHEET["mesh"], other], "time": {"end": 0.1, "step": 0.001}}
+    for obstacles, name in ((far, None), (near, "floor")):
+        simulation = SteppedScene(comm, scene_of(scene | {"obstacles": obstacles}))
+        simulation.step()
+        system = simulation.problem.system
+        nearest, obstacle = worst_pair(system), nearest_obstacle(system)
+        assert nearest is not None
+        assert not nearest.obstacle
+        assert (None if obstacle is None else obstacle.obstacle) == name
+        assert simulation.ledger.columns()["friction_work"] == 0.0
+        simulation.destroy()

@@ -77,3 +77,32 @@ def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> Non
         system.damping.freeze(system.x, system.active.frozen)
         assert not system.damping.with_stiffness_into(system.x, 0.3, system.mass, values, none)
         assert system.discretisation.near
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("shape", ["sphere", "capsule"])
+def test_what_is_nearly_flat_is_felt_as_a_plane(comm: MPI.Comm, shape: str) -> None:
+    """Where nearest points to a far centre are anywhere, and distances from it have few digits."""
+    radius, side = 1e4, 0.4
+    ends = {"from": [-5.0, 0.0, -radius], "to": [5.0, 1.0, -radius]}
+    place = ends if shape == "capsule" else {"center": [0.0, 0.0, -radius]}
+    sheet = grid(side, side, 6, 6) | {"transform": {"translate": [-0.5 * side, -0.5 * side, 0.007]}}
+    content = {
+        "mesh": sheet,
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0.0, 0.0, -9.81],
+        "contact": {"gap": 0.005, "friction": 0.3},
+        "obstacles": {"hill": {shape: place | {"radius": radius}}},
+        "time": {"end": 0.3, "step": 0.01},
+        "solver": {},
+    }
+    simulation, iterations = SteppedScene(comm, scene_of(content)), []
+    while not simulation.finished:
+        step = simulation.step()
+        assert not step.rejected
+        iterations.append(step.newton_iterations)
+    weight = 9.81 * comm.allreduce(float(simulation.problem.system.mass.sum()))
+    force = simulation.ledger.obstacle_forces(1)[0, :3]
+    simulation.destroy()
+    np.testing.assert_allclose(force, [0.0, 0.0, -weight], atol=1e-6 * weight)
+    assert np.mean(iterations) < 3.0

@@ -154,6 +154,29 @@ def test_ranks_agree_with_the_default_solver(comm: MPI.Comm, integrator: str) ->
     np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-8 * size)
 
 
+@pytest.mark.parallel(2, alone=False)
+def test_ranks_agree_while_sheets_fall(comm: MPI.Comm) -> None:
+    """What linear solves leave adds up until something is near."""
+    turned = {"rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 20.0}, "translate": [-0.05, -0.12, 0.05]}
+    content = {
+        "mesh": [grid(0.22, 0.3, 9, 12, "alternating"), grid(0.2, 0.2, 8, 8) | {"transform": turned}],
+        "gravity": [0.0, 0.0, -9.81],
+        "material": {"cloth": "gray-interlock", "damping": 0.005},
+        "contact": {"friction": 0.3},
+        "obstacles": {"floor": {"plane": {"point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0]}}},
+        "time": {"end": 1.0, "step": 0.004},
+        "solver": {},
+    }
+    ways = []
+    for ranks in (MPI.COMM_SELF, comm):
+        simulation = SteppedScene(ranks, scene_of(content))
+        for _ in range(10):
+            simulation.step()
+        ways.append(gathered(simulation.problem.points, simulation.problem.system.x))
+        simulation.destroy()
+    np.testing.assert_allclose(ways[1], ways[0], rtol=0.0, atol=1e-9)
+
+
 def test_ranks_agree_where_sheets_collide(comm: MPI.Comm) -> None:
     """They buckle in one of many ways. What the preconditioner, which depends on the ranks, leaves of the
     first directions of Newton's method must not tell in which.

@@ -25,6 +25,7 @@ NORMAL = [math.sin(SLOPE), 0.0, math.cos(SLOPE)]
 DOWN = np.array([math.cos(SLOPE), 0.0, -math.sin(SLOPE)])
 
 
+FLAT = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}
 PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}
 
 
@@ -91,6 +92,38 @@ def test_it_stands(comm: MPI.Comm) -> None:
     assert abs(speed) < 1e-5
     assert 0.0 < way < 2e-3
     np.testing.assert_allclose(force[:3], [0.0, 0.0, -weight], atol=2e-4 * weight)
+
+
+def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
+    """On a plane that turns, also where less friction holds what slides: its border is pressed less."""
+    threshold, gap, side = 0.5, 0.005, 0.3
+    turned = [
+        {"time": 0.0},
+        {"time": 0.3},
+        {"time": 2.8, "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 25.7}},
+        {"time": 3.3, "rotate": {"axis": [0.0, 1.0, 0.0], "degrees": 29.0}},
+    ]
+    content = {
+        "mesh": grid(side, side, 5, 5, "alternating")
+        | {"transform": {"translate": [-0.5 * side, -0.5 * side, 0.95 * gap]}},
+        "material": {"cloth": "gray-interlock"},
+        "gravity": [0.0, 0.0, -G],
+        "contact": {"gap": gap, "friction": {"static": threshold, "kinetic": 0.6 * threshold}, "self": False},
+        "obstacles": {"slope": {"plane": FLAT, "motion": turned}},
+        "time": {"end": 3.3, "step": 0.01},
+        "solver": {},
+    }
+    simulation = SteppedScene(comm, scene_of(content))
+    system, ways = simulation.problem.system, []
+    weight = system.points.summed(float(system.mass.sum()))[0]
+    for time in (2.8, 3.3):
+        while simulation.time < time - 0.005:
+            simulation.step()
+        middle = system.points.summed(*(float(system.mass @ x) for x in system.x[: len(system.mass)].T))
+        ways.append(math.hypot(middle[0], middle[2]) / weight)
+    simulation.destroy()
+    assert ways[0] < 0.01
+    assert ways[1] > 0.05
 
 
 INTEGRATORS = [
