@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.mesh.points import Layout
 from lyra_petsc.terms.term import Load
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.following_loads import FollowingLoads
 
 
 class AppliedLoads:
@@ -27,6 +31,8 @@ class AppliedLoads:
     unbalanced, given : (n_owned, 3) or None
         Static: force [N] that holds the start shape, reduced as the factor grows; loads in place of the
         present ones.
+    following : FollowingLoads or None
+        Static: how those that follow the shape change with it from there.
     """
 
     def __init__(self, terms: Sequence[Load], layout: Layout) -> None:
@@ -35,6 +41,15 @@ class AppliedLoads:
         self.factor = 1.0
         self.unbalanced: Array | None = None
         self.given: Array | None = None
+        self.following: FollowingLoads | None = None
+
+    def at(self, x: Array) -> Array:
+        """Force [N] in a solve, (n_owned, 3), at positions x (n_local, 3)."""
+        if self.following is None:
+            return self.now
+        force = self.now.copy()
+        self.following.add_force(x, force)
+        return force
 
     def freeze(self, t0: float, t1: float, x: Array, wind: Array | None) -> None:
         """Take the loads of a step from t0 to t1 [s] at positions x (n_local, 3).

@@ -4,8 +4,9 @@ A load step begins where the polynomial through the last equilibria leads, with 
 Jacobian. Each solve minimises E(x) − W(x) + ‖x − x_k‖²_M / (2 Δτ²), which has a positive-definite Hessian
 where the shell alone is singular (flat, slack) or indefinite (buckling). Δτ grows while Newton finds it easy,
 until the out-of-balance force is small without the last term. Loads that follow the shape (pressure, wind)
-are taken anew before every solve, under-relaxed. So is friction, where obstacles stand still: a sheet that
-comes to lie on something in a load step is held there by the forces found on the way.
+are taken anew before every solve, under-relaxed; pressures change in it along their own stiffness. Friction
+is taken anew, too, where obstacles stand still: a sheet that comes to lie on something in a load step is held
+there by the forces found on the way.
 
 Source: pseudo-transient continuation, Kelley & Keyes, SIAM J. Numer. Anal. 35 (1998) 508-523.
 """
@@ -28,6 +29,7 @@ from lyra_petsc.stepping.relaxation import Relaxation
 from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
+from lyra_petsc.terms.term import Load
 
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""
@@ -130,7 +132,7 @@ class Equilibrium:
         x = system.x[:n].copy()
         system.applied.factor = factor
         newton = linear = solves = 0
-        anchored, last, arrived, leaps = 0.0, np.inf, False, not self._follows
+        anchored, last, arrived, leaps = 0.0, np.inf, False, not self._system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
         touched = system.active.touched()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x
@@ -158,10 +160,13 @@ class Equilibrium:
             last = force
             if attempt.converged:
                 system.active.on_the_way(system.x)
-            system.applied.given = relaxation.following(system.applied.now.copy()) if self._follows else None
+            if self._follows:
+                self._take_loads(relaxation, before, factor)
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
-            system.applied.given = self._integrator.ahead = None
+            if self._follows:
+                relaxation.solved_with(system.applied.at(system.x))
+            system.applied.given = system.applied.following = self._integrator.ahead = None
             self._integrator.others = []
             solves += 1
             newton += attempt.newton_iterations
@@ -207,6 +212,19 @@ class Equilibrium:
         moves = system.points.largest(float(np.abs(system.prescribed.velocity).max(initial=0.0)))[0] > 0.0
         if self._rate is not None and not moves:
             self._integrator.others = self._extrapolation.along(factor, self._rate)
+
+    def _take_loads(self, relaxation: Relaxation, before: float, factor: float) -> None:
+        """Let the next solve have loads of the present shape, and pressures as they change from there."""
+        system = self._system
+        system.applied.given = relaxation.following(system.applied.now.copy())
+        pressures = [load for load in system.active.loads if load.follows]
+        if pressures:
+            from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
+
+            def force_of(load: Load, x: Array, out: Array) -> None:
+                load.add_force(x, before, factor, out)
+
+            system.applied.following = FollowingLoads(pressures, system.x, force_of, factor)
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""
@@ -340,7 +358,7 @@ class Equilibrium:
             fastest = system.points.comm.allreduce(fastest, MPI.MAX)
             self._careful = float(np.sqrt(self._spacing / fastest))
             self._longest = LONGEST * self._careful
-            sufficed = 0.0 if self._follows else self._sufficed
+            sufficed = 0.0 if system.active.viscous else self._sufficed
             self._integrator.pseudo = min(max(self._careful, sufficed), self._longest)
         return norm
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lyra_petsc.arrays import Array
-from lyra_petsc.kernels.scatter import add_elements
+from lyra_petsc.stepping.following_loads import FollowingLoads
 from lyra_petsc.stepping.stage_equations import StageEquations
-from lyra_petsc.terms.load_stiffness import following_stiffness
-from lyra_petsc.terms.term import Load, Term, UpcomingStep, Viscous
+from lyra_petsc.terms.term import Load, UpcomingStep, Viscous
 
 
 def add_exact_hessian(system: StageEquations, values: Array) -> None:
@@ -20,20 +19,18 @@ def add_exact_hessian(system: StageEquations, values: Array) -> None:
     for term in active.elastic:
         rows.add_stiffness(term, system.x, active.frozen[term], 0.0, 1.0, values)
 
-    def force_of(term: Term, x: Array, out: Array) -> None:
+    def force_of(term: Load | Viscous, x: Array, out: Array) -> None:
         """Add the force [N] of a load, or of the wind on a sheet at rest, at positions x."""
         if isinstance(term, Load):
             term.add_force(x, system.t0, system.t1, out)
-        elif isinstance(term, Viscous):
+        else:
             against = np.zeros_like(out)
             step = UpcomingStep(system.t0, system.t1, system.t1, x, system.reference.at)
             term.add_gradient(np.zeros_like(x), term.freeze(step), against)
             out -= against
 
-    following: list[Load | Viscous] = [load for load in active.loads if load.follows]
-    for load in [*following, *active.viscous]:
-        blocks = system.applied.factor * following_stiffness(load, system.x, force_of)
-        offsets = rows.pattern.offsets_of(load.stencil)
-        add_elements(np.ones(load.n_elements), blocks, offsets, values)
+    following = [load for load in active.loads if load.follows]
+    loads = FollowingLoads([*following, *active.viscous], system.x, force_of, system.applied.factor)
+    loads.add_hessian(1.0, rows.pattern, values)
     if len(prescribed.beside.changing):
         rows.constrain(values, prescribed.mask, prescribed.beside)

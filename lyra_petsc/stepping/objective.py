@@ -69,6 +69,8 @@ class Objective:
             # ** would raise where the square is infinite
             square += 2.0 * float(np.vdot(each, stiffness * of_size * of_size))
         parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
+        if of.applied.following is not None:
+            parts.append(rate * of.applied.following.energy(x))
         if of.damping.acts:
             parts.append(0.5 * float(np.vdot(v, of.damping.product(vs))))
         if not of.integrator.lagged_loads:

@@ -25,7 +25,6 @@ class Relaxation:
     def following(self, loads: Array) -> Array:
         """Loads (n_owned, 3) [N] for the next solve; ``loads`` are those at the present shape; collective."""
         if self._loads is None:
-            self._loads = loads
             return loads
         change = loads - self._loads
         if self._change is not None:
@@ -36,5 +35,8 @@ class Relaxation:
             if square > 0.0:
                 self._share = min(MOST, max(LEAST, -self._share * dot / square))
         self._change = change
-        self._loads = self._loads + self._share * change
-        return self._loads
+        return self._loads + self._share * change
+
+    def solved_with(self, loads: Array) -> None:
+        """These loads (n_owned, 3) [N] were in balance, or nearly."""
+        self._loads = loads

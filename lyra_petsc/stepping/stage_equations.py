@@ -743,7 +743,7 @@ class StageEquations:
         del vdot
         if self.active.constraints:
             yield self._counted("springs", self._sum(self.active.constraints, x))
-        yield self._counted("loads", -self.applied.now)
+        yield self._counted("loads", -self.applied.at(x))
         if self.damping.acts:
             yield self._counted("damping", self.damping.product(vs))
             if self.integrator.lagged_loads:  # nobody asks again
@@ -896,5 +896,7 @@ class StageEquations:
         if not lagged:
             for wind in self.active.viscous:
                 wind.add_hessian(vs, self.active.frozen[wind], rows.pattern.offsets, values)
+        if self.applied.following is not None and blend < 1.0:
+            self.applied.following.add_hessian((1.0 - blend) * reach, rows.pattern, values)
         if len(changing):
             rows.constrain(values, self.prescribed.mask, beside)

@@ -1,0 +1,98 @@
+"""Pressures in equilibria: what is linear along their stiffness, and rings that buckle under them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from oracle import expanded
+from physics import SteppedScene, grid, scene_of
+
+from lyra_petsc.arrays import Array
+from lyra_petsc.experiments.bench import Bench
+from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.verification.answers import STATIC, scene
+from lyra_petsc.experiments.verification.cases.shells import symmetric
+from lyra_petsc.phases import Phases
+from lyra_petsc.stepping.following_loads import FollowingLoads
+from lyra_petsc.terms.term import Load
+
+
+def force_of(load: Load, x: Array, out: Array) -> None:
+    load.add_force(x, 0.0, 1.0, out)
+
+
+def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
+    content = scene_of({"mesh": grid(1.0, 0.7, 3, 2), "loads": [{"pressure": 7.0}]})
+    simulation = SteppedScene(MPI.COMM_SELF, content, Phases())
+    system, random = simulation.problem.system, np.random.default_rng(0)
+    x = system.x + 0.1 * random.normal(size=system.x.shape)
+    u, way = (0.1 * random.normal(size=x.shape) for _ in range(2))
+    loads = FollowingLoads(system.active.loads, x, force_of, 0.5)
+
+    force, change = np.zeros_like(x), np.zeros_like(x)
+    loads.add_force(x + u, force)
+    energies = [loads.energy(x + u + sign * way) for sign in (1.0, -1.0)]
+    assert float(np.vdot(force, way)) == pytest.approx(0.5 * (energies[1] - energies[0]), rel=1e-12)
+
+    rows = system.discretisation.rows
+    values = rows.zeros()
+    loads.add_hessian(2.0, rows.pattern, values)
+    loads.add_force(x + way, change)
+    product = np.einsum("aibj,bj->ai", expanded(rows.pattern, values, len(x)), way)
+    np.testing.assert_allclose(product, -2.0 * change, rtol=0, atol=1e-12 * np.abs(product).max())
+
+    # with a rim that is held the stiffness is symmetric, and that of the force itself
+    inside = (np.abs(system.x[:, :1] - 0.5) < 0.4) & (np.abs(system.x[:, 1:2] - 0.35) < 0.3)
+    way *= inside
+    there, back, change = (np.zeros_like(x) for _ in range(3))
+    system.active.loads[0].add_force(x + 1e-6 * way, 0.0, 1.0, there)
+    system.active.loads[0].add_force(x - 1e-6 * way, 0.0, 1.0, back)
+    loads.add_force(x + way, change)
+    expected = 0.5 * (there - back) / 2e-6
+    np.testing.assert_allclose(change * inside, expected * inside, rtol=0, atol=1e-6 * np.abs(change).max())
+    simulation.destroy()
+
+
+RADIUS, THICKNESS, YOUNG, OVAL = 1.0, 0.02, 1e6, 0.01
+
+
+def ring(comm: MPI.Comm, part: float) -> tuple[float, int]:
+    """How far a ring of radius 1 and amplitude ``OVAL`` is oval under a part of the pressure at which it
+    buckles, 3 D / R³, and Newton iterations.
+
+    M. Lévy, Journal de mathématiques pures et appliquées 10 (1884); S. P. Timoshenko, J. M. Gere, Theory of
+    Elastic Stability, 2nd ed. 1961, § 7.3.
+    """
+    bench = Bench(comm, exact=False)
+    flat, faces = rectangle(16, 2, 1.0, 1.0, alternating=True)
+    angle = 0.5 * math.pi * flat[:, 0]
+    radius = RADIUS + OVAL * np.cos(2.0 * angle)
+    vertices = np.column_stack([radius * np.cos(angle), 0.25 * flat[:, 1], radius * np.sin(angle)])
+    pressure = part * 3.0 * YOUNG * THICKNESS**3 / 12.0 / RADIUS**3
+    content = scene(
+        bench.mesh(vertices, faces),
+        {"young": YOUNG, "poisson": 0.0, "thickness": THICKNESS, "density": 1.0},
+        handles=symmetric("xyz", 2.0 * RADIUS),
+        loads=[{"pressure": pressure}],
+        time=STATIC | {"step": 0.2},
+    )
+    newton = 0
+    with bench.simulation(content) as trial:
+        while not trial.simulation.finished:
+            newton += trial.step().newton_iterations
+        x = trial.x
+    return 0.5 * float(x[:, 0].max() - x[:, 2].max()), newton
+
+
+@pytest.mark.parallel
+def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
+    """Before the critical pressure deviations grow by 1 / (1 − p / p_c); beyond, a solution is found, too."""
+    oval, newton = ring(comm, 0.5)
+    assert oval == pytest.approx(OVAL / 0.5, rel=0.02)
+    assert newton <= 15  # 30 with pressures that are taken as they were
+    oval, newton = ring(comm, 1.3)
+    assert oval > 0.3
+    assert newton <= 35  # 109
