@@ -669,8 +669,12 @@ class StageEquations:
         """
         gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
-            x, ahead = self.ahead(v + gone * way, (1.0 - gone) * way)
+            there = v + gone * way, (1.0 - gone) * way
+            x, ahead = self.ahead(*there)
             seen = self.discretisation.largest_step(x, ahead)
+            if seen < FEW:
+                x, ahead = self._look(*there)
+                seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
             part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
             free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
