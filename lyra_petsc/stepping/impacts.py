@@ -6,6 +6,8 @@ nearest points. What meets parts with about a tenth of its speed, whatever Δt i
 few periods of the barrier; what lies, slides or rolls at the same distance is not damped. (Without it sheets
 bounce for long under backward Euler with short steps, and with any under integrators of second order; and
 what bounces slides on where it should stand, as its normal force is too small every other moment.)
+`make_up_friction` then lets friction follow the normal forces that acted in the step, those of dashpots,
+too.
 
 **The midpoint rule**: what contact would add to the energy is taken from the velocities. The rule works with
 the forces at its stage, and a barrier that stiffens within a step stores less energy than they take, or gives
