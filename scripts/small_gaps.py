@@ -26,21 +26,24 @@ BALL = {"sphere": {"center": [0.0, 0.0, -0.35], "radius": 0.3}}
 ROD = {"capsule": {"from": [-0.2, 0.0, -0.2], "to": [0.3, 0.05, -0.22], "radius": 0.15}}
 BOX = {"box": {"min": [-0.3, -0.2, -0.4], "max": [0.21, 0.25, -0.05]}}
 
-# obstacle, gap [m], Δt [s], end [s], friction
-SCENES: dict[str, tuple[dict[str, Any], float, float, float, float]] = {
-    "ball": (BALL, 1e-5, 0.01, 0.2, 0.0),
-    "ball-drapes": (BALL, 1e-5, 0.01, 0.4, 0.0),
-    "ball-rubs": (BALL, 1e-5, 0.01, 0.3, 0.4),
-    "ball-short-steps": (BALL, 1e-5, 0.005, 0.3, 0.0),
-    "ball-long-steps": (BALL, 1e-5, 0.04, 0.4, 0.0),
-    "ball-larger-gap": (BALL, 1e-4, 0.01, 0.4, 0.0),
-    "rod": (ROD, 1e-5, 0.01, 0.3, 0.0),
-    "box": (BOX, 1e-5, 0.01, 0.25, 0.0),
+# obstacle, gap [m], Δt [s], end [s], friction, integrator
+SCENES: dict[str, tuple[dict[str, Any], float, float, float, float, str]] = {
+    "ball": (BALL, 1e-5, 0.01, 0.2, 0.0, "beuler"),
+    "ball-midpoint": (BALL, 1e-5, 0.01, 0.24, 0.0, "midpoint"),
+    "ball-alpha2": (BALL, 1e-5, 0.01, 0.24, 0.0, "alpha2"),
+    "ball-bdf2": (BALL, 1e-5, 0.01, 0.24, 0.0, "bdf2"),
+    "ball-drapes": (BALL, 1e-5, 0.01, 0.4, 0.0, "beuler"),
+    "ball-rubs": (BALL, 1e-5, 0.01, 0.3, 0.4, "beuler"),
+    "ball-short-steps": (BALL, 1e-5, 0.005, 0.3, 0.0, "beuler"),
+    "ball-long-steps": (BALL, 1e-5, 0.04, 0.4, 0.0, "beuler"),
+    "ball-larger-gap": (BALL, 1e-4, 0.01, 0.4, 0.0, "beuler"),
+    "rod": (ROD, 1e-5, 0.01, 0.3, 0.0, "beuler"),
+    "box": (BOX, 1e-5, 0.01, 0.25, 0.0, "beuler"),
 }
 
 
 def scene(name: str) -> Scene:
-    obstacle, gap, step, end, friction = SCENES[name]
+    obstacle, gap, step, end, friction, integrator = SCENES[name]
     grid = {"width": 1.0, "height": 1.0, "nx": 24, "ny": 24, "pattern": "alternating"}
     return Scene.model_validate(
         {
@@ -49,7 +52,7 @@ def scene(name: str) -> Scene:
             "gravity": [0.0, 0.0, -9.81],
             "contact": {"gap": gap, "friction": friction},
             "obstacles": {"it": obstacle},
-            "time": {"end": end, "step": step, "integrator": "beuler"},
+            "time": {"end": end, "step": step, "integrator": integrator},
         }
     )
 

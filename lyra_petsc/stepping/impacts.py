@@ -6,6 +6,8 @@ nearest points. What meets parts with about a tenth of its speed, whatever Δt i
 few periods of the barrier; what lies, slides or rolls at the same distance is not damped. (Without it sheets
 bounce for long under backward Euler with short steps, and with any under integrators of second order; and
 what bounces slides on where it should stand, as its normal force is too small every other moment.)
+`make_up_friction` then lets friction follow the normal forces that acted in the step, those of dashpots,
+too.
 
 **The midpoint rule**: what contact would add to the energy is taken from the velocities. The rule works with
 the forces at its stage, and a barrier that stiffens within a step stores less energy than they take, or gives
@@ -22,9 +24,11 @@ stay as they are. (Energy by projection: Hairer, Lubich & Wanner, Geometric Nume
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.stepping.stage_equations import StageEquations
@@ -36,12 +40,12 @@ DAMPING = 0.5
 
 
 class Damped(NamedTuple):
-    """What dashpots did in a step, on this rank.
+    """What impulses at the end of a step did, on this rank.
 
     Attributes
     ----------
     felt : (n_owned,)
-        Mean forces [N] on vertices that meet something.
+        Mean forces [N] of dashpots on vertices that meet something.
     held : (m,)
         What handles must hold against [N], at the prescribed unknowns.
     work, heat : float
@@ -108,45 +112,23 @@ def _add_impulses(term: Elastic, system: StageEquations, frozen: Any, out: Array
     np.add.at(out, rows, (force[:, None] * beta)[:, :, None] * normal[:, None, :])
 
 
-def normal_forces(system: StageEquations) -> Array | None:
-    """Normal forces (n_owned,) [N] on vertices that meet something, at the stage of the step just taken; None
-    where that is its end.
-    """
-    if system.stage.after == system.dt:
-        return None
-    out = np.zeros(system.points.n_owned)
-    for term in system.active.limiting:
-        *_, force, vertex = term.touching_points(system.stage_positions, system.active.frozen[term])
-        out += np.bincount(vertex[vertex >= 0], force[vertex >= 0], minlength=len(out))
-    return out
-
-
 def damp_impacts(system: StageEquations) -> Damped:
     """Damp the rates at which distances in contact change; collective.
 
     Impulses −w r of a pair with the rate r, w/m = 1 − e^−q, q = 2 ζ √(Δt² b″/m), which is a dashpot's in Δt
-    and keeps second order. As Σ_e w_e a_e a_eᵀ is not beyond the mass matrix for m the least over the pair's
-    vertices of mass over Σ_e |β_ei| Σ_j |β_ej|, with all pairs e, no impulse is too large, however many pairs
-    a vertex has.
+    and keeps second order; m as `_inverse_masses` has it, so that no impulse is too large.
     """
-    layout, free = system.points, system.prescribed.free
-    n, dt, felt = layout.n_owned, system.dt, np.zeros(layout.n_owned)
+    layout, n, dt, felt = system.points, system.points.n_owned, system.dt, np.zeros(system.points.n_owned)
     every = [term.dashpots(system.x, system.active.frozen[term]) for term in system.active.limiting]
     if not any(layout.largest(sum(len(pairs.points) for pairs in every))):
         held = np.zeros(len(system.prescribed.at))
         return Damped(felt, held, 0.0, 0.0, np.empty(0, dtype=np.int64), *np.empty((2, 0, 3)))
     # each is that of the rank of one vertex, which knows all pairs with the same nearest points
     mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
-    shared, inverse, impulse = np.zeros((3, *system.x.shape))
     for pairs, own in zip(every, mine, strict=True):
         dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
-        dashpots.share(*pairs[:2], own, shared)
-    layout.add_to_owners(shared)
-    mass = system.mass[:, None]
-    free = free & (mass > 0.0)
-    np.divide(shared[:n, :1], mass, out=inverse[:n], where=free)  # 0 of what is held
-    layout.update_ghosts(inverse)
-    work, obstacle, at, force = 0.0, [], [], []
+    inverse = _inverse_masses(system, [(*pairs[:2], own) for pairs, own in zip(every, mine, strict=True)])
+    work, impulse, pushes = 0.0, np.zeros_like(system.x), []
     for pairs, own in zip(every, mine, strict=True):
         push = np.empty(len(own))
         given = *pairs[:4], pairs.pushed, own, dt, DAMPING
@@ -155,16 +137,85 @@ def damp_impacts(system: StageEquations) -> Damped:
         felt += np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
         work += float(push @ pairs.pushed) / dt
         on = np.flatnonzero(own & (pairs.obstacle >= 0))
-        beta = np.where(pairs.points[on] >= 0, pairs.beta[on], 0.0)
-        side, corners = beta.sum(axis=1), system.x[np.maximum(pairs.points[on], 0)]
-        obstacle.append(pairs.obstacle[on])
-        at.append(np.einsum("ei,eik->ek", beta, corners) / side[:, None])
-        force.append(-(push[on] * side / dt)[:, None] * pairs.normal[on])
-    layout.add_to_owners(impulse)
-    change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
+        force = (push[on] / dt)[:, None] * pairs.normal[on]
+        pushes.append(_on_obstacles(system, pairs.points[on], pairs.beta[on], pairs.obstacle[on], force))
+    held, heat = _give(system, impulse, work)
+    return Damped(felt, held, work, heat, *(np.concatenate(part) for part in zip(*pushes, strict=True)))
+
+
+def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> Damped:
+    """Give what slides the friction that it lacks, or take back what it had too much, by impulses; what all
+    impulses of the step did; collective.
+
+    No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`.
+    """
+    stage, x, dt = system.stage_positions, system.x, system.dt
+    rubbing = term.rubbing(stage, x, system.active.frozen[term], damped.felt, dt)
+    points, beta, along, more, obstacle, moved = rubbing
+    if not any(system.points.largest(float(np.abs(more).max(initial=0.0)))):
+        return damped
+    impulse = np.zeros_like(x)
+    inverse = _inverse_masses(system, [(points, beta, more > 0.0)])
+    rows, of_sheet = np.maximum(points, 0), np.where(points >= 0, beta, 0.0)
+    speed = np.einsum("ei,eik,ek->e", of_sheet, system.v[rows], along)
+    speed -= np.einsum("ek,ek->e", moved, along) / dt
+    most = np.where((of_sheet != 0.0)[:, :, None], inverse[rows], 0.0).max(axis=(1, 2), initial=0.0)
+    stops = np.divide(speed, dt * most, out=np.zeros_like(speed), where=most > 0.0)
+    force = -np.minimum(more, np.maximum(stops, 0.0))[:, None] * along
+    np.add.at(impulse, rows, dt * of_sheet[:, :, None] * force[:, None, :])
+    work, on = float(np.vdot(force, moved)), obstacle >= 0
+    pushed = _on_obstacles(system, points[on], beta[on], obstacle[on], force[on])
+    held, heat = _give(system, impulse, work)
+    return Damped(
+        damped.felt,
+        damped.held + held,
+        damped.work + work,
+        damped.heat + heat,
+        *(np.concatenate(part) for part in zip(damped[4:], pushed, strict=True)),
+    )
+
+
+def _inverse_masses(system: StageEquations, every: Iterable[tuple[Ints, Array, NDArray[np.bool_]]]) -> Array:
+    """1/m (n_local, 3) [1/kg] of the parts of vertices' masses that one pair may stop; 0 of what is held;
+    collective.
+
+    ``every`` are points, β and which are this rank's. As Σ_e w_e a_e a_eᵀ with w_e ≤ m_e is not beyond the
+    mass matrix for m_e the least over a pair's vertices of mass over Σ_e |β_ei| Σ_j |β_ej|, with all pairs e,
+    impulses of all of them together turn nothing round, however many pairs a vertex has.
+    """
+    n, mass = system.points.n_owned, system.mass[:, None]
+    shared, inverse = np.zeros((2, *system.x.shape))
+    for points, beta, own in every:
+        dashpots.share(points, beta, own, shared)
+    system.points.add_to_owners(shared)
+    free = system.prescribed.free & (mass > 0.0)
+    np.divide(shared[:n, :1], mass, out=inverse[:n], where=free)
+    system.points.update_ghosts(inverse)
+    return inverse
+
+
+def _on_obstacles(
+    system: StageEquations, points: Ints, beta: Array, obstacle: Ints, force: Array
+) -> tuple[Ints, Array, Array]:
+    """Obstacles of pairs, where (m, 3) [m] they are pushed, and the force on them, where a sheet is pushed by
+    ``force`` (m, 3) [N] times β.
+    """
+    of_sheet = np.where(points >= 0, beta, 0.0)
+    side = of_sheet.sum(axis=1, keepdims=True)
+    at = np.einsum("ei,eik->ek", of_sheet, system.x[np.maximum(points, 0)]) / side
+    return obstacle, at, -side * force
+
+
+def _give(system: StageEquations, impulse: Array, work: float) -> tuple[Array, float]:
+    """Let impulses (n_local, 3) [N s] change the velocities; mean forces [N] of handles against them, and how
+    much of the ``work`` [J] of obstacles, and of kinetic energy, became heat; collective.
+    """
+    n, mass = system.points.n_owned, system.mass[:, None]
+    system.points.add_to_owners(impulse)
     # what is held goes on, against its part of the impulses; what is not loses or gains
+    free = system.prescribed.free & (mass > 0.0)
+    change = np.divide(impulse[:n], mass, out=np.zeros_like(impulse[:n]), where=free)
     heat = work - float(np.vdot(impulse[:n], system.v[:n] + 0.5 * change))
     system.state.set(system.x[:n], system.v[:n] + change)
     system.integrator.take_jump(change)
-    held = -impulse[:n].take(system.prescribed.at) / dt
-    return Damped(felt, held, work, heat, *(np.concatenate(part) for part in (obstacle, at, force)))
+    return -impulse[:n].take(system.prescribed.at) / system.dt, heat

@@ -28,6 +28,7 @@ from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
+from lyra_petsc.stepping.integrators.bdf2 import Bdf2
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
@@ -50,6 +51,9 @@ FINER = 0.2
 
 FINEST = 0.02
 """The same under the midpoint rule, whose steps keep angular momentum over an impact, if they find a way."""
+
+FAR = 20.0
+"""Skins of a search through which a vertex goes in a step, above which halvings do not resolve an impact."""
 
 FOLLOWED, FOLLOWED_OF_RUN = 0.02, 1e-4
 """Parts of a search's skin that vertices go in a step, and of the run, below which automatic steps do not
@@ -275,8 +279,7 @@ class SteppedScene:
             newton += attempt.newton_iterations
             linear += attempt.linear_iterations
             if not attempt.converged:
-                blocked = attempt.words.startswith(MEETS) and system.integrator is self._usual
-                if not (blocked and self._take_impact(end - self.time, "finds no way")):
+                if not self._find_way(attempt, end - self.time):
                     self._recover(attempt, end)
             else:
                 accurate = self._accurate(v_before[:n], end - self.time)
@@ -292,7 +295,7 @@ class SteppedScene:
                     assert self.guard is not None
                     # not under the midpoint rule, which keeps angular momentum
                     last = halvings == HALVINGS - 1
-                    impact = not self._usual.by_stage and self._take_impact(
+                    impact = not system.integrator.by_stage and self._take_impact(
                         end - self.time, self.guard.words, last=last
                     )
                     if not impact:
@@ -389,9 +392,13 @@ class SteppedScene:
         system = self.problem.system
         if not system.touches or is_set("ts_adapt_dt_min"):
             return 0.0
+        return min(FOLLOWED * self._time_through_skin(), FOLLOWED_OF_RUN * self.control.end)
+
+    def _time_through_skin(self) -> float:
+        """Time [s] in which the fastest vertex goes through the skin of a search for contact; collective."""
+        system = self.problem.system
         fastest = float(self.comm.allreduce(np.abs(system.v).max(initial=0.0), MPI.MAX))
-        skin = min(term.skin for term in system.active.limiting)
-        return min(FOLLOWED * skin / max(fastest, 1e-300), FOLLOWED_OF_RUN * self.control.end)
+        return min(term.skin for term in system.active.limiting) / max(fastest, 1e-300)
 
     def _keeps_energy(self, x_before: Array, v_before: Array, end: float) -> bool:
         """Whether the step just taken made no energy."""
@@ -409,6 +416,26 @@ class SteppedScene:
                 self.ledger.take_back(kept)
             return stands
 
+    def _find_way(self, attempt: Attempt, dt: float) -> bool:
+        """Let another integrator repeat a step of dt [s] in which something would pass; whether one does.
+
+        The midpoint rule and generalised-α go on from their stage to the end of the step, with small gaps
+        through what held the sheet at the stage. BDF2, of second order, too, has its stage at the end. Where
+        some halvings of Δt resolve the impact it loses more energy than they do.
+        """
+        system, usual = self.problem.system, self._usual
+        if system.integrator is usual and attempt.words.startswith(MEETS):
+            ends, far = system.stage.after == system.dt, dt > FAR * self._time_through_skin()
+            if ends or self.scene.time.adaptive or not far:
+                return self._take_impact(dt, "finds no way")
+            system.integrator = Bdf2()
+            self._tell_of_impact("finds no way", "bdf2")
+            return True
+        if system.integrator is usual or system.integrator.order == 1:
+            return False
+        system.integrator = usual
+        return self._take_impact(dt, "finds no way")
+
     def _take_impact(self, dt: float, why: str, *, last: bool = False) -> bool:
         """Let backward Euler repeat a short step that failed where something touches; whether it does.
 
@@ -422,17 +449,22 @@ class SteppedScene:
             long = dt > (FINEST if usual.by_stage else FINER) * self.control.step
         if long or usual.name == "beuler" or not usual.moves or not system.touches:
             return False
-        if system.integrator is not usual:
+        if system.integrator is not usual and system.integrator.order == 1:
             system.integrator = usual  # nor did that help
             return False
         system.integrator = LaggedBackwardEuler() if usual.lagged_loads else BackwardEuler()
-        if "impact" not in self._told:
-            self._told.add("impact")
-            self.notes.append(
-                f"step {self.step_number + 1} ({self._now()}): {usual.name} {why} where "
-                "something touches; such steps are repeated by backward Euler"
-            )
+        self._tell_of_impact(why, "backward Euler")
         return True
+
+    def _tell_of_impact(self, why: str, by: str) -> None:
+        """Say once by which integrator such steps are repeated."""
+        told = "impact" if by == "backward Euler" else f"impact {by}"
+        if told not in self._told:
+            self._told.add(told)
+            self.notes.append(
+                f"step {self.step_number + 1} ({self._now()}): {self._usual.name} {why} where "
+                f"something touches; such steps are repeated by {by}"
+            )
 
     def _lessen(self, dt: float, halvings: int) -> None:
         """Halve a step that made energy, or give up; the state is that before it."""

@@ -112,7 +112,7 @@ class StageEquations:
     objective : Objective
         The function whose gradient F is.
     followers : list of NeedsAcceleration
-        Who must hear of jumps and of the accelerations after them: the integrator, an error estimate.
+        Who must hear of jumps and of the accelerations after them, as the integrator does: an error estimate.
     active : ActiveTerms
     applied : AppliedLoads
     touches : bool
@@ -159,7 +159,7 @@ class StageEquations:
         self.stage = Stage(1.0, 1.0, 1.0)
         self.objective = Objective(self)
         self.dt = self.t0 = self.t1 = self.moving_energy_before = 0.0
-        self.followers: list[NeedsAcceleration] = [integrator]
+        self.followers: list[NeedsAcceleration] = []
         self._at_end = False  # the stage that ``begin_edges`` makes, after which its frames are in use again
         self._iterate: Array | None = None
         self._predicted: tuple[Array, Array] | None = None
@@ -223,9 +223,9 @@ class StageEquations:
             self._follow(self.x, ahead, stops)
         # a step may begin where a state was written, a rounding beside the event
         if changed or any(abs(t0 - event) <= 1e-6 * self.dt for event in self._events):
-            for follower in self.followers:
+            for follower in (self.integrator, *self.followers):
                 follower.disturbed()
-        asking = [follower for follower in self.followers if follower.needs_acceleration]
+        asking = [each for each in (self.integrator, *self.followers) if each.needs_acceleration]
         acceleration = self._accelerations(t0 + after) if asking else self.history
         for follower in asking:
             follower.start_from(acceleration)
@@ -367,11 +367,10 @@ class StageEquations:
             if self.watches_impacts:
                 left = self.integrator.surplus
                 self.integrator.surplus = impacts.surplus(self, self._stored, before, left)
-            rubbing = [term for term in self.active.near if term.slips]
-            acted = impacts.normal_forces(self) if rubbing else None
             self.damped = impacts.damp_impacts(self)
-            for term in rubbing:
-                term.take_normal_forces(acted, self.damped.felt)
+            for term in self.active.near:
+                if term.slips:
+                    self.damped = impacts.make_up_friction(self, term, self.damped)
 
     def reopen(self, x_before: Array) -> None:
         """Let the step just accepted, from x_before (n_owned, 3), be asked again; collective."""
@@ -669,8 +668,12 @@ class StageEquations:
         """
         gone, begin = 0.0, float(after)
         for _ in range(SEARCHES):
-            x, ahead = self.ahead(v + gone * way, (1.0 - gone) * way)
+            there = v + gone * way, (1.0 - gone) * way
+            x, ahead = self.ahead(*there)
             seen = self.discretisation.largest_step(x, ahead)
+            if seen < FEW:
+                x, ahead = self._look(*there)
+                seen = self.discretisation.largest_step(x, ahead)
             ahead *= seen
             part = Part(begin + gone, begin + (1.0 if seen == 1.0 else gone + seen * (1.0 - gone)))
             free = [term.lets_pass(x, ahead, self.active.frozen[term], part) for term in self.active.limiting]
@@ -815,8 +818,8 @@ class StageEquations:
         """Whether there is anything of which one linear solve cannot tell whether it sticks or slides;
         collective.
         """
-        terms = [term for term in self.active.near if term.slips]
-        return self.discretisation.near and any(self.points.largest(sum(term.n_elements for term in terms)))
+        number = sum(term.n_rubbing for term in self.active.near)
+        return self.discretisation.near and any(self.points.largest(number))
 
     @property
     def may_impact(self) -> bool:

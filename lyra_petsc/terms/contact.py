@@ -255,6 +255,21 @@ class Obstacles:
             found.append((rotation, there - rotation @ way))
         return found
 
+    def taken_along(
+        self, x: Array, points: Ints, beta: Array, obstacle: Ints, moved: list[tuple[Array, Array]]
+    ) -> Array:
+        """How far (m, 3) [m] obstacles moved where pairs with points and β (m, 4) touch them at positions x
+        (n_local, 3), times Σ β_i of the sheet's points; 0 of pairs between sheets, with an obstacle −1.
+        """
+        out = np.zeros((len(points), 3))
+        for number, (turn, way) in enumerate(moved if self.moving else []):
+            mine = np.flatnonzero(obstacle == number)
+            part = np.where(points[mine] >= 0, beta[mine], 0.0)
+            side = part.sum(axis=1, keepdims=True)
+            foot = np.einsum("ei,eik->ek", part, x[np.maximum(points[mine], 0)]) / side
+            out[mine] = side * (foot - (foot - way) @ turn)  # where it is now, less where it was
+        return out
+
 
 class ContactBarrier(Elastic):
     """The barrier between all near pairs.
@@ -701,14 +716,9 @@ class ContactBarrier(Elastic):
         at, square, beta = met.at[of], square[of], met.beta[of]
         normal = met.felt[of, :3] / np.sqrt(square)[:, None]
         stiffness = met.weight[of] * met.felt[of, 4] * square
-        points, obstacle, pushed = self.points[at], self.obstacle[at], np.zeros(len(at))
-        for number, (turn, way) in enumerate(frozen.moved_on if self.moving else []):
-            mine = np.flatnonzero(obstacle == number)
-            part = np.where(points[mine] >= 0, beta[mine], 0.0)
-            side = part.sum(axis=1, keepdims=True)
-            foot = np.einsum("ei,eik->ek", part, x[np.maximum(points[mine], 0)]) / side
-            moved = foot - (foot - way) @ turn  # where it is now, less where it was
-            pushed[mine] = np.einsum("ek,ek->e", side * moved, normal[mine])
+        points, obstacle = self.points[at], self.obstacle[at]
+        moved = self.obstacles.taken_along(x, points, beta, obstacle, frozen.moved_on)
+        pushed = np.einsum("ek,ek->e", moved, normal)
         return Dashpots(points, beta, normal, stiffness, self.vertex_of(at), obstacle, pushed)
 
     def normal_forces(self, x: Array, frozen: Places) -> Array:

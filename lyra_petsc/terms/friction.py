@@ -4,8 +4,11 @@ Pairs, their normals and normal forces are those of the last accepted state; a p
 elastic part of its way, so that what sticks does not creep, and so does a vertex that goes on over what it
 touches. The owner of a pair's first vertex knows it, and tells the owners of the others.
 
-The normal forces of a step are those that acted in the step before: what sums up over the time that a pair
-touches is μ times their impulse. Under integrators of second order they are not those at its end alone.
+The normal forces of a step's equations are those at its start. Where others act in it, vertices that slide
+are owed the difference, and get a part of that by impulses at the end of every step, all of it when they
+leave (`CoulombFriction.rubbing`, `stepping.impacts`), so that friction sums up to μ times the impulse of the
+normal forces by now. Else what comes to lie on a slope would slide on as fast as its weight makes it in a
+step, and be stopped only by what friction could hold beyond that.
 """
 
 from __future__ import annotations
@@ -25,11 +28,15 @@ from lyra_petsc.terms.contact import HALFWAY, ContactBarrier
 from lyra_petsc.terms.contact_pairs import EDGE_EDGE
 from lyra_petsc.terms.friction_pairs import COLUMNS, FORCE, SLID
 from lyra_petsc.terms.rest import RestShape
-from lyra_petsc.terms.term import Elastic, Offsets, UpcomingStep
+from lyra_petsc.terms.term import Elastic, Offsets, Rubbing, UpcomingStep
 
-WORK, MORE, MISSED = 0, 1, 2
-"""Columns of what is known of vertices: work of friction [J]; by how much the normal forces that acted in the
-last step exceed those at its end [N], as far as friction is given it, and the rest, of all steps."""
+WORK, OWED = 0, 1
+"""Columns of what is known of vertices: work of friction [J]; impulse of normal forces [N s] that friction
+has not followed yet."""
+
+PAID = 0.25
+"""Part of that which is made up for in a step. All at once would make friction tremble twice as much as the
+normal forces of a sheet on a sheet do, and linear systems take a third more iterations."""
 
 SLIP = 4
 """Place of the elastic parts of the ways among what the kernels take."""
@@ -68,13 +75,14 @@ class ObstacleMoves(NamedTuple):
     stage, end : list of (3, 3) and (3,)
         Rotation and translation [m] of each from the start of the step to where friction is asked, and to the
         end.
-    places : (m, 3)
-        Their points and normals there.
+    now, places : (m, 3)
+        Their points and normals at the stage, and at the end.
     """
 
     part: float
     stage: list[tuple[Array, Array]]
     end: list[tuple[Array, Array]]
+    now: Array
     places: Array
 
 
@@ -104,7 +112,7 @@ class CoulombFriction(Elastic):
         self._common = coefficients(scene.contact.friction)
         self._heat = np.zeros((n_vertices, 3))
         self._pairs = self._known = _no_pairs()
-        self._felt: tuple[Array | None, Array] | None = None  # as `take_normal_forces` is given
+        self._owed: Array | None = None  # after the step, until that is accepted
         self.stale = False
         super().__init__(Elements(np.empty((0, 4), dtype=np.int32), {"what": np.empty((0, COLUMNS))}))
 
@@ -124,6 +132,8 @@ class CoulombFriction(Elastic):
         self._normal, self._still, self._slip, self._foot = vectors
         friction_pairs.unpack(what, self._beta, self._normal, self._still, self._slip, self._foot)
         self._obstacle = what[:, 1].astype(np.int64)
+        of_vertex = (what[:, 0] != EDGE_EDGE) & (what[:, 2] == 0.0)
+        self._vertex = np.where(of_vertex, self.stencil[:, 0], -1)
         self._force = self._limit = self._spring = what[:, FORCE].copy()
         if n:
             static, kinetic = self._coefficients[self._obstacle].T
@@ -133,6 +143,10 @@ class CoulombFriction(Elastic):
             drops = kinetic < static
             self._spring[drops] = static[drops] * self._force[drops] / longest
         self._of: ObstacleMoves | None = None  # what is remembered of a stage
+
+    @property
+    def n_rubbing(self) -> int:
+        return len(self._pairs.key)
 
     # -- pairs -------------------------------------------------------------------------------------
 
@@ -144,36 +158,16 @@ class CoulombFriction(Elastic):
         """Take the pairs that touch at positions x (n_local, 3) and obstacles' points; ``old`` ones go on."""
         contact = self._contact
         if not contact.n_elements and not len(self._pairs.key):
-            self._heat[:, MORE:] = 0.0
             return
         beta, normal, force, at = contact.touching(x, places, contact.n_owned)
         key = np.empty((len(at), 10), dtype=np.int64)
         friction_pairs.keys(contact.points, contact.number, contact.kind, contact.obstacle, beta, at, key)
-        self._give(contact.vertex_of(at), force)
         order = _order(key)
         key, same, what = key[order], np.empty(len(at), dtype=np.int64), np.empty((len(at), COLUMNS))
         friction_pairs.find(key, old.key, old.what, same)
         touching = at[order], beta[order], normal[order], force[order]
         friction_pairs.describe(x, contact.stencil, contact.points, key, touching, same, old.what, what)
         self._pairs, self.stale = Pairs(key, what), True
-
-    def _give(self, vertex: Ints, force: Array) -> None:
-        """Let normal forces (m,) [N] of pairs of vertices be those that acted in the step."""
-        more, missed = self._heat[:, MORE], self._heat[:, MISSED]
-        led = vertex >= 0
-        total = np.bincount(vertex[led], force[led], minlength=len(more))
-        if self._felt is not None:
-            n, (force_of_step, damping) = len(more), self._felt
-            felt = damping[:n] + (total if force_of_step is None else force_of_step[:n])
-            missed += felt - total
-            missed[(total == 0.0) & (felt == 0.0)] = 0.0
-            np.clip(missed, -total, total, out=more)
-            missed -= more
-        if more.any():
-            force[led] *= 1.0 + (more / np.maximum(total, np.finfo(float).tiny))[vertex[led]]
-
-    def take_normal_forces(self, force: Array | None, damping: Array) -> None:
-        self._felt = force, damping
 
     def take_pairs(self, x: Array, frozen: ObstacleMoves) -> None:
         self._renew(x, frozen.places, self._pairs)
@@ -207,7 +201,9 @@ class CoulombFriction(Elastic):
             part = (step.at - step.start) / (step.end - step.start)
         elif step.at < step.end:
             stage = obstacles.moved(step.start, step.at)
-        return ObstacleMoves(part, stage, end, obstacles.at(step.end))
+        places = obstacles.at(step.end)
+        now = obstacles.at(step.at) if obstacles.moving else places
+        return ObstacleMoves(part, stage, end, now, places)
 
     def _state(self, moved: list[tuple[Array, Array]]) -> tuple[NDArray[Any], ...]:
         """What the kernels take, with obstacles moved so."""
@@ -273,12 +269,7 @@ class CoulombFriction(Elastic):
         return self._spring * size
 
     def accept(self, x: Array, frozen: ObstacleMoves) -> None:
-        if self._felt is None:
-            self._heat[:, MORE:] = 0.0
-        self._take_step(x, frozen)
-        self._felt = None
-
-    def _take_step(self, x: Array, frozen: ObstacleMoves) -> None:
+        self._heat[:, OWED], self._owed = (0.0 if self._owed is None else self._owed), None
         if not self.n_elements:
             self._on_obstacles = np.zeros_like(self._on_obstacles)
             self._renew(x, frozen.places, self._known)
@@ -294,6 +285,34 @@ class CoulombFriction(Elastic):
         old = self._known.what.copy()
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
         self._renew(x, frozen.places, Pairs(self._known.key, old))
+
+    def rubbing(self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float) -> Rubbing:
+        contact, state, slip = self._contact, list(self._state(frozen.end)), self._slip.copy()
+        *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
+        vertex, slides = contact.vertex_of(at), np.empty(self.n_elements, dtype=np.bool_)
+        state[SLIP] = slip
+        friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
+        led = np.flatnonzero(self._vertex[: self.n_owned] >= 0)
+        rub = led[slides[led]]
+        # normal forces on vertices: that acted, that pairs were given, and those among them that slide
+        acted, given, rubs = (
+            np.bincount(first, each, minlength=len(self._heat))
+            for first, each in (
+                (vertex[vertex >= 0], force[vertex >= 0]),
+                (self._vertex[led], self._force[led]),
+                (self._vertex[rub], self._force[rub]),
+            )
+        )
+        owed = self._heat[:, OWED] / dt + acted + damping[: len(acted)] - given
+        pays = np.where(rubs > 0.0, np.where(acted > 0.0, PAID, 1.0) * owed, 0.0)
+        # what sticks is owed nothing, what has just come is given all later
+        goes_on = (acted > 0.0) & ((rubs > 0.0) | (given == 0.0))
+        self._owed = np.where(goes_on, dt * (owed - pays), 0.0)
+        points, beta, obstacle = self.stencil[rub], self._beta[rub], self._obstacle[rub]
+        along = slip[rub] / np.linalg.norm(slip[rub], axis=1, keepdims=True)
+        more = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
+        moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
+        return Rubbing(points, beta, along, more, obstacle, moved)
 
     def on_the_way(self, x: Array, frozen: ObstacleMoves) -> None:
         # what obstacles take along in the load step would go that way twice

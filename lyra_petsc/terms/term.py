@@ -213,6 +213,31 @@ class Dashpots(NamedTuple):
     pushed: Array
 
 
+class Rubbing(NamedTuple):
+    """Pairs that slide, and what friction lacks.
+
+    Attributes
+    ----------
+    points, beta : (m, 4)
+        As `Elastic.touching_points` has them.
+    along : (m, 3)
+        Unit vectors of the ways that they slid.
+    more : (m,)
+        By how much friction [N] was too small in one step; below 0, too large.
+    obstacle : (m,)
+        What is touched, −1 between sheets.
+    moved : (m, 3)
+        How far the obstacle moved in the step, times Σ β_i of the sheet's points [m].
+    """
+
+    points: Ints
+    beta: Array
+    along: Array
+    more: Array
+    obstacle: Ints
+    moved: Array
+
+
 class Elastic(Term):
     """An energy of the positions; its force is minus the gradient."""
 
@@ -466,10 +491,16 @@ class Elastic(Term):
     def take_pairs(self, x: Array, frozen: Any) -> None:
         """Take the elements that act at positions x (n_local, 3), where a run begins or goes on."""
 
-    def take_normal_forces(self, force: Array | None, damping: Array) -> None:
-        """Know the normal forces (n_owned,) [N] on vertices that met something in the step just taken, None:
-        as at its end; and those of dashpots.
+    @property
+    def n_rubbing(self) -> int:
+        """How many pairs touch that may stick or slide in the next step, of a term that `slips`."""
+        return 0
+
+    def rubbing(self, stage: Array, x: Array, frozen: Any, damping: Array, dt: float) -> Rubbing:
+        """What slides in a step of length dt [s] over a stage at positions ``stage`` to x (n_local, 3), in
+        which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that `slips`.
         """
+        raise NotImplementedError
 
     def element_state(self) -> tuple[Ints, Array]:
         """What a checkpoint must hold of changing elements: vertices (E, n) of those that this rank counts,

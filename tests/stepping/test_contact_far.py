@@ -62,6 +62,15 @@ def test_a_step_is_searched_once(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch
     assert searches == STEPS
 
 
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2"])
+def test_a_fall_through_many_small_gaps_needs_no_shorter_steps(integrator: str) -> None:
+    """The way on from the stage, hundreds of times the gap, is not known from the search before the step."""
+    falls = {"handles": [], "initial": {"velocity": [0.0, 0.0, -1.0]}, "contact": {"gap": 1e-5}}
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(SCENE | FAR | falls | timed(integrator)))
+    assert not sum(simulation.step().rejected for _ in range(STEPS))
+    simulation.destroy()
+
+
 def test_damping_and_stiffness_are_one_multiple_until_something_is_near() -> None:
     with Simulation(SCENE | FAR, MPI.COMM_SELF) as simulation:
         system = simulation.problem.system

@@ -30,10 +30,15 @@ PLANE = {"plane": {"point": [0.0, 0.0, 0.0], "normal": NORMAL}}
 
 
 def on_slope(
-    comm: MPI.Comm, friction: float, end: float, slope: dict[str, Any] = PLANE
+    comm: MPI.Comm,
+    friction: float,
+    end: float,
+    slope: dict[str, Any] = PLANE,
+    integrator: str = "beuler",
+    above: float = 0.9,
 ) -> tuple[float, float, Array, float, float]:
     """Mean way and speed down the slope, force on it, weight and friction's work of a sheet let go."""
-    place = [0.9 * GAP * component for component in NORMAL]
+    place = [above * GAP * component for component in NORMAL]
     turn = {"axis": [0.0, 1.0, 0.0], "degrees": math.degrees(SLOPE)}
     content = {
         "mesh": grid(0.4, 0.4, 3, 3) | {"transform": {"rotate": turn, "translate": place}},
@@ -41,7 +46,7 @@ def on_slope(
         "gravity": [0.0, 0.0, -G],
         "contact": {"gap": GAP, "friction": friction, "self": False},
         "obstacles": {"slope": slope},
-        "time": {"end": end, "step": 0.01},
+        "time": {"end": end, "step": 0.01, "integrator": integrator},
     }
     simulation = SteppedScene(comm, scene_of(content))
     system, n = simulation.problem.system, simulation.problem.points.n_owned
@@ -124,6 +129,16 @@ def test_it_stands_until_friction_at_rest_is_exceeded(comm: MPI.Comm) -> None:
     simulation.destroy()
     assert ways[0] < 0.01
     assert ways[1] > 0.05
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("integrator", ["beuler", "midpoint", "alpha2", "bdf2", "semi-implicit"])
+def test_friction_is_that_of_the_normal_forces_of_the_same_time(comm: MPI.Comm, integrator: str) -> None:
+    """What is let go above where it comes to lie; a step later friction would lack g sin α Δt for good."""
+    for part in (0.5, 1.01):
+        _, speed, *_ = on_slope(comm, part * math.tan(SLOPE), 0.5, integrator=integrator, above=0.97)
+        expected = max(1.0 - part, 0.0) * G * math.sin(SLOPE) * 0.5
+        assert speed == pytest.approx(expected, abs=0.01 * G * math.sin(SLOPE) * 0.01)
 
 
 INTEGRATORS = [

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mpi4py import MPI
-from physics import end_on_one_rank, gathered, grid, scene_of
+from physics import CLOTH, end_on_one_rank, gathered, grid, scene_of
 
 from lyra_petsc.stepping.simulation import SteppedScene
 
@@ -53,6 +53,29 @@ def test_what_meets_hardly_bounces(comm: MPI.Comm, integrator: str, step: float,
     unexplained = budget.total + budget.dissipation - budget.external_work - before
     # backward Euler damps by itself, too
     assert abs(unexplained) < (0.08 if integrator == "beuler" else 0.01) * 0.5 * mass * SPEED**2
+
+
+@pytest.mark.parallel(1)
+@pytest.mark.parametrize("integrator", ["midpoint", "alpha2", "bdf2", "beuler"])
+def test_small_gaps_need_no_more_steps(comm: MPI.Comm, integrator: str) -> None:
+    """A sheet falls on a ball by hundreds of gaps a step, and vertices meet it in every one of them."""
+    ball = {"sphere": {"center": [0.0, 0.0, -0.302], "radius": 0.3}}
+    scene = {
+        "mesh": grid(0.6, 0.6, 8, 8) | {"transform": {"translate": [-0.3, -0.28, 0.0]}},
+        "material": CLOTH,
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "contact": {"gap": 1e-5, "self": False},
+        "obstacles": {"ball": ball},
+        "time": {"end": 0.04, "step": 0.005, "integrator": integrator},
+    }
+    simulation = SteppedScene(comm, scene_of(scene))
+    before = simulation.budget.total
+    while not simulation.finished:
+        simulation.step()
+    assert simulation.ledger.columns()["contacts"] > 2
+    assert simulation.budget.total < before
+    assert simulation.step_number == 8
+    simulation.destroy()
 
 
 @pytest.mark.parallel(alone=False)
