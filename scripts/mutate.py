@@ -214,8 +214,8 @@ CHANGES: list[Change] = [
     ),
     Change(
         STEPPING + "exact_hessian.py",
-        "blocks = system.applied.factor * following_stiffness",
-        "blocks = following_stiffness",
+        "force_of, system.applied.factor",
+        "force_of, 1.0",
         (STABLE + "test_the_hessian_is_the_slope_of_all_forces[pressure]",),
     ),
     Change(

@@ -45,7 +45,7 @@ class Damped(NamedTuple):
     Attributes
     ----------
     felt : (n_owned,)
-        Mean forces [N] of dashpots on vertices that meet something.
+        Mean forces [N] of dashpots on vertices that meet what friction follows.
     held : (m,)
         What handles must hold against [N], at the prescribed unknowns.
     work, heat : float
@@ -127,13 +127,14 @@ def damp_impacts(system: StageEquations) -> Damped:
     mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
     for pairs, own in zip(every, mine, strict=True):
         dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
+    sheets = _sheets_count(system)
     inverse = _inverse_masses(system, [(*pairs[:2], own) for pairs, own in zip(every, mine, strict=True)])
     work, impulse, pushes = 0.0, np.zeros_like(system.x), []
     for pairs, own in zip(every, mine, strict=True):
         push = np.empty(len(own))
         given = *pairs[:4], pairs.pushed, own, dt, DAMPING
         dashpots.damp(system.v, inverse, *given, push, impulse)
-        vertex = np.flatnonzero(own & (pairs.vertex >= 0))
+        vertex = np.flatnonzero(own & (pairs.vertex >= 0) & (sheets | (pairs.obstacle >= 0)))
         felt += np.bincount(pairs.vertex[vertex], push[vertex] / dt, minlength=n)
         work += float(push @ pairs.pushed) / dt
         on = np.flatnonzero(own & (pairs.obstacle >= 0))
@@ -150,7 +151,8 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`.
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
-    rubbing = term.rubbing(stage, x, system.active.frozen[term], damped.felt, dt)
+    frozen, sheets = system.active.frozen[term], _sheets_count(system)
+    rubbing = term.rubbing(stage, x, frozen, damped.felt, dt, sheets=sheets)
     points, beta, along, more, obstacle, moved = rubbing
     if not any(system.points.largest(float(np.abs(more).max(initial=0.0)))):
         return damped
@@ -173,6 +175,11 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
         damped.heat + heat,
         *(np.concatenate(part) for part in zip(damped[4:], pushed, strict=True)),
     )
+
+
+def _sheets_count(system: StageEquations) -> bool:
+    """Whether friction between sheets follows their normal forces, too: of a stage before the step's end."""
+    return system.stage.after < system.dt
 
 
 def _inverse_masses(system: StageEquations, every: Iterable[tuple[Ints, Array, NDArray[np.bool_]]]) -> Array:

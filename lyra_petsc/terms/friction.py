@@ -8,7 +8,8 @@ The normal forces of a step's equations are those at its start. Where others act
 are owed the difference, and get a part of that by impulses at the end of every step, all of it when they
 leave (`CoulombFriction.rubbing`, `stepping.impacts`), so that friction sums up to μ times the impulse of the
 normal forces by now. Else what comes to lie on a slope would slide on as fast as its weight makes it in a
-step, and be stopped only by what friction could hold beyond that.
+step, and be stopped only by what friction could hold beyond that. Between sheets normal forces tremble, and a
+knot would take 40 % more Newton iterations: there only where the stage is before the end, with other forces.
 """
 
 from __future__ import annotations
@@ -35,8 +36,7 @@ WORK, OWED = 0, 1
 has not followed yet."""
 
 PAID = 0.25
-"""Part of that which is made up for in a step. All at once would make friction tremble twice as much as the
-normal forces of a sheet on a sheet do, and linear systems take a third more iterations."""
+"""Part of that which is made up for in a step: all at once would make friction tremble."""
 
 SLIP = 4
 """Place of the elastic parts of the ways among what the kernels take."""
@@ -286,19 +286,22 @@ class CoulombFriction(Elastic):
         old[:, friction_pairs.SLIP : SLID], old[:, SLID] = slip[: self.n_owned], slides[: self.n_owned]
         self._renew(x, frozen.places, Pairs(self._known.key, old))
 
-    def rubbing(self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float) -> Rubbing:
+    def rubbing(
+        self, stage: Array, x: Array, frozen: ObstacleMoves, damping: Array, dt: float, *, sheets: bool
+    ) -> Rubbing:
         contact, state, slip = self._contact, list(self._state(frozen.end)), self._slip.copy()
         *_, force, at = contact.touching(stage, frozen.now, contact.n_owned)
         vertex, slides = contact.vertex_of(at), np.empty(self.n_elements, dtype=np.bool_)
+        on = (vertex >= 0) & (sheets | (contact.obstacle[at] >= 0))
         state[SLIP] = slip
         friction_pairs.slide(x, *state, np.empty(self.n_elements), slides)
-        led = np.flatnonzero(self._vertex[: self.n_owned] >= 0)
+        led = np.flatnonzero(((self._vertex >= 0) & (sheets | (self._obstacle >= 0)))[: self.n_owned])
         rub = led[slides[led]]
         # normal forces on vertices: that acted, that pairs were given, and those among them that slide
         acted, given, rubs = (
             np.bincount(first, each, minlength=len(self._heat))
             for first, each in (
-                (vertex[vertex >= 0], force[vertex >= 0]),
+                (vertex[on], force[on]),
                 (self._vertex[led], self._force[led]),
                 (self._vertex[rub], self._force[rub]),
             )
@@ -309,7 +312,8 @@ class CoulombFriction(Elastic):
         goes_on = (acted > 0.0) & ((rubs > 0.0) | (given == 0.0))
         self._owed = np.where(goes_on, dt * (owed - pays), 0.0)
         points, beta, obstacle = self.stencil[rub], self._beta[rub], self._obstacle[rub]
-        along = slip[rub] / np.linalg.norm(slip[rub], axis=1, keepdims=True)
+        length = np.linalg.norm(slip[rub], axis=1, keepdims=True)
+        along = np.divide(slip[rub], length, out=np.zeros((len(rub), 3)), where=length > 0.0)
         more = self._limit[rub] * (pays / np.maximum(rubs, np.finfo(float).tiny))[self._vertex[rub]]
         moved = contact.obstacles.taken_along(x, points, beta, obstacle, frozen.end)
         return Rubbing(points, beta, along, more, obstacle, moved)

@@ -496,9 +496,13 @@ class Elastic(Term):
         """How many pairs touch that may stick or slide in the next step, of a term that `slips`."""
         return 0
 
-    def rubbing(self, stage: Array, x: Array, frozen: Any, damping: Array, dt: float) -> Rubbing:
+    def rubbing(
+        self, stage: Array, x: Array, frozen: Any, damping: Array, dt: float, *, sheets: bool
+    ) -> Rubbing:
         """What slides in a step of length dt [s] over a stage at positions ``stage`` to x (n_local, 3), in
         which dashpots pushed vertices by ``damping`` (n_owned,) [N], too; of a term that `slips`.
+
+        On obstacles, and with ``sheets`` on sheets.
         """
         raise NotImplementedError
 
