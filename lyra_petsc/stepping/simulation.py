@@ -694,7 +694,8 @@ class SteppedScene:
         for term in system.active.elastic:
             names = term.registration.state
             if names:
-                term.restore({name: arrays[f"{term.name}.{name}"] for name in names})
+                known = {name: arrays.get(f"{term.name}.{name}") for name in names}
+                term.restore({name: array for name, array in known.items() if array is not None})
             if term.name in elements and term.registration.neighbours:
                 self._restore_elements(term, *elements[term.name])
                 term.take_pairs(system.x, system.active.frozen[term])

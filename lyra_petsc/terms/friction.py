@@ -35,6 +35,9 @@ WORK, OWED = 0, 1
 """Columns of what is known of vertices: work of friction [J]; impulse of normal forces [N s] that friction
 has not followed yet."""
 
+HEAT = np.arange(3) == WORK
+"""Which column is that of the work."""
+
 PAID = 0.25
 """Part of that which is made up for in a step: all at once would make friction tremble."""
 
@@ -344,10 +347,11 @@ class CoulombFriction(Elastic):
         return self._on_obstacles
 
     def state(self) -> dict[str, Array]:
-        return {"friction_work": self._heat}
+        # older ones had something else in the place of what is owed
+        return {"friction_work": self._heat * HEAT, "friction_owed": self._heat * ~HEAT}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self._heat = state["friction_work"].copy()
+        self._heat = state["friction_work"] * HEAT + state.get("friction_owed", 0.0)
 
     def history(self, x: Array, frozen: ObstacleMoves) -> Mapping[str, float]:
         return {"friction_work": float(self._heat[:, WORK].sum())}

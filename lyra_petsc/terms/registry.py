@@ -156,7 +156,7 @@ REGISTRY: list[Registration] = [
         Role.CONSTRAINT,
         columns={"friction_work": "sum"},
         neighbours=True,
-        state=("friction_work",),
+        state=("friction_work", "friction_owed"),
         element_vertices=4,
     ),
     Registration("clamp", _clamps, Role.ELASTIC, "bending_energy", damped=True, bends=True, moving=True),

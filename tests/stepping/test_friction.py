@@ -258,3 +258,24 @@ def test_a_resumed_run_keeps_what_sticks(comm: MPI.Comm, shared_tmp: Path, integ
     if x is not None:
         assert np.abs(unbroken - start).max() > 1e-4
         np.testing.assert_allclose(x, unbroken, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parallel(1)
+def test_checkpoints_of_older_versions_owe_nothing() -> None:
+    """They have something else beside the work."""
+    content = {
+        "mesh": grid(1.0, 1.0, 1, 1) | {"transform": {"translate": [0.0, 0.0, 5.0]}},
+        "contact": {"gap": GAP, "friction": 0.5},
+        "obstacles": {"slope": PLANE},
+    }
+    simulation = SteppedScene(MPI.COMM_SELF, scene_of(content))
+    term = simulation.problem.terms["friction"]
+    older = np.arange(3.0 * len(term.state()["friction_work"])).reshape(-1, 3)
+    term.restore({"friction_work": older})
+    kept = term.state()
+    term.restore(kept)
+    np.testing.assert_array_equal(kept["friction_work"], older * [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(term.state()["friction_owed"], 0.0)
+    term.restore(kept | {"friction_owed": older * [0.0, 1.0, 0.0]})
+    np.testing.assert_array_equal(term.state()["friction_owed"], older * [0.0, 1.0, 0.0])
+    simulation.destroy()
