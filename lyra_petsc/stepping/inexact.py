@@ -24,9 +24,9 @@ step in which parts collide. An impact magnifies what a solve leaves, which depe
 thirty to a hundred times."""
 
 ALONE = 1e-4
-"""Tolerance of the solves of a step with contact in which nothing is near: what looser ones leave, more on some
-ranks than on others, adds up until parts meet. It saves an iteration of Newton's method in three, and takes a
-third more of the linear solver's."""
+"""Tolerance of the solves of a step with contact in which nothing is near: what looser ones leave, more on
+some ranks than on others, adds up until parts meet. It saves an iteration of Newton's method in three, and
+takes a third more of the linear solver's."""
 
 COLLISION = 1.0
 """How much nearer parts come in a step, over the edges' mean length, from which on they collide: sheets then
