@@ -132,7 +132,7 @@ class Equilibrium:
         x = system.x[:n].copy()
         system.applied.factor = factor
         newton = linear = solves = 0
-        anchored, last, arrived, leaps = 0.0, np.inf, False, not self._system.active.viscous
+        anchored, last, arrived, leaps = 0.0, np.inf, False, not system.active.viscous
         ceiling, touches = np.inf, system.discretisation.guards
         touched = system.active.touched()
         self._integrator.ahead = self._extrapolation.to(factor, before, x) - x

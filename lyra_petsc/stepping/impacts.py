@@ -127,7 +127,7 @@ def damp_impacts(system: StageEquations) -> Damped:
     mine = [np.empty(len(pairs.points), dtype=bool) for pairs in every]
     for pairs, own in zip(every, mine, strict=True):
         dashpots.find_own(*pairs[:2], pairs.vertex, layout.global_number, n, own)
-    sheets = _sheets_count(system)
+    sheets = _between_sheets_too(system)
     inverse = _inverse_masses(system, [(*pairs[:2], own) for pairs, own in zip(every, mine, strict=True)])
     work, impulse, pushes = 0.0, np.zeros_like(system.x), []
     for pairs, own in zip(every, mine, strict=True):
@@ -151,7 +151,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     No pair is turned round by more friction: that is at most its speed times m of `_inverse_masses`.
     """
     stage, x, dt = system.stage_positions, system.x, system.dt
-    frozen, sheets = system.active.frozen[term], _sheets_count(system)
+    frozen, sheets = system.active.frozen[term], _between_sheets_too(system)
     rubbing = term.rubbing(stage, x, frozen, damped.felt, dt, sheets=sheets)
     points, beta, along, more, obstacle, moved = rubbing
     if not any(system.points.largest(float(np.abs(more).max(initial=0.0)))):
@@ -177,7 +177,7 @@ def make_up_friction(system: StageEquations, term: Elastic, damped: Damped) -> D
     )
 
 
-def _sheets_count(system: StageEquations) -> bool:
+def _between_sheets_too(system: StageEquations) -> bool:
     """Whether friction between sheets follows their normal forces, too: of a stage before the step's end."""
     return system.stage.after < system.dt
 

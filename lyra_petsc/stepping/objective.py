@@ -67,7 +67,7 @@ class Objective:
             sizes = term.sizes(self._size)
             of_size = rate * (sizes if isinstance(sizes, float) else sizes[: term.n_owned])
             # ** would raise where the square is infinite
-            square += 2.0 * float(np.vdot(each, stiffness * of_size * of_size))
+            square += 2.0 * float(np.vdot(each, stiffness * (of_size * of_size)))
         parts.append(-rate * float(np.vdot(of.applied.now, x[:n] - of.x[:n])))
         if of.applied.following is not None:
             parts.append(rate * of.applied.following.energy(x))

@@ -28,7 +28,6 @@ from lyra_petsc.stepping.equilibrium import Equilibrium
 from lyra_petsc.stepping.failure_advice import Circumstances, advice, more_room, trouble
 from lyra_petsc.stepping.failure_diagnosis import diagnose
 from lyra_petsc.stepping.failure_report import FailedAttempt, Failure
-from lyra_petsc.stepping.integrators.bdf2 import Bdf2
 from lyra_petsc.stepping.integrators.beuler import BackwardEuler, LaggedBackwardEuler
 from lyra_petsc.stepping.local_error import LocalError
 from lyra_petsc.stepping.near_pairs import nearest_obstacle, worst_pair
@@ -428,6 +427,8 @@ class SteppedScene:
             ends, far = system.stage.after == system.dt, dt > FAR * self._time_through_skin()
             if ends or self.scene.time.adaptive or not far:
                 return self._take_impact(dt, "finds no way")
+            from lyra_petsc.stepping.integrators.bdf2 import Bdf2  # of use for nothing else
+
             system.integrator = Bdf2()
             self._tell_of_impact("finds no way", "bdf2")
             return True
