@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -30,6 +30,9 @@ from lyra_petsc.stepping.stability import Examination, Stability
 from lyra_petsc.stepping.stage_equations import StageEquations
 from lyra_petsc.stepping.stepper import Attempt, Stepper
 from lyra_petsc.terms.term import Load
+
+if TYPE_CHECKING:
+    from lyra_petsc.stepping.following_loads import FollowingLoads
 
 MOST_SOLVES = 100
 """Proximal steps after which a load step is given up."""
@@ -148,7 +151,7 @@ class Equilibrium:
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
-                self._rate, spent = self._stepper.tangent(self._pull)
+                self._rate, spent = self._tangent(self._pull, self._known(before, factor))
                 linear += spent
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
@@ -161,7 +164,7 @@ class Equilibrium:
             if attempt.converged:
                 system.active.on_the_way(system.x)
             if self._follows:
-                self._take_loads(relaxation, before, factor)
+                linear += self._take_loads(relaxation, before, factor, first=solves == 0)
             leap = leaps and self._integrator.pseudo > self._careful
             attempt = self._solve(before, factor, LEAP_ITERATIONS if leap else None)
             if self._follows:
@@ -213,18 +216,61 @@ class Equilibrium:
         if self._rate is not None and not moves:
             self._integrator.others = self._extrapolation.along(factor, self._rate)
 
-    def _take_loads(self, relaxation: Relaxation, before: float, factor: float) -> None:
-        """Let the next solve have loads of the present shape, and pressures as they change from there."""
+    def _take_loads(self, relaxation: Relaxation, before: float, factor: float, *, first: bool) -> int:
+        """Let the next solve have loads of the present shape, and pressures as they change from there.
+
+        Returns linear iterations.
+        """
+        system, now = self._system, self._system.applied.now.copy()
+        known = system.applied.following = self._known(before, factor)
+        way, spent = None, 0
+        if known is not None and not first:
+            way, spent = self._tangent(system.out_of_balance()[0], known)
+        elif known is not None and self._integrator.others and self._rate is not None:
+            way = (factor - before) * self._rate
+        if known is None or way is None:
+            system.applied.given = relaxation.following(now)
+        else:
+            system.applied.given = now + self._skew_force(known, way)
+        return spent
+
+    def _known(self, before: float, factor: float) -> FollowingLoads | None:
+        """Pressures as they change from the present shape, if there are any."""
+        pressures = [load for load in self._system.active.loads if load.follows]
+        if not pressures:
+            return None
+        from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
+
+        def force_of(load: Load, x: Array, out: Array) -> None:
+            load.add_force(x, before, factor, out)
+
+        return FollowingLoads(pressures, self._system.x, force_of, factor)
+
+    def _skew_force(self, known: FollowingLoads, way: Array) -> Array:
+        """Force (n_owned, 3) [N] on free unknowns by the skew stiffness of pressures on a way; collective."""
         system = self._system
-        system.applied.given = relaxation.following(system.applied.now.copy())
-        pressures = [load for load in system.active.loads if load.follows]
-        if pressures:
-            from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
+        local = np.zeros_like(system.x)
+        local[: len(way)] = way
+        system.points.update_ghosts(local)
+        return np.where(system.prescribed.free, known.skew_force(local, len(way)), 0.0)
 
-            def force_of(load: Load, x: Array, out: Array) -> None:
-                load.add_force(x, before, factor, out)
+    def _tangent(self, force: Array, known: FollowingLoads | None) -> tuple[Array | None, int]:
+        """As `Stepper.tangent`, with all of the stiffness of pressures; collective."""
+        if known is None:
+            return self._stepper.tangent(force)
+        from lyra_petsc.stepping.following_loads import newton_way
 
-            system.applied.following = FollowingLoads(pressures, system.x, force_of, factor)
+        linear = 0
+
+        def solve(force: Array) -> Array | None:
+            nonlocal linear
+            way, spent = self._stepper.tangent(force)
+            linear += spent
+            return way
+
+        comm = self._system.points.comm
+        way = newton_way(force, solve, lambda way: self._skew_force(known, way), comm.allreduce)
+        return way, linear
 
     def _solve(self, before: float, factor: float, most: int | None) -> Attempt:
         """A proximal step, given up after ``most`` Newton iterations or if one leads far away; collective."""

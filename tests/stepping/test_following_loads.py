@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 from oracle import expanded
 from physics import SteppedScene, grid, scene_of
+from scipy.integrate import solve_ivp
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
@@ -16,7 +17,7 @@ from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import symmetric
 from lyra_petsc.phases import Phases
-from lyra_petsc.stepping.following_loads import FollowingLoads
+from lyra_petsc.stepping.following_loads import FollowingLoads, newton_way
 from lyra_petsc.terms.term import Load
 
 
@@ -96,3 +97,54 @@ def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
     oval, newton = ring(comm, 1.3)
     assert oval > 0.3
     assert newton <= 35  # 109
+
+
+def test_a_skew_stiffness_is_solved_with() -> None:
+    random = np.random.default_rng(0)
+    skew = random.normal(size=(6, 6))
+    skew = 3.0 * (skew - skew.T)  # more than the symmetric part: a fixed point would run away
+    size = random.uniform(1.0, 2.0, 6)
+    force = random.normal(size=(2, 3))
+    way = newton_way(
+        force,
+        lambda force: force / size.reshape(2, 3),
+        lambda way: (skew @ way.ravel()).reshape(2, 3),
+        lambda numbers: numbers,
+    )
+    assert way is not None
+    np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
+
+
+def curled(load: float) -> tuple[float, float]:
+    """Tip of an inextensible cantilever of length 1 under a pressure of ``load`` B/L³, by its equations."""
+
+    def rates(_: float, y: Array) -> list[float]:
+        angle, curvature, normal, shear, *_ = y
+        along = [math.cos(angle), math.sin(angle)]
+        return [curvature, -shear, shear * curvature, -normal * curvature - load, *along]
+
+    angle, _, _, _, x, z = solve_ivp(rates, [0.0, -1.0], [0.0] * 6, rtol=1e-9, atol=1e-11).y[:, -1]
+    c, s = math.cos(angle), math.sin(angle)
+    return -c * x - s * z, s * x - c * z
+
+
+@pytest.mark.parallel
+def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
+    """Beyond half a circle; beside free edges the stiffness of the pressure is not symmetric."""
+    load, thickness, young = 30.0, 0.002, 1.2e9
+    mesh = {"grid": {"width": 1.0, "height": 0.1, "nx": 40, "ny": 4, "pattern": "alternating"}}
+    content = scene(
+        mesh,
+        {"young": young, "poisson": 0.0, "thickness": thickness, "density": 1.0},
+        STATIC | {"step": 0.125},
+        gravity=[0, 0, 0],
+        handles=[{"group": "left", "clamp": True}],
+        loads=[{"pressure": load * young * thickness**3 / 12.0}],
+    )
+    newton = 0
+    with Bench(comm, exact=False).simulation(content) as trial:
+        while not trial.simulation.finished:
+            newton += trial.step().newton_iterations
+        tip = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
+    np.testing.assert_allclose(tip[[0, 2]], curled(load), atol=6e-3)
+    assert newton <= 90  # 353 where a solve takes what is skew as it was
