@@ -60,8 +60,8 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
 RADIUS, THICKNESS, YOUNG, OVAL = 1.0, 0.02, 1e6, 0.01
 
 
-def ring(comm: MPI.Comm, part: float) -> tuple[float, int]:
-    """How far a ring of radius 1 and amplitude ``OVAL`` is oval under a part of the pressure at which it
+def ring(comm: MPI.Comm, part: float, start: float = OVAL) -> tuple[float, int]:
+    """How far a ring of radius 1 that is ``start`` oval is so under a part of the pressure at which it
     buckles, 3 D / R³, and Newton iterations.
 
     M. Lévy, Journal de mathématiques pures et appliquées 10 (1884); S. P. Timoshenko, J. M. Gere, Theory of
@@ -70,7 +70,7 @@ def ring(comm: MPI.Comm, part: float) -> tuple[float, int]:
     bench = Bench(comm, exact=False)
     flat, faces = rectangle(16, 2, 1.0, 1.0, alternating=True)
     angle = 0.5 * math.pi * flat[:, 0]
-    radius = RADIUS + OVAL * np.cos(2.0 * angle)
+    radius = RADIUS + start * np.cos(2.0 * angle)
     vertices = np.column_stack([radius * np.cos(angle), 0.25 * flat[:, 1], radius * np.sin(angle)])
     pressure = part * 3.0 * YOUNG * THICKNESS**3 / 12.0 / RADIUS**3
     content = scene(
@@ -97,6 +97,11 @@ def test_a_ring_buckles_under_pressure(comm: MPI.Comm) -> None:
     oval, newton = ring(comm, 1.3)
     assert oval > 0.3
     assert newton <= 35  # 109
+
+
+def test_a_round_ring_leaves_its_unstable_equilibrium() -> None:
+    """Between 3 D/R³ and 4 D/R³, at which it would under forces that keep their directions."""
+    assert abs(ring(MPI.COMM_SELF, 1.1, start=0.0)[0]) > 0.1
 
 
 def test_a_skew_stiffness_is_solved_with() -> None:
