@@ -9,13 +9,13 @@ import pytest
 from mpi4py import MPI
 from oracle import expanded
 from physics import SteppedScene, grid, scene_of
-from scipy.integrate import solve_ivp
 
 from lyra_petsc.arrays import Array
 from lyra_petsc.experiments.bench import Bench
 from lyra_petsc.experiments.meshes import rectangle
 from lyra_petsc.experiments.verification.answers import STATIC, scene
 from lyra_petsc.experiments.verification.cases.shells import symmetric
+from lyra_petsc.experiments.verification.rods import pressed_tip
 from lyra_petsc.phases import Phases
 from lyra_petsc.stepping.following_loads import FollowingLoads, newton_way
 from lyra_petsc.terms.term import Load
@@ -120,19 +120,6 @@ def test_a_skew_stiffness_is_solved_with() -> None:
     np.testing.assert_allclose((np.diag(size) - skew) @ way.ravel(), force.ravel(), atol=1e-2)
 
 
-def curled(load: float) -> tuple[float, float]:
-    """Tip of an inextensible cantilever of length 1 under a pressure of ``load`` B/L³, by its equations."""
-
-    def rates(_: float, y: Array) -> list[float]:
-        angle, curvature, normal, shear, *_ = y
-        along = [math.cos(angle), math.sin(angle)]
-        return [curvature, -shear, shear * curvature, -normal * curvature - load, *along]
-
-    angle, _, _, _, x, z = solve_ivp(rates, [0.0, -1.0], [0.0] * 6, rtol=1e-9, atol=1e-11).y[:, -1]
-    c, s = math.cos(angle), math.sin(angle)
-    return -c * x - s * z, s * x - c * z
-
-
 @pytest.mark.parallel
 def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
     """Beyond half a circle; beside free edges the stiffness of the pressure is not symmetric."""
@@ -151,5 +138,5 @@ def test_a_strip_with_free_edges_curls_under_pressure(comm: MPI.Comm) -> None:
         while not trial.simulation.finished:
             newton += trial.step().newton_iterations
         tip = trial.x[np.isclose(trial.start[:, 0], 1.0)].mean(axis=0)
-    np.testing.assert_allclose(tip[[0, 2]], curled(load), atol=6e-3)
+    np.testing.assert_allclose(tip[[0, 2]], pressed_tip(load), atol=6e-3)
     assert newton <= 90  # 353 where a solve takes what is skew as it was
