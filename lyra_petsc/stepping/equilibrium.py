@@ -224,10 +224,11 @@ class Equilibrium:
         system, now = self._system, self._system.applied.now.copy()
         known = system.applied.following = self._known(before, factor)
         way, spent = None, 0
-        if known is not None and not first:
-            way, spent = self._tangent(system.out_of_balance()[0], known)
-        elif known is not None and self._integrator.others and self._rate is not None:
-            way = (factor - before) * self._rate
+        if known is not None and not system.active.viscous:  # of wind no stiffness is known
+            if not first:
+                way, spent = self._tangent(system.out_of_balance()[0], known)
+            elif self._integrator.others and self._rate is not None:
+                way = (factor - before) * self._rate
         if known is None or way is None:
             system.applied.given = relaxation.following(now)
         else:
