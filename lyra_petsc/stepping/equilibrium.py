@@ -68,6 +68,9 @@ LONGEST = 1e7
 ANY = float(np.finfo(np.float64).max)
 """Beyond all Δτ."""
 
+NUDGE = 1e-6
+"""Of an edge, by which handles are moved to see what force that takes."""
+
 WORSE = 2.0
 """Growth of the out-of-balance force in a solve after which Δτ was too long."""
 
@@ -151,8 +154,7 @@ class Equilibrium:
             if arrived and self._balanced(force, last):
                 system.moving_energy_before = anchored
                 self._in_vain, self._sufficed, self._found = 0, self._integrator.pseudo, factor
-                self._rate, spent = self._tangent(self._pull, self._known(before, factor))
-                linear += spent
+                linear += self._learn_rate(x, before, factor)
                 return Attempt(True, newton, linear, force, at_roundoff=attempt.at_roundoff)
             lessened = _last_lessened([each.residual for each in history])
             words = self._hopeless(solves, lessened, x, arrived=arrived)
@@ -207,14 +209,38 @@ class Equilibrium:
         )
 
     def _look_ahead(self, before: float, factor: float) -> None:
-        """Expect equilibria to go on along the tangent where loads alone change; collective."""
+        """Expect equilibria to go on along the tangent; collective."""
         if before != self._found:
             return
-        system = self._system
-        self._pull = system.out_of_balance()[0] / (factor - before)
-        moves = system.points.largest(float(np.abs(system.prescribed.velocity).max(initial=0.0)))[0] > 0.0
-        if self._rate is not None and not moves:
+        self._pull = self._system.out_of_balance()[0] / (factor - before)
+        if self._rate is not None:
             self._integrator.others = self._extrapolation.along(factor, self._rate)
+
+    def _learn_rate(self, start: Array, before: float, factor: float) -> int:
+        """How the equilibrium just found changes as loads do and handles go on from where they were in the
+        positions ``start`` (n_owned, 3); linear iterations; collective.
+        """
+        system, n = self._system, len(start)
+        step = factor - before
+        moved = np.where(system.prescribed.free, 0.0, system.x[:n] - start)
+        (largest,) = system.points.largest(float(np.abs(moved).max(initial=0.0)))
+        pull = self._pull
+        if largest > 0.0 and system.discretisation.guards:
+            self._rate = None  # with contact guesses are others
+            return 0
+        if largest > 0.0:
+            x, part = system.x.copy(), NUDGE * self._spacing / largest
+            here = system.out_of_balance()[0]
+            system.x[:n] += part * moved
+            system.points.update_ghosts(system.x)
+            system.forget_forces()
+            pull = pull + (system.out_of_balance()[0] - here) / (part * step)
+            system.x[:] = x
+            system.forget_forces()
+        self._rate, spent = self._tangent(pull, self._known(before, factor))
+        if self._rate is not None:
+            self._rate += moved / step
+        return spent
 
     def _take_loads(self, relaxation: Relaxation, before: float, factor: float, *, first: bool) -> int:
         """Let the next solve have loads of the present shape, and pressures as they change from there.
