@@ -118,7 +118,7 @@ class Equilibrium:
         # factors tell at once how far the first load would lead
         self._sufficed = ANY if stepper.linear.factors else 0.0
         self._extrapolation = Extrapolation(system.points.comm)
-        self._follows = bool(system.active.viscous) or any(load.follows for load in system.active.loads)
+        self._follows = bool(system.active.viscous or system.active.following)
         system.applied.factor = 0.0
         system.begin_step(0.0, 0.0)
         force, _ = system.out_of_balance()
@@ -217,7 +217,7 @@ class Equilibrium:
         """Let the next solve have loads of the present shape, and pressures as they change from there."""
         system = self._system
         system.applied.given = relaxation.following(system.applied.now.copy())
-        pressures = [load for load in system.active.loads if load.follows]
+        pressures = system.active.following
         if pressures:
             from lyra_petsc.stepping.following_loads import FollowingLoads  # of use for nothing else
 
