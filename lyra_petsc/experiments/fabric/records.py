@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
-from lyra_petsc.experiments.results import Line, View
+from lyra_petsc.experiments.results import Line, View, verdict_line
 from lyra_petsc.output.agreement import replace_text
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
 from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
@@ -125,6 +125,7 @@ class Fabric(View[FabricOutcome]):
     """
 
     verb = "fabric"
+    entry = "test"
     pictures = "plots"
     columns = ("test", "quantity", "value", "scatter", "unit", "passed", "problem")
 
@@ -138,12 +139,7 @@ class Fabric(View[FabricOutcome]):
             yield f"  {number.quantity} = {_value(number)} {number.unit}", ""
         for name, verdict in outcome.verdicts.items():
             if name != "measured" or not verdict.passed:
-                word, style = ("passed", "") if verdict.passed else ("FAILED", "bold red")
-                yield f"  {name}: {word}: {verdict.words}", style
-
-    def summary(self, outcomes: Sequence[FabricOutcome]) -> list[Sequence[str]]:
-        table = [(o.case.name, "passed" if o.passed else "FAILED", f"{o.seconds:.1f}") for o in outcomes]
-        return [("test", "verdict", "run time [s]"), *table]
+                yield verdict_line(verdict, f"{name}: ")
 
     def rows(self, outcome: FabricOutcome) -> Iterable[Mapping[str, Any]]:
         common = {"test": outcome.case.name, "passed": outcome.passed, "problem": outcome.record.stopped}
@@ -175,8 +171,7 @@ class Fabric(View[FabricOutcome]):
             report.heading(outcome.case.name)
             report.paragraph(f"{outcome.case.title}. Run time {seconds(outcome.seconds)}.")
             for name, verdict in outcome.verdicts.items():
-                word = "passed" if verdict.passed else "FAILED"
-                report.paragraph(f"{name}: {word}: {verdict.words}.")
+                report.paragraph(f"{name}: {verdict.line}.")
             if drawn:
                 for drawing in pictures(outcome):
                     report.figure(drawing)
