@@ -35,7 +35,6 @@ def ring(vt: str = "each vertex") -> Mesh:
         uv,
         np.ones(len(TRIANGLES), dtype=bool),
         has_uv=vt != "none",
-        has_seams=vt == "seam",
     )
 
 

@@ -29,7 +29,7 @@ from lyra_petsc.mesh.geo_words import (
     RESERVED,
     STATEMENTS,
 )
-from lyra_petsc.mesh.readers import read_bytes
+from lyra_petsc.scene.text import read_bytes
 from lyra_petsc.scene.values import one_line
 
 LONGEST_STRING = 900

@@ -27,14 +27,10 @@ def reason(error: BaseException) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def missing_folder(path: Path) -> str:
-    """Why a file cannot be written whose folder is gone, whatever HDF5 says of it; empty if it is there."""
-    return "" if path.parent.is_dir() else os.strerror(errno.ENOENT)
-
-
 def cannot_write(path: Path, error: BaseException) -> OutputError:
-    """The refusal of a file that could not be written."""
-    return OutputError(f"{path}: cannot be written: {missing_folder(path) or reason(error)}")
+    """The refusal of a file that could not be written; that its folder is gone HDF5 says in other words."""
+    why = reason(error) if path.parent.is_dir() else os.strerror(errno.ENOENT)
+    return OutputError(f"{path}: cannot be written: {why}")
 
 
 def raise_together(comm: MPI.Comm, problem: LyraError | None) -> None:

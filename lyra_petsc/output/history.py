@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from io import StringIO
 from pathlib import Path
@@ -75,11 +75,8 @@ class History:
         *,
         resume_after: int | None = None,
     ) -> None:
-        if not columns or columns[0] != "step":
-            raise ValueError("the first column is step")
         self.path = Path(path)
         self.columns = tuple(columns)
-        self._names = frozenset(columns)
         self._file: BinaryIO | None = None
         self.kept_until = -1
         on_root(comm, lambda: self._open(resume_after))
@@ -91,21 +88,15 @@ class History:
         Parameters
         ----------
         rows : mapping
-            A number, or a name, for each column and nothing else.
+            A number, or a name, for each column.
 
         Raises
         ------
         OutputError
             On rank 0.
         """
-        lines = StringIO()
-        table = csv.writer(lines, lineterminator="\n")
-        for values in rows:
-            if values.keys() != self._names:
-                raise ValueError(f"columns {sorted(set(values) ^ set(self.columns))} are missing or unknown")
-            table.writerow([_text(values[name]) for name in self.columns])
         try:
-            self._write(lines.getvalue())
+            self._write([_text(values[name]) for name in self.columns] for values in rows)
         except OSError as error:
             raise cannot_write(self.path, error) from error
 
@@ -126,16 +117,16 @@ class History:
                 self._cut(resume_after)
             self._file = self.path.open("ab" if go_on else "wb")
             if not go_on:
-                header = StringIO()
-                csv.writer(header, lineterminator="\n").writerow(self.columns)
-                self._write(header.getvalue())
+                self._write([self.columns])
         except OSError as error:
             raise cannot_write(self.path, error) from error
 
-    def _write(self, line: str) -> None:
-        if self._file is None:
-            raise ValueError(f"{self.path} is closed")
-        self._file.write(line.encode())
+    def _write(self, rows: Iterable[Sequence[str]]) -> None:
+        """Write all rows at once."""
+        assert self._file is not None
+        lines = StringIO()
+        csv.writer(lines, lineterminator="\n").writerows(rows)
+        self._file.write(lines.getvalue().encode())
         self._file.flush()
 
     def _cut(self, last_step: int) -> None:

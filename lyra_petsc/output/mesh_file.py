@@ -53,8 +53,7 @@ def write_mesh(folder: str | os.PathLike[str], mesh: Mesh | None, comm: MPI.Comm
     """
 
     def work() -> None:
-        if mesh is None:
-            raise ValueError("rank 0 needs the mesh")
+        assert mesh is not None
         datasets = _arrays(mesh)
         names: dict[str, dict[str, int | float | str]] = {"mesh": {"vt": int(mesh.has_uv)}}
         for number, (name, group) in enumerate(mesh.groups.items()):
@@ -101,8 +100,7 @@ def check_same_mesh(
     file = Path(folder) / MESH_FILE
 
     def work() -> None:
-        if mesh is None:
-            raise ValueError("rank 0 needs the mesh")
+        assert mesh is not None
         try:
             difference = _difference(StoredMesh(file.parent), mesh, set(groups))
         except InputError as error:

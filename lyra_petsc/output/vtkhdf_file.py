@@ -162,26 +162,15 @@ def _virtual(
     Tensors of six components get VTK's order.
     """
     h5py = import_h5py()
-    stored = h5py.h5t.py_create(kind, logical=True)
-    space, target = (h5py.h5s.create_simple(shape) for _ in range(2))
-    source = h5py.h5s.create_simple((rows, *shape[1:]))
-    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    if kind.kind == "f":
-        plan.set_fill_value(np.array(np.nan, dtype=kind))
+    layout = h5py.VirtualLayout(shape, kind)
     for i, (file, dataset) in places.items():
-        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else [(None, None)]:
-            _select(target, i * rows, rows, shape, ours)
-            _select(source, 0, rows, shape, theirs)
-            plan.set_virtual(target, file.encode(), dataset.encode(), source)
-    h5py.h5d.create(root.id, name.encode(), stored, space, plan)
-
-
-def _select(space: Any, first: int, rows: int, shape: tuple[int, ...], pair: tuple[int, int] | None) -> None:
-    """Select rows from ``first`` on, with all columns or a pair of them."""
-    if pair is None:
-        space.select_hyperslab((first,) + (0,) * (len(shape) - 1), (rows, *shape[1:]))
-    else:
-        space.select_hyperslab((first, pair[0]), (rows, 2), (1, pair[1] - pair[0]))
+        source = h5py.VirtualSource(file, dataset, (rows, *shape[1:]))
+        here = slice(i * rows, (i + 1) * rows)
+        if not is_tensor(shape):
+            layout[here] = source
+        for ours, theirs in VTK_COLUMNS if is_tensor(shape) else ():
+            layout[here, ours] = source[:, theirs]
+    root.create_virtual_dataset(name, layout, np.nan if kind.kind == "f" else None)
 
 
 @contextmanager
