@@ -31,6 +31,7 @@ from lyra_petsc.output.read_run import StoredRun
 from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.tensors import in_vtk_order, is_tensor
 from lyra_petsc.output.vtkhdf_file import GROUPS, add_offsets, cells, describe
+from lyra_petsc.show.render.render_plan import numbers, pick_state
 from lyra_petsc.show.render.sheet_geometry import split_at_seams, vertex_normals
 
 if TYPE_CHECKING:
@@ -39,9 +40,6 @@ if TYPE_CHECKING:
 
 SINGLE_RATE = 24.0
 """ExportedStates a second where there is a single state."""
-
-SAME_TIME = 1e-6
-"""A time of ``--times`` may be outside the run by this fraction of its length."""
 
 
 @dataclass(frozen=True)
@@ -156,24 +154,8 @@ def choose(run: StoredRun, times: str | None, every: int | None) -> ExportedStat
         raise InputError(f"must be at least 1, not {every}", key="--every")
     if times is None:
         return ExportedStates(run, tuple(range(0, len(run), every or 1)))
-    return ExportedStates(run, tuple(sorted({run.at(time) for time in _numbers(times, run)})))
-
-
-def _numbers(text: str, run: StoredRun) -> list[float]:
-    first, last = float(run.times[0]), float(run.times[-1])
-    slack = SAME_TIME * (last - first)
-    numbers = []
-    for word in text.split(","):
-        try:
-            number = float(word)
-        except ValueError:
-            raise InputError(
-                f"must be numbers [s] with commas between, not {word.strip()!r}", key="--times"
-            ) from None
-        if not first - slack <= number <= last + slack:
-            raise InputError(f"the run goes from {first:g} to {last:g} s, not to {number:g}", key="--times")
-        numbers.append(number)
-    return numbers
+    found = {pick_state(run, time, "--times") for time in numbers(times, "--times", "0,0.5,1")}
+    return ExportedStates(run, tuple(sorted(found)))
 
 
 def turned_up(up: tuple[int, int], target: int) -> tuple[float, float, float, float]:

@@ -49,8 +49,8 @@ def test_times_of_a_sequence_are_beside_it(tmp_path):
     ("asked", "words"),
     [
         ({"to": "fbx"}, r"--to: unknown format 'fbx', (known|did you)"),
-        ({"times": "1.5"}, r"--times: the run goes from 0 to 0\.2 s, not to 1\.5"),
-        ({"times": "nan"}, r"not to nan"),
+        ({"times": "1.5"}, r"--times: 1\.5 s is outside the run, whose states go from 0 to 0\.2 s"),
+        ({"times": "nan"}, r"--times: must be numbers with commas"),
         ({"times": "a"}, r"--times: must be numbers"),
         ({"every": 0}, r"--every: must be at least 1"),
         ({"every": 1, "times": "0"}, r"--every: choose states either by"),
