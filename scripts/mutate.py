@@ -300,8 +300,8 @@ CHANGES: list[Change] = [
     # -- materials, meshes, loads
     Change(
         "lyra_petsc/scene/materials/library.py",
-        "bend = stretch * sheet.thickness * sheet.thickness / 12",
-        "bend = stretch * sheet.thickness * sheet.thickness / 10",
+        "bend = stretch * thickness * thickness / 12",
+        "bend = stretch * thickness * thickness / 10",
         ("tests/scene/test_material_library.py",),
     ),
     Change(

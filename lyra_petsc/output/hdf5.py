@@ -33,8 +33,7 @@ from lyra_petsc.output.agreement import (
     raise_together,
 )
 from lyra_petsc.output.ordering import row_type
-from lyra_petsc.output.self_contained import import_h5py
-from lyra_petsc.output.stored import open_stored
+from lyra_petsc.output.stored import import_h5py, open_stored
 from lyra_petsc.parallel import on_one_machine, on_root
 
 if TYPE_CHECKING:

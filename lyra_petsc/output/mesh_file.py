@@ -15,8 +15,7 @@ from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.mesh import Group, Mesh
 from lyra_petsc.output.hdf5 import NewFile, write_collective
-from lyra_petsc.output.stored import SUM, check_sum
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import SUM, StoredMesh, check_sum
 from lyra_petsc.output.xdmf import MESH_FILE
 from lyra_petsc.parallel import on_root
 

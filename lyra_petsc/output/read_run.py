@@ -21,9 +21,7 @@ from lyra_petsc.errors import InputError, nearest
 from lyra_petsc.extras import require
 from lyra_petsc.output.agreement import reason
 from lyra_petsc.output.history import HISTORY_COLUMNS
-from lyra_petsc.output.self_contained import check_file, check_folder, check_name
-from lyra_petsc.output.stored import read_stored
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, check_file, check_folder, check_name, read_stored
 from lyra_petsc.output.summary import read_summary
 from lyra_petsc.output.tensors import COMPONENTS, TENSORS
 from lyra_petsc.output.xdmf import MESH_FILE, XDMF_FILE

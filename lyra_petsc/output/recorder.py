@@ -335,8 +335,7 @@ class Recorder:
                 simulation.step_number,
                 simulation.time,
                 problem.system.x[: problem.points.n_vertices],
-                {field.name: value for field, value in values.items() if field.on == "vertex"},
-                {field.name: value for field, value in values.items() if field.on == "triangle"},
+                {field.name: (field.on, value) for field, value in values.items()},
                 beside=[checkpoint],  # what is announced is not written again after a kill
             )
         self._last_state = simulation.step_number

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, reason
-from lyra_petsc.output.self_contained import check_folder, open_own
+from lyra_petsc.output.stored import check_folder, open_own
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:

@@ -27,8 +27,7 @@ from lyra_petsc.errors import InputError, OutputError
 from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text
 from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import OutsideFolderError
-from lyra_petsc.output.stored import TABLE, check_sums, open_stored, text_of
+from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_of
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import (
@@ -53,7 +52,8 @@ MORE = 0.1
 
 STATE_FILE = re.compile(r"states-(\d{4,})\.h5")
 
-Fields = Mapping[str, NDArray[Any]]
+Fields = Mapping[str, tuple[str, NDArray[Any]]]
+"""By their names: what their rows belong to (``vertex`` or ``triangle``), and this rank's rows."""
 
 
 class StateWriter:
@@ -99,7 +99,7 @@ class StateWriter:
     ) -> None:
         self.folder = Path(folder)
         self.vertices = vertices
-        self.triangles = triangles
+        self._orders = {"vertex": vertices} | ({} if triangles is None else {"triangle": triangles})
         self.n_triangles = n_triangles
         self._room: _PreallocatedFile | None = None
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
@@ -129,8 +129,7 @@ class StateWriter:
         step: int,
         time: float,
         position: Array,
-        vertex_fields: Fields | None = None,
-        triangle_fields: Fields | None = None,
+        fields: Fields,
         beside: Sequence[NewFile] = (),
     ) -> int:
         """Write and announce one state; collective. Returns its number.
@@ -143,9 +142,9 @@ class StateWriter:
             [s].
         position : (n_owned, 3) float64
             Current positions of this rank's vertices [m].
-        vertex_fields, triangle_fields : mapping of str to (n_owned, ...) array
-            Further fields on this rank's vertices and triangles: floats or integers, the same
-            names, types and trailing shapes on every rank.
+        fields : mapping of str to (str, (n_owned, ...) array)
+            Further fields on ``vertex`` or ``triangle``, on this rank's: floats or integers, the same names,
+            types and trailing shapes on every rank.
         beside : sequence of NewFile
             Files that are there, too, when the state is announced.
 
@@ -155,20 +154,16 @@ class StateWriter:
             On every rank; the states announced before stand. With a background, of the state before.
         """
         slabs = {"position": self.vertices.to_slab(np.asarray(position, dtype=np.float64))}
-        slabs |= {name: self.vertices.to_slab(rows) for name, rows in (vertex_fields or {}).items()}
-        fields = self._describe(slabs, "vertex", self.vertices)
-        if triangle_fields:
-            if self.triangles is None:
-                raise ValueError("fields on triangles need the order of the triangles")
-            on_triangles = {name: self.triangles.to_slab(rows) for name, rows in triangle_fields.items()}
-            fields += self._describe(on_triangles, "triangle", self.triangles)
-            slabs |= on_triangles
-
+        slabs |= {name: self._orders[on].to_slab(rows) for name, (on, rows) in fields.items()}
+        described = tuple(
+            StoredField(name, on, (self._orders[on].n_global, *slabs[name].shape[1:]), slabs[name].dtype.name)
+            for name, (on, _) in fields.items()
+        )
         number = self._next
         room = self._room
-        if room is None or room.fields != fields or number >= room.first + len(room.places):
-            room = self._room = self._lay_out(slabs, fields)
-        state = WrittenState(number, int(step), float(time), room.path.name, fields)
+        if room is None or room.fields != described or number >= room.first + len(room.places):
+            room = self._room = self._lay_out(slabs, described)
+        state = WrittenState(number, int(step), float(time), room.path.name, described)
         written = partial(room.say_written, state, check_sums(slabs.values(), self._comm))
         datasets = {f"{group_name(number)}/{key}": slab for key, slab in slabs.items()}
         places = room.places[number - room.first].tolist()
@@ -188,12 +183,12 @@ class StateWriter:
         if self._vtkhdf:
             on_root(self._comm, lambda: self._announce_to_vtk(late=True))
 
-    def _lay_out(self, slabs: Fields, fields: tuple[StoredField, ...]) -> _PreallocatedFile:
+    def _lay_out(
+        self, slabs: Mapping[str, NDArray[Any]], fields: tuple[StoredField, ...]
+    ) -> _PreallocatedFile:
         """A file with room for the next states; collective."""
         first, names = self._next, list(slabs)
-        on = {"position": "vertex"} | {field.name: field.on for field in fields}
-        n_of = {"vertex": self.vertices.n_global, "triangle": self.n_triangles}
-        rows = [n_of[on[name]] for name in names]
+        rows = [self.vertices.n_global, *(field.shape[0] for field in fields)]
         widths = [slab.itemsize * int(np.prod(slab.shape[1:], dtype=int)) for slab in slabs.values()]
         size = sum(n * width for n, width in zip(rows, widths, strict=True))
         slots = max(1, min(max(first, FEWEST), MOST, LARGEST // max(size, 1)))
@@ -204,7 +199,7 @@ class StateWriter:
             f"{TABLE}/sums": np.empty((0, len(names)), np.uint64),
         }
         planned = {f"{group_name(first + i)}/{name}": slabs[name] for i in range(slots) for name in names}
-        told = json.dumps([[name, on[name]] for name in names])
+        told = json.dumps([["position", "vertex"], *([field.name, field.on] for field in fields)])
         attributes: Attributes = {TABLE: {"first": first, "columns": told}}
 
         def work() -> list[int]:
@@ -222,14 +217,6 @@ class StateWriter:
 
         places = np.array(on_root(self._comm, work), dtype=np.int64)
         return _PreallocatedFile(path, first, fields, places[:3], places[3:].reshape(slots, len(names)))
-
-    @staticmethod
-    def _describe(slabs: Fields, on: str, order: FileOrder) -> tuple[StoredField, ...]:
-        return tuple(
-            StoredField(name, on, (order.n_global, *slab.shape[1:]), slab.dtype.name)
-            for name, slab in slabs.items()
-            if name != "position"
-        )
 
     def _announce(self, state: WrittenState) -> None:
         """Announce a state (rank 0)."""

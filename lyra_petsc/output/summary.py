@@ -15,7 +15,7 @@ import numpy as np
 import lyra_petsc
 from lyra_petsc.errors import InputError
 from lyra_petsc.output.agreement import reason, replace_text
-from lyra_petsc.output.self_contained import import_h5py
+from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
 from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, replace_bytes
-from lyra_petsc.output.self_contained import import_h5py
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, import_h5py
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
 from lyra_petsc.output.xdmf import WrittenState, group_name
 

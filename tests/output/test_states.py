@@ -10,8 +10,8 @@ from lyra_petsc.mesh.mesh import Mesh
 from lyra_petsc.output import hdf5, xdmf
 from lyra_petsc.output.mesh_file import write_mesh
 from lyra_petsc.output.ordering import FileOrder
-from lyra_petsc.output.self_contained import import_h5py
 from lyra_petsc.output.states import StateWriter, stored_states
+from lyra_petsc.output.stored import import_h5py
 from lyra_petsc.output.xdmf import XDMF_FILE
 
 pytestmark = [pytest.mark.parallel, pytest.mark.quick]
@@ -47,10 +47,11 @@ class Run:
             step,
             0.1 * step,
             position(step)[self.vertices],
-            {"velocity": -position(step)[self.vertices], "mass": np.arange(5.0)[self.vertices]},
             {
-                "rank": np.arange(3, dtype=np.int32)[self.triangles],
-                "green_strain": strain(step)[self.triangles],
+                "velocity": ("vertex", -position(step)[self.vertices]),
+                "mass": ("vertex", np.arange(5.0)[self.vertices]),
+                "rank": ("triangle", np.arange(3, dtype=np.int32)[self.triangles]),
+                "green_strain": ("triangle", strain(step)[self.triangles]),
             },
         )
 

@@ -32,8 +32,13 @@ class Writer:
             i,
             0.1 * i,
             position(i)[self.vertices],
-            {"velocity": velocity(i)[self.vertices], "rank": 0 * self.vertices + i} if fields else {},
-            {"stress": stress(i)[self.triangles]} if fields else {},
+            {
+                "velocity": ("vertex", velocity(i)[self.vertices]),
+                "rank": ("vertex", 0 * self.vertices + i),
+                "stress": ("triangle", stress(i)[self.triangles]),
+            }
+            if fields
+            else {},
         )
 
 

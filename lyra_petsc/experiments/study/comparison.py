@@ -26,10 +26,8 @@ from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
-from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import stored_states
-from lyra_petsc.output.stored import open_stored
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
 from lyra_petsc.parallel import on_root
 
 SAME_TIME = 1e-6
