@@ -136,7 +136,7 @@ def read_checkpoint(
         On every rank, if there is none, if all are damaged, or if it is of another mesh.
     """
     newest: InputError | None = None
-    for file in checkpoint_files(folder, order.comm):
+    for file in on_root(order.comm, lambda: checkpoint_files(folder)):
         try:
             scalars, sums, counts = on_root(order.comm, lambda f=file: _head(f, order))  # type: ignore[misc]
             arrays, edges = (

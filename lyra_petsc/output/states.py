@@ -31,7 +31,6 @@ from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open
 from lyra_petsc.output.tensors import TENSORS
 from lyra_petsc.output.vtkhdf_file import CELLS_FILE, VTKHDF_FILE, write_cells, write_vtkhdf
 from lyra_petsc.output.xdmf import (
-    MESH_FILE,
     XDMF_FILE,
     GrowingXdmf,
     StoredField,
@@ -105,7 +104,7 @@ class StateWriter:
         self._document = GrowingXdmf(self.folder / XDMF_FILE)  # of rank 0
         self._states: list[WrittenState] = []  # of rank 0, for states.vtkhdf
         self._in_vtk = 0
-        self._series = TimeSeries(vertices.n_global, n_triangles, MESH_FILE)
+        self._series = TimeSeries(vertices.n_global, n_triangles)
         self._next = 0
         self._vtkhdf, self._background = vtkhdf, background
         if vtkhdf:
@@ -239,7 +238,7 @@ class StateWriter:
         new = len(self._states) - self._in_vtk
         if new == 0 or not (late or new >= MORE * self._in_vtk):
             return
-        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles, MESH_FILE)
+        write_vtkhdf(self.folder, self._states, self.vertices.n_global, self.n_triangles)
         self._in_vtk = len(self._states)
 
     def _truncate(self, last_step: int) -> tuple[int, frozenset[str]]:
@@ -432,7 +431,7 @@ def write_failure(
         )
         written.append(WrittenState(number, step + number, state.time, FAILURE_DATA, fields))
     write_collective([NewFile(folder / FAILURE_DATA, datasets, attributes)], vertices.comm)
-    document = TimeSeries(vertices.n_global, n_triangles, MESH_FILE).text(written)
+    document = TimeSeries(vertices.n_global, n_triangles).text(written)
     on_root(vertices.comm, lambda: replace_text(folder / FAILURE_XDMF, document))
 
 

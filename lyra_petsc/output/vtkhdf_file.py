@@ -22,7 +22,7 @@ from lyra_petsc.arrays import Ints
 from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, replace_bytes
 from lyra_petsc.output.stored import StoredMesh, import_h5py
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
-from lyra_petsc.output.xdmf import WrittenState, group_name
+from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
 
 VTKHDF_FILE = "states.vtkhdf"
 CELLS_FILE = "cells.h5"
@@ -58,9 +58,7 @@ def write_cells(folder: Path) -> None:
             file[name] = array
 
 
-def write_vtkhdf(
-    folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int, mesh_file: str
-) -> None:
+def write_vtkhdf(folder: Path, states: Sequence[WrittenState], n_vertices: int, n_triangles: int) -> None:
     """Write ``states.vtkhdf`` for these states. Call on one rank.
 
     A field that some states lack is NaN there (0 if it is of whole numbers).
@@ -71,8 +69,6 @@ def write_vtkhdf(
         With ``cells.h5`` and the files of the states.
     states : sequence of WrittenState
     n_vertices, n_triangles : int
-    mesh_file : str
-        Name of the file with ``/mesh/rest``.
 
     Raises
     ------
@@ -90,7 +86,7 @@ def write_vtkhdf(
         real = np.dtype(np.float64)
         positions = {i: (s.file, f"{group_name(s.number)}/position") for i, s in enumerate(states)}
         _virtual(root, "Points", (len(states) * n_vertices, 3), real, positions, n_vertices)
-        rest = {0: (mesh_file, "mesh/rest")}
+        rest = {0: (MESH_FILE, "mesh/rest")}
         _virtual(root, "PointData/rest", (n_vertices, 3), real, rest, n_vertices)
         add_offsets(root, "vertex", "rest", len(states), 0)
         # each name once: as the newest state has it

@@ -96,18 +96,16 @@ class TimeSeries:
     ----------
     n_vertices, n_triangles : int
         Rows of positions and of triangles.
-    mesh_file : str
-        Name of the file with ``/mesh/triangles`` and ``/mesh/rest``, relative to the XDMF file.
     """
 
-    def __init__(self, n_vertices: int, n_triangles: int, mesh_file: str) -> None:
+    def __init__(self, n_vertices: int, n_triangles: int) -> None:
         self._n_vertices = n_vertices
-        triangles = _item((n_triangles, 3), "int64", f"{mesh_file}:/mesh/triangles")
+        triangles = _item((n_triangles, 3), "int64", f"{MESH_FILE}:/mesh/triangles")
         self._before = (
             f'   <Topology TopologyType="Triangle" NumberOfElements="{n_triangles}">{triangles}</Topology>\n'
         )
         rest = StoredField("rest", "vertex", (n_vertices, 3), "float64")
-        self._after = _attribute(rest, f"{mesh_file}:/mesh/rest")
+        self._after = _attribute(rest, f"{MESH_FILE}:/mesh/rest")
 
     def text(self, states: Sequence[WrittenState]) -> str:
         """The whole document, states in the order given."""

@@ -145,5 +145,5 @@ def test_thousand_states_are_announced_quickly(folder, comm):
     for i in range(3):
         writer.write(i)
     began = MPI.Wtime()
-    states_module.write_vtkhdf(folder, stored_states(folder) * 333, 8, 8, "mesh.h5")
+    states_module.write_vtkhdf(folder, stored_states(folder) * 333, 8, 8)
     assert MPI.Wtime() - began < 2.0
