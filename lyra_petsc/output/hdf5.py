@@ -107,8 +107,7 @@ class NewFile:
         This rank's rows of each dataset; ranks' rows follow each other in rank order. Names,
         types and trailing shapes are the same on every rank; a rank may have no rows.
     attributes : mapping of str to mapping
-        Attributes of groups and datasets, by their path in the file; of the last file read on rank 0,
-        of others on any rank.
+        Attributes of groups and datasets, by their path in the file; read on rank 0.
     publish : callable
         What rank 0 does when all files have their names.
     places : sequence of int or None
@@ -141,8 +140,7 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
     Parameters
     ----------
     files : sequence of NewFile
-        As many on every rank. Where the ranks share a machine, one lays out a file while another does the
-        next.
+        As many on every rank.
     comm : MPI.Comm
         All ranks; collective.
     background : Background or None
@@ -160,9 +158,6 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
     slabs = [{name: np.ascontiguousarray(slab) for name, slab in file.datasets.items()} for file in files]
     of_ranks = comm.allgather([[len(slab) for slab in of_file.values()] for of_file in slabs])
     lengths = [np.array([of_files[number] for of_files in of_ranks]) for number in range(len(files))]
-    shared = comm.size if on_one_machine(comm) else 1
-    owners = [number % shared for number in reversed(range(len(files)))]
-    mine = [number for number, owner in enumerate(owners) if owner == comm.rank]
 
     def laid_out(number: int) -> list[int]:
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
@@ -171,17 +166,17 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
         return _guarded(file.path, lambda: lay_out(file.part, slabs[number], rows, file.attributes))
 
     try:
-        known = comm.allgather(on_each(comm, lambda: {number: laid_out(number) for number in mine}))
-        for number, file in enumerate(files):
-            places, before = known[owners[number]][number], lengths[number][: comm.rank].sum(axis=0).tolist()
+        known = on_root(comm, lambda: [laid_out(number) for number in range(len(files))])
+        for number, (file, places) in enumerate(zip(files, known, strict=True)):
+            before = lengths[number][: comm.rank].sum(axis=0).tolist()
             pieces = [
                 (place + start * slab.itemsize * math.prod(slab.shape[1:]), slab)
                 for place, start, slab in zip(places, before, slabs[number].values(), strict=True)
             ]
             write_slabs(file.path, file.part, pieces, comm)
     except LyraError:
-        for number in mine:
-            files[number].discard()
+        for file in files if comm.rank == 0 else ():
+            file.discard()
         raise
     if background is not None:
         background.begin(partial(_complete, files))
@@ -227,23 +222,16 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
     InputError
         On every rank, if the file is damaged or the dataset missing or of another length.
     """
-    problem: LyraError | None = None
-    slab: NDArray[Any] = np.empty(0)
-    try:
+
+    def work() -> NDArray[Any]:
         with open_stored(Path(path)) as file:
             stored = file[dataset]
             if stored.shape[:1] != (order.n_global,):
-                problem = InputError(
-                    f"{dataset} has {stored.shape[0] if stored.shape else 'no'} rows, "
-                    f"{order.n_global} are expected",
-                    file=path,
-                )
-            else:
-                slab = stored[order.start : order.start + order.n_slab]
-    except InputError as error:
-        problem = error
-    raise_together(order.comm, problem)
-    return slab
+                found = f"{dataset} has {stored.shape[0] if stored.shape else 'no'} rows"
+                raise InputError(f"{found}, {order.n_global} are expected", file=path)
+            return np.asarray(stored[order.start : order.start + order.n_slab])
+
+    return on_each(order.comm, work)
 
 
 def _guarded(path: Path, work: Callable[[], Result]) -> Result:

@@ -118,11 +118,6 @@ class StateWriter:
     def _comm(self) -> MPI.Comm:
         return self.vertices.comm
 
-    @property
-    def count(self) -> int:
-        """Number of the next state."""
-        return self._next
-
     def write(
         self,
         step: int,
