@@ -17,7 +17,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import writing
 from lyra_petsc.output.hdf5 import NewFile, read_slab
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.run_folder import CHECKPOINT, NEXT, PREVIOUS, checkpoint_files
@@ -110,12 +110,10 @@ def checkpoint_file(
 
 
 def _rotate(folder: Path) -> None:
-    try:
+    with writing(folder / CHECKPOINT):
         if (folder / CHECKPOINT).exists():
             os.replace(folder / CHECKPOINT, folder / PREVIOUS)
         os.replace(folder / NEXT, folder / CHECKPOINT)
-    except OSError as error:
-        raise cannot_write(folder / CHECKPOINT, error) from error
 
 
 def read_checkpoint(

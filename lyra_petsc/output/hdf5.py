@@ -31,6 +31,7 @@ from lyra_petsc.output.agreement import (
     cannot_write,
     on_each,
     raise_together,
+    writing,
 )
 from lyra_petsc.output.ordering import row_type
 from lyra_petsc.output.stored import import_h5py, open_stored
@@ -163,7 +164,8 @@ def write_collective(files: Sequence[NewFile], comm: MPI.Comm, background: Backg
         file, rows = files[number], lengths[number].sum(axis=0).tolist()
         if file.places is not None:
             return list(file.places)
-        return _guarded(file.path, lambda: lay_out(file.part, slabs[number], rows, file.attributes))
+        with writing(file.path, HDF5_ERRORS):
+            return lay_out(file.part, slabs[number], rows, file.attributes)
 
     try:
         known = on_root(comm, lambda: [laid_out(number) for number in range(len(files))])
@@ -189,10 +191,12 @@ def _complete(files: Sequence[NewFile]) -> None:
     try:
         for file in files:
             file.prepare()
-            _guarded(file.path, partial(_sync, file.part))
+            with writing(file.path), open(file.part, "rb") as raw:
+                os.fsync(raw.fileno())
         for file in files:
             if file.places is None:
-                _guarded(file.path, partial(os.replace, file.part, file.path))
+                with writing(file.path):
+                    os.replace(file.part, file.path)
     except LyraError:
         for file in files:
             file.discard()
@@ -232,18 +236,6 @@ def read_slab(path: str | os.PathLike[str], dataset: str, order: FileOrder) -> N
             return np.asarray(stored[order.start : order.start + order.n_slab])
 
     return on_each(order.comm, work)
-
-
-def _guarded(path: Path, work: Callable[[], Result]) -> Result:
-    try:
-        return work()
-    except HDF5_ERRORS as error:
-        raise cannot_write(path, error) from error
-
-
-def _sync(part: Path) -> None:
-    with open(part, "rb") as raw:
-        os.fsync(raw.fileno())
 
 
 def lay_out(
@@ -355,14 +347,11 @@ def _write_alone(path: Path, part: Path, pieces: Sequence[Piece], *, sync: bool)
     """These pieces, if there are any, into a plain file."""
     if not pieces:
         return
-    try:
-        with open(part, "r+b", buffering=0) as file:
-            for offset, rows in pieces:
-                _write_rows(file, offset, rows)
-            if sync:
-                os.fsync(file.fileno())
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with writing(path), open(part, "r+b", buffering=0) as file:
+        for offset, rows in pieces:
+            _write_rows(file, offset, rows)
+        if sync:
+            os.fsync(file.fileno())
 
 
 def _write_rows(file: FileIO, offset: int, rows: NDArray[Any]) -> None:

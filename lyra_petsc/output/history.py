@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from lyra_petsc.errors import InputError
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import replaced, writing
 from lyra_petsc.parallel import on_root
 
 if TYPE_CHECKING:
@@ -95,10 +95,8 @@ class History:
         OutputError
             On rank 0.
         """
-        try:
+        with writing(self.path):
             self._write([_text(values[name]) for name in self.columns] for values in rows)
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
 
     def close(self) -> None:
         """Close the file; nothing can be appended afterwards.
@@ -111,15 +109,13 @@ class History:
             self._file = None
 
     def _open(self, resume_after: int | None) -> None:
-        try:
+        with writing(self.path):
             go_on = resume_after is not None and self.path.exists()
             if resume_after is not None and go_on:
                 self._cut(resume_after)
             self._file = self.path.open("ab" if go_on else "wb")
             if not go_on:
                 self._write([self.columns])
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
 
     def _write(self, rows: Iterable[Sequence[str]]) -> None:
         """Write all rows at once."""
@@ -132,20 +128,13 @@ class History:
     def _cut(self, last_step: int) -> None:
         """Keep the header and the whole rows up to ``last_step``; the file is never half a file."""
         check_columns(self.path, self.columns)
-        kept = self.path.with_name(self.path.name + ".part")
-        with (
-            open(self.path, encoding="utf-8", errors="replace", newline="") as old,
-            open(kept, "w", encoding="utf-8", newline="") as new,
-        ):
+        with open(self.path, "rb") as old, replaced(self.path) as new:
             new.write(old.readline())
             for line in old:
-                if not line.endswith("\n") or not _is_row_until(line, last_step):
+                if not line.endswith(b"\n") or not _is_row_until(line, last_step):
                     break
-                self.kept_until = int(line.split(",", 1)[0])
+                self.kept_until = int(line.split(b",", 1)[0])
                 new.write(line)
-            new.flush()
-            os.fsync(new.fileno())
-        os.replace(kept, self.path)
 
 
 def check_columns(path: Path, columns: Sequence[str]) -> None:
@@ -166,9 +155,9 @@ def check_columns(path: Path, columns: Sequence[str]) -> None:
             )
 
 
-def _is_row_until(line: str, last_step: int) -> bool:
+def _is_row_until(line: bytes, last_step: int) -> bool:
     try:
-        return int(line.split(",", 1)[0]) <= last_step
+        return int(line.split(b",", 1)[0]) <= last_step
     except ValueError:
         return False
 

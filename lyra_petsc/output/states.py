@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError, OutputError
-from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text
+from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, reason, replace_text, writing
 from lyra_petsc.output.hdf5 import Attributes, Background, NewFile, lay_out, write_collective
 from lyra_petsc.output.ordering import FileOrder
 from lyra_petsc.output.stored import TABLE, OutsideFolderError, check_sums, open_stored, text_of
@@ -280,12 +280,9 @@ class _PreallocatedFile:
     def say_written(self, state: WrittenState, sums: NDArray[np.uint64]) -> None:
         """Write a state's row of the table (rank 0)."""
         entries, index = (np.int64(state.step), np.float64(state.time), sums), state.number - self.first
-        try:
-            with open(self.path, "r+b", buffering=0) as file:
-                for place, entry in zip(self.table.tolist(), entries, strict=True):
-                    os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
-        except OSError as error:
-            raise cannot_write(self.path, error) from error
+        with writing(self.path), open(self.path, "r+b", buffering=0) as file:
+            for place, entry in zip(self.table.tolist(), entries, strict=True):
+                os.pwrite(file.fileno(), entry.tobytes(), place + index * entry.nbytes)
 
 
 def _forget(path: Path, last_step: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Ints
-from lyra_petsc.output.agreement import HDF5_ERRORS, cannot_write, replace_bytes
+from lyra_petsc.output.agreement import HDF5_ERRORS, replace_bytes, writing
 from lyra_petsc.output.stored import StoredMesh, import_h5py
 from lyra_petsc.output.tensors import VTK_COLUMNS, is_tensor
 from lyra_petsc.output.xdmf import MESH_FILE, WrittenState, group_name
@@ -174,11 +174,9 @@ def _replaced(path: Path) -> Iterator[Any]:
 
     One on disk takes the process down if it cannot grow while it is closed.
     """
-    try:
-        with import_h5py().File("unnamed", "w", driver="core", backing_store=False) as file:
-            yield file
-            file.flush()
-            content = bytes(file.id.get_file_image())
-    except HDF5_ERRORS as error:
-        raise cannot_write(path, error) from error
+    in_memory = {"driver": "core", "backing_store": False}
+    with writing(path, HDF5_ERRORS), import_h5py().File("unnamed", "w", **in_memory) as file:
+        yield file
+        file.flush()
+        content = bytes(file.id.get_file_image())
     replace_bytes(path, content)

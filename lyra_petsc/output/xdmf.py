@@ -19,7 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from lyra_petsc.output.agreement import cannot_write
+from lyra_petsc.output.agreement import cannot_write, replaced
 
 XDMF_FILE = "states.xdmf"
 MESH_FILE = "mesh.h5"
@@ -208,25 +208,17 @@ class GrowingXdmf:
 
     def _make(self, pieces: list[bytes], copied: int) -> None:
         """The first ``copied`` bytes of the file and these pieces, with new room, under its name."""
-        part = self.path.with_name(self.path.name + ".part")
-        try:
-            with open(part, "wb") as new:
-                if copied:
-                    with open(self.path, "rb") as old:
-                        while new.tell() < copied:
-                            new.write(old.read(min(copied - new.tell(), MOST_ROOM)))
-                new.writelines(pieces)
-                new.write(b" " * _pad(new.tell()))
-                seam = new.tell()
-                new.write(SEAM)
-                new.write(b" " * min(max(seam // 8, LEAST_ROOM), MOST_ROOM) + ROOM_END)
-                size = new.tell()
-                new.flush()
-                os.fsync(new.fileno())
-            os.replace(part, self.path)
-        except OSError as error:
-            part.unlink(missing_ok=True)
-            raise cannot_write(self.path, error) from error
+        with replaced(self.path) as new:
+            if copied:
+                with open(self.path, "rb") as old:
+                    while new.tell() < copied:
+                        new.write(old.read(min(copied - new.tell(), MOST_ROOM)))
+            new.writelines(pieces)
+            new.write(b" " * _pad(new.tell()))
+            seam = new.tell()
+            new.write(SEAM)
+            new.write(b" " * min(max(seam // 8, LEAST_ROOM), MOST_ROOM) + ROOM_END)
+            size = new.tell()
         self._seam, self._size = seam, size
 
 
