@@ -33,7 +33,8 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.mesh.elements import Elements
 from lyra_petsc.mesh.select import select_vertices
 from lyra_petsc.scene.materials.library import is_isotropic
-from lyra_petsc.scene.schema import AXES, Scene
+from lyra_petsc.scene.schema import Scene
+from lyra_petsc.scene.values import AXES
 from lyra_petsc.terms import midedge_energy
 from lyra_petsc.terms.hinge_energy import fading_limit
 from lyra_petsc.terms.membrane import Membrane

@@ -23,10 +23,8 @@ from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
-from lyra_petsc.output.self_contained import check_folder
 from lyra_petsc.output.states import stored_states
-from lyra_petsc.output.stored import read_stored
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh, check_folder, read_stored
 
 SAME_TIME = 1e-6
 """Fraction of the time between samples by which a state may miss a sample time."""

@@ -25,7 +25,7 @@ from lyra_petsc.experiments.study.comparison import (
 from lyra_petsc.experiments.study.plan import ENERGY, POSITION, probe_quantity
 from lyra_petsc.mesh.build import build_mesh
 from lyra_petsc.mesh.mesh import Mesh
-from lyra_petsc.output.stored_mesh import StoredMesh
+from lyra_petsc.output.stored import StoredMesh
 
 pytest.importorskip("scipy")
 
