@@ -1,4 +1,4 @@
-"""Errors of a run against a reference at the sample times, on one rank.
+"""Errors of a run against a reference at the sample times, slab by slab: no rank holds a whole state.
 
 Between meshes of the same sheets rest shapes are compared, sheet by sheet: each point goes to the nearest
 triangle of its sheet and gets the barycentric weights of the nearest place in it. On flat sheets that is
@@ -11,64 +11,75 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
 
 from lyra_petsc.arrays import Array, Ints
 from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.exact_motions import ExactMotion
 from lyra_petsc.experiments.study.plan import MEAN_SQUARE, Quantity
 from lyra_petsc.mesh.measures import bounding_diagonal
+from lyra_petsc.output.agreement import on_each
 from lyra_petsc.output.read_run import ENERGIES, Columns, read_table
 from lyra_petsc.output.states import stored_states
-from lyra_petsc.output.stored import StoredMesh, check_folder, read_stored
+from lyra_petsc.output.stored import StoredMesh, check_folder, open_stored
+from lyra_petsc.parallel import on_root
 
 SAME_TIME = 1e-6
 """Fraction of the time between samples by which a state may miss a sample time."""
 
+ROWS_AT_ONCE = 1 << 16
+"""Rows of a file that a rank reads at a time."""
 
-class AnyMesh(Protocol):
-    """A mesh with its rest shape (V, 3) [m] and triangles (F, 3): built, or read from a run's folder."""
+
+@dataclass
+class RestSurface:
+    """The rest shape of a run's mesh, on rank 0.
+
+    Attributes
+    ----------
+    rest : (V, 3) float64
+        [m].
+    triangles : (F, 3) int64
+    areas : (V,) float64
+        Rest area of each vertex [m²]: a third of that of its triangles.
+    """
+
+    rest: Array
+    triangles: Ints
+    areas: Array
 
     @property
-    def rest(self) -> Array:
-        """(V, 3) [m]"""
+    def size(self) -> float:
+        """Diagonal [m] of the bounding box."""
+        return bounding_diagonal(self.rest)
 
-    @property
-    def triangles(self) -> Ints:
-        """(F, 3)"""
-
-
-def same_mesh(one: AnyMesh, other: AnyMesh) -> bool:
-    """Whether it is the same mesh, vertex by vertex, up to rounding."""
-    if one.rest.shape != other.rest.shape or not np.array_equal(one.triangles, other.triangles):
-        return False
-    size = max(map(bounding_diagonal, (one.rest, other.rest)))
-    return bool(np.abs(one.rest - other.rest).max() <= 1e-9 * size)
-
-
-def vertex_areas(mesh: StoredMesh) -> Array:
-    """Rest area of each vertex (V,) [m²]: a third of that of its triangles."""
-    uv = mesh.corner_uv
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    thirds = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 6.0
-    return np.bincount(mesh.triangles.ravel(), np.repeat(thirds, 3), len(mesh.rest)).astype(np.float64)
+    def same_as(self, other: RestSurface) -> bool:
+        """Whether it is the same mesh, vertex by vertex, up to rounding."""
+        if self.rest.shape != other.rest.shape or not np.array_equal(self.triangles, other.triangles):
+            return False
+        return bool(np.abs(self.rest - other.rest).max() <= 1e-9 * max(self.size, other.size))
 
 
 @dataclass
 class Samples:
-    """A run at the sample times.
+    """A run at the sample times; the same on all ranks.
 
     Attributes
     ----------
-    mesh : StoredMesh
+    folder : Path
     times : tuple of float
         [s].
-    places : tuple of (Path, str)
+    files : tuple of (str, str)
         File and dataset of the positions at each time.
+    n_vertices : int
+    size : float
+        Diagonal [m] of the rest shape's bounding box.
     energies : (T, 4) float64
         Kinetic, membrane, bending, potential [J] at each time.
     exchanged : float
@@ -79,32 +90,88 @@ class Samples:
         Vertices of each mesh source; needed between different meshes.
     """
 
-    mesh: StoredMesh
+    folder: Path
     times: tuple[float, ...]
-    places: tuple[tuple[Path, str], ...]
+    files: tuple[tuple[str, str], ...]
+    n_vertices: int
+    size: float
     energies: Array
     exchanged: float
     probes: dict[str, Array]
     sheets: Sequence[int] = ()
 
-    @cached_property
-    def size(self) -> float:
-        """Diagonal [m] of the rest shape's bounding box."""
-        return bounding_diagonal(self.mesh.rest)
+    def rows(self, comm: MPI.Comm, sample: int, wanted: Ints | None = None) -> Array:
+        """Positions (n, 3) [m] of this rank's slab of vertices, or of the vertices ``wanted``; collective.
 
-    def positions(self, sample: int) -> Array:
-        """(V, 3) [m]
+        Parameters
+        ----------
+        comm : MPI.Comm
+        sample : int
+        wanted : (n,) int, optional
+            Ascending vertex numbers.
 
         Raises
         ------
         InputError
-            If the file cannot be read.
+            On every rank, if the file cannot be read.
         """
-        return read_stored(*self.places[sample], self.mesh.rest.shape, "f")
+        file, dataset = self.files[sample]
+
+        def read() -> Array:
+            with open_stored(self.folder / file) as opened:
+                stored = opened[dataset]
+                if wanted is not None:
+                    return _picked(stored, wanted)
+                return stored[slice(*slab(comm, self.n_vertices))]
+
+        return on_each(comm, read)
 
 
-def read_samples(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
-    """What a run left at the sample times.
+def slab(comm: MPI.Comm, n: int, rank: int | None = None) -> tuple[int, int]:
+    """First row and the row after the last of a rank's share of n rows; this one's unless told."""
+    rank = comm.rank if rank is None else rank
+    return rank * n // comm.size, (rank + 1) * n // comm.size
+
+
+def scatter(comm: MPI.Comm, rows: NDArray[Any] | None) -> NDArray[Any]:
+    """This rank's slab of rows (n, …) that rank 0 has; collective."""
+    pieces: list[NDArray[Any]] = []
+    if rows is not None:
+        pieces = [rows[slice(*slab(comm, len(rows), rank))] for rank in range(comm.size)]
+    return np.asarray(comm.scatter(pieces, root=0))
+
+
+def _picked(stored: Any, wanted: Ints) -> Array:
+    """Rows of a dataset, read in pieces so that a rank never holds all of it."""
+    out = np.empty((len(wanted), 3))
+    for start in range(0, stored.shape[0], ROWS_AT_ONCE):
+        first, last = np.searchsorted(wanted, [start, start + ROWS_AT_ONCE])
+        if last > first:
+            piece = stored[start : start + ROWS_AT_ONCE]
+            out[first:last] = piece[wanted[first:last] - start]
+    return out
+
+
+def read_surface(folder: Path) -> RestSurface:
+    """The mesh of a run. For rank 0.
+
+    Raises
+    ------
+    InputError
+        If ``mesh.h5`` is missing or damaged.
+    """
+    mesh = StoredMesh(folder)
+    rest, triangles, uv = mesh.rest, mesh.triangles, mesh.corner_uv
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    thirds = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 6.0
+    areas = np.bincount(triangles.ravel(), np.repeat(thirds, 3), len(rest)).astype(np.float64)
+    return RestSurface(rest, triangles, areas)
+
+
+def read_samples(
+    comm: MPI.Comm, folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()
+) -> Samples:
+    """What a run left at the sample times; collective.
 
     Parameters
     ----------
@@ -119,15 +186,20 @@ def read_samples(folder: Path, times: Sequence[float], spacing: float, sheets: S
     Raises
     ------
     InputError
-        If a state, the mesh or the history is missing.
+        On every rank, if a state, the mesh or the history is missing.
     """
+    return on_root(comm, lambda: read_here(folder, times, spacing, sheets))
+
+
+def read_here(folder: Path, times: Sequence[float], spacing: float, sheets: Sequence[int] = ()) -> Samples:
+    """As ``read_samples``, on one rank and for it alone."""
     if folder.is_dir():
         check_folder(folder)
     states = stored_states(folder) if folder.is_dir() else []
     if not states:
         raise InputError("holds no states of a run", file=folder)
     at = np.array([state.time for state in states])
-    places = []
+    files = []
     for time in times:
         nearest = int(np.abs(at - time).argmin())
         if abs(at[nearest] - time) > SAME_TIME * spacing:
@@ -136,10 +208,9 @@ def read_samples(folder: Path, times: Sequence[float], spacing: float, sheets: S
                 f"{at.min():g} to {at.max():g} s); run it with output.every = {spacing:g}",
                 file=folder,
             )
-        state = states[nearest]
-        places.append((folder / state.file, f"states/{state.number:06d}/position"))
-    mesh = StoredMesh(folder)
-    vertex_areas(mesh)  # reads all that comparisons need
+        number = states[nearest].number
+        files.append((states[nearest].file, f"states/{number:06d}/position"))
+    surface = read_surface(folder)
     history, at_samples = _table(folder / "history.csv", times)
     energies = np.column_stack([history[name] for name in ENERGIES])
     probes = {}
@@ -148,7 +219,10 @@ def read_samples(folder: Path, times: Sequence[float], spacing: float, sheets: S
         for name in (name.removesuffix("_x") for name in table if name.endswith("_x")):
             probes[name] = np.column_stack([table[f"{name}_{axis}"] for axis in "xyz"])[chosen]
     exchanged = float(np.abs(energies - energies[0]).max())
-    return Samples(mesh, tuple(times), tuple(places), energies[at_samples], exchanged, probes, sheets)
+    return Samples(
+        folder, tuple(times), tuple(files), len(surface.rest), surface.size, energies[at_samples], exchanged,
+        probes, sheets,
+    )  # fmt: skip
 
 
 def _table(path: Path, times: Sequence[float]) -> tuple[Columns, list[int]]:
@@ -163,26 +237,62 @@ CANDIDATES = 12
 """Triangles with the nearest centroids among which the nearest triangle is looked for."""
 
 
-def located(
-    points: AnyMesh, point_sheets: Sequence[int], other: AnyMesh, other_sheets: Sequence[int]
-) -> tuple[Ints, Array]:
-    """Where in another mesh the vertices of ``points`` lie: corners (n, 3) and their weights (n, 3).
+@dataclass
+class Transfer:
+    """This rank's part: corners and weights for its slab of points.
+
+    Attributes
+    ----------
+    wanted : (m,) int64
+        Vertices of the other mesh that this rank reads, ascending.
+    corner : (n, 3) int64
+        Numbers in ``wanted``.
+    weight : (n, 3) float64
+    """
+
+    wanted: Ints
+    corner: Ints
+    weight: Array
+
+    def rows(self, comm: MPI.Comm, samples: Samples, sample: int) -> Array:
+        """Positions (n, 3) [m] of the other mesh's surface at this rank's points; collective."""
+        found = samples.rows(comm, sample, self.wanted)
+        return np.einsum("nc,nci->ni", self.weight, found[self.corner])
+
+
+def make_transfer(
+    comm: MPI.Comm,
+    points: RestSurface | None,
+    point_sheets: Sequence[int],
+    other: RestSurface | None,
+    other_sheets: Sequence[int],
+) -> Transfer:
+    """Plan the way from ``other`` to the vertices of ``points``; collective, set up on rank 0.
 
     Parameters
     ----------
-    points, other : mesh
+    points, other : RestSurface
+        Needed on rank 0 only.
     point_sheets, other_sheets : sequence of int
         Vertices of each sheet, which are numbered consecutively.
     """
-    found = []
-    ends, others = np.cumsum([0, *point_sheets]), np.cumsum([0, *other_sheets])
-    first = other.triangles[:, 0]
-    for sheet in range(len(point_sheets)):
-        inside = (first >= others[sheet]) & (first < others[sheet + 1])
-        mine = points.rest[ends[sheet] : ends[sheet + 1]]
-        found.append(_nearest(mine, other.rest, other.triangles[inside]))
-    corners, weights = zip(*found, strict=True)
-    return np.concatenate(corners), np.concatenate(weights)
+
+    def locate() -> tuple[Ints, Array]:
+        assert points is not None
+        assert other is not None
+        corner = np.empty((len(points.rest), 3), dtype=np.int64)
+        weight = np.empty((len(points.rest), 3))
+        ends, others = np.cumsum([0, *point_sheets]), np.cumsum([0, *other_sheets])
+        for sheet in range(len(point_sheets)):
+            mine = slice(ends[sheet], ends[sheet + 1])
+            first = other.triangles[:, 0]
+            inside = (first >= others[sheet]) & (first < others[sheet + 1])
+            corner[mine], weight[mine] = _nearest(points.rest[mine], other.rest, other.triangles[inside])
+        return corner, weight
+
+    corner, weight = (scatter(comm, rows) for rows in on_root(comm, locate, share=False) or (None, None))
+    wanted, inverse = np.unique(corner, return_inverse=True)
+    return Transfer(wanted, inverse.reshape(corner.shape).astype(np.int64), weight)
 
 
 def _nearest(places: Array, vertices: Array, triangles: Ints) -> tuple[Ints, Array]:
@@ -234,10 +344,15 @@ Errors = dict[str, float]
 History = dict[str, Array]
 """Errors at each sample after the start, by the name of the quantity."""
 
+Rows = Callable[[int], Array]
+"""Positions (n, 3) [m] of this rank's points at a sample."""
 
-def against_motion(samples: Samples, motion: ExactMotion, quantities: Sequence[Quantity]) -> Errors:
-    """Errors of a run against an exact motion."""
-    start, times = samples.positions(0), samples.times
+
+def against_motion(
+    comm: MPI.Comm, samples: Samples, motion: ExactMotion, quantities: Sequence[Quantity]
+) -> Errors:
+    """Errors of a run against an exact motion; collective."""
+    start, times = samples.rows(comm, 0), samples.times
     forms = [motion.energies(t) for t in times]
     exact = np.array([[form.kinetic, form.membrane, 0.0, form.potential] for form in forms])
     probes = {
@@ -247,35 +362,26 @@ def against_motion(samples: Samples, motion: ExactMotion, quantities: Sequence[Q
     whole = replace(samples, energies=exact, exchanged=float(np.abs(exact - exact[0]).max()), probes=probes)
 
     def positions() -> History:
-        return _positions(samples, lambda i: motion.positions(start, times[i]), samples.size)
+        surface = on_root(comm, lambda: read_surface(samples.folder), share=False)
+        return _positions(comm, samples, lambda i: motion.positions(start, times[i]), surface, samples.size)
 
     return overall(_errors(samples, whole, quantities, positions))
 
 
-def against_run(mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
-    """Errors of a run against another, over all samples."""
-    return overall(history_against_run(mine, other, quantities))
+def against_run(comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> Errors:
+    """Errors of a run against another, over all samples; collective."""
+    return overall(history_against_run(comm, mine, other, quantities))
 
 
-def history_against_run(mine: Samples, other: Samples, quantities: Sequence[Quantity]) -> History:
-    """Errors of a run against another at each sample.
+def history_against_run(
+    comm: MPI.Comm, mine: Samples, other: Samples, quantities: Sequence[Quantity]
+) -> History:
+    """Errors of a run against another at each sample; collective.
 
     On different meshes the finer solution is interpolated at the rest places of the coarser one's
     vertices.
     """
-
-    def positions() -> History:
-        coarse, fine = (other, mine) if len(mine.mesh.rest) > len(other.mesh.rest) else (mine, other)
-        if same_mesh(coarse.mesh, fine.mesh):
-            return _positions(coarse, fine.positions, other.size)
-        corners, weights = located(coarse.mesh, coarse.sheets, fine.mesh, fine.sheets)
-
-        def interpolated(sample: int) -> Array:
-            return np.einsum("nc,nci->ni", weights, fine.positions(sample)[corners])
-
-        return _positions(coarse, interpolated, other.size)
-
-    return _errors(mine, other, quantities, positions)
+    return _errors(mine, other, quantities, lambda: _between(comm, mine, other))
 
 
 def _errors(
@@ -306,12 +412,27 @@ def overall(history: History) -> Errors:
     return found
 
 
-def _positions(samples: Samples, there: Callable[[int], Array], size: float) -> History:
-    """Largest and area-weighted L2 distance over space, at each sample after the start, over ``size`` [m]."""
-    areas = vertex_areas(samples.mesh)
-    distances = [
-        np.linalg.norm(samples.positions(i) - there(i), axis=1) for i in range(1, len(samples.times))
-    ]
-    largest = np.array([distance.max(initial=0.0) for distance in distances])
-    squares = np.array([areas @ distance**2 for distance in distances]) / areas.sum()
+def _between(comm: MPI.Comm, run: Samples, reference: Samples) -> History:
+    coarse, fine = (reference, run) if run.n_vertices > reference.n_vertices else (run, reference)
+    found = on_root(comm, lambda: [read_surface(each.folder) for each in (coarse, fine)], share=False)
+    at, beyond = found or (None, None)
+    same = comm.bcast(at is not None and beyond is not None and at.same_as(beyond), root=0)
+    there: Rows = partial(fine.rows, comm)
+    if not same:
+        there = partial(make_transfer(comm, at, coarse.sheets, beyond, fine.sheets).rows, comm, fine)
+    return _positions(comm, coarse, there, at, reference.size)
+
+
+def _positions(
+    comm: MPI.Comm, samples: Samples, there: Rows, surface: RestSurface | None, size: float
+) -> History:
+    """Largest and area-weighted L2 error over space, at each sample after the start; surface on rank 0."""
+    areas = scatter(comm, None if surface is None else surface.areas)
+    whole = comm.allreduce(float(areas.sum()))
+    count = len(samples.times) - 1
+    largest, squares = np.empty(count), np.empty(count)
+    for i in range(count):
+        distance = np.linalg.norm(samples.rows(comm, i + 1) - there(i + 1), axis=1)
+        largest[i] = comm.allreduce(float(distance.max(initial=0.0)), MPI.MAX)
+        squares[i] = comm.allreduce(float(areas @ distance**2)) / whole
     return {"position_max": largest / size, MEAN_SQUARE: np.sqrt(squares) / size}

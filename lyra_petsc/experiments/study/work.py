@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -29,7 +30,7 @@ from lyra_petsc.errors import InputError
 from lyra_petsc.experiments.case import Launcher, Outcome, Verdict
 from lyra_petsc.experiments.exact_motions import SOLUTIONS, Body, ExactMotion, exact_motion, matching
 from lyra_petsc.experiments.study import comparison
-from lyra_petsc.experiments.study.comparison import Errors, History, Samples
+from lyra_petsc.experiments.study.comparison import Errors, History, RestSurface, Samples
 from lyra_petsc.experiments.study.jobs import CASES, RESULT_FILE, Job, Result, launched, read_result, run_case
 from lyra_petsc.experiments.study.plan import (
     AUTO_STEPS,
@@ -157,14 +158,15 @@ def _of_run(plan: Plan, folder: Path, key: str) -> Reference:
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, key=key)
     try:
-        samples = comparison.read_samples(folder, plan.sample_times(), plan.every)
+        samples = comparison.read_here(folder, plan.sample_times(), plan.every)
+        stored = comparison.read_surface(folder)
     except InputError as error:
         raise InputError(error.message, file=error.file, key=key) from None
     axis = plan.axis("mesh")
     for chosen in [[(axis, value)] for value in axis.values] if axis is not None else [[]]:
         mesh = mesh_of(plan.request.with_changes(overrides(plan.base, chosen)))
-        if not comparison.same_mesh(mesh, samples.mesh):
-            stored = samples.mesh
+        built = RestSurface(mesh.rest, mesh.triangles, np.ones(mesh.n_vertices))
+        if not built.same_as(stored):
             raise InputError(
                 f"is a run of another mesh ({len(stored.rest)} vertices, {len(stored.triangles)} triangles; "
                 f"the study's has {mesh.n_vertices} and {mesh.n_triangles}, or others)",
@@ -608,19 +610,20 @@ class Work:
         quantities = self.plan.quantities
         if found.motion is not None:
             found.own = {quantity.name: Estimate(ROUND_OFF, math.nan, True) for quantity in quantities}
-            errors_of: Callable[..., Errors] = partial(comparison.against_motion, motion=found.motion)
+            errors_of: Callable[..., Errors] = partial(
+                comparison.against_motion, self.comm, motion=found.motion
+            )
         else:
             assert found.folder is not None
-            read = partial(self._samples, found.folder, found.sheets)
-            other: Any = on_root(self.comm, read, share=False)
-            errors_of = partial(comparison.against_run, other=other)
+            other = self._samples(found.folder, found.sheets)
+            errors_of = partial(comparison.against_run, self.comm, other=other)
         for row in rows:
             try:
-                mine = on_root(self.comm, partial(self._of_case, row.case), share=False)
+                mine = self._of_case(row.case)
             except InputError as error:
                 row.result.fail(" ".join(str(error).split()))
                 continue
-            row.errors = on_root(self.comm, partial(errors_of, mine, quantities=quantities))
+            row.errors = errors_of(mine, quantities=quantities)
             row.own = {name: estimate.error for name, estimate in found.own.items()}
             mark_unresolved(row)
         return found
@@ -662,23 +665,11 @@ class Work:
             yield replace(level, title=f"reference: {level.title}")
         return self._results[level.name]
 
-    # on rank 0
-
     def _of_case(self, case: StudyCase) -> Samples:
         return self._samples(self.folder / CASES / case.name, self._results[case.name].sheets)
 
     def _samples(self, folder: Path, sheets: Sequence[int]) -> Samples:
-        return comparison.read_samples(folder, self.plan.sample_times(), self.plan.every, sheets)
-
-    def _differences(self, chain: Chain) -> list[History]:
-        """Between neighbours of a chain, finest first."""
-        samples = [self._of_case(level) for level in chain.levels]
-        return [
-            comparison.history_against_run(coarse, fine, self.plan.quantities)
-            for fine, coarse in itertools.pairwise(samples)
-        ]
-
-    # collective
+        return comparison.read_samples(self.comm, folder, self.plan.sample_times(), self.plan.every, sheets)
 
     def _own(self, family: list[Chain], known: Reference) -> Runs[dict[str, Estimate]]:
         """Own error of the reference from its chains."""
@@ -690,7 +681,11 @@ class Work:
                 if self._results[level.name].problem:
                     known.notes.append(f"the own error of the reference is not known: {level.title} failed")
                     return {}
-            differences = on_root(self.comm, partial(self._differences, chain))
+            samples = [self._of_case(level) for level in chain.levels]
+            differences = [
+                comparison.history_against_run(self.comm, coarse, fine, self.plan.quantities)
+                for fine, coarse in itertools.pairwise(samples)
+            ]
             estimates.append(of_chain(differences, chain))
         own = joined(estimates)
         doubtful = [name for name, estimate in own.items() if not estimate.trusted]
