@@ -12,7 +12,7 @@ case ${1:-} in
     run) ranks=${RANKS:-2} extras=(study) ;;
     render | view) extras=(view) ;;
     export) extras=(export) ;;
-    study | stress | verify | report) extras=(study) ;;
+    study | stress | verify | fabric | fit | report) extras=(study) ;;
 esac
 [[ $ranks =~ ^[1-9][0-9]*$ ]] || give_up "RANKS=$ranks is not a number of ranks"
 for argument in "$@"; do

@@ -37,6 +37,13 @@ def aligned(rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
     return [line.rstrip() for line in lines]
 
 
+def write_csv(path: Path, lines: Iterable[Iterable[Any]]) -> None:
+    """Write a table; the file is the old or the new one, never half. Call on one rank."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    replace_text(path, text.getvalue())
+
+
 def verdict_line(verdict: Verdict, name: str = "") -> Line:
     """A verdict below its case; those that are not good stand out."""
     return f"  {name}{verdict.line}", "" if verdict.passed else "bold red"
@@ -212,10 +219,8 @@ class Results(Generic[O]):
 
         def table() -> None:
             rows = [row for outcome in _run(outcomes) for row in view.rows(outcome)]
-            lines = [view.columns, *([view.cell(row.get(name)) for name in view.columns] for row in rows)]
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(lines)
-            replace_text(path, text.getvalue())
+            cells = ([view.cell(row.get(name)) for name in view.columns] for row in rows)
+            write_csv(path, [view.columns, *cells])
 
         on_root(self._comm, table)
         content = view.content(outcomes, self._ranks, self._command)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from lyra_petsc.experiments.case import Case, Outcome, Verdict, read_record, save_record
-from lyra_petsc.experiments.results import Line, View, verdict_line
-from lyra_petsc.output.agreement import replace_text
+from lyra_petsc.experiments.results import Line, View, verdict_line, write_csv
 from lyra_petsc.show.report.document import PLOTS, Drawing, Report, seconds, short
-from lyra_petsc.show.report.plots import HEIGHT, Series, colour, drawn, empty_figure
+from lyra_petsc.show.report.plots import HEIGHT, colour, drawn, empty_figure
 
 OUTCOME_FILE = "outcome.json"
 
@@ -178,33 +175,26 @@ class Fabric(View[FabricOutcome]):
 
     def close(self, report: Report, folder: Path, command: Sequence[str]) -> str:
         for outcome in self._outcomes:
-            for curve in outcome.record.curves:
-                text = io.StringIO()
+            curves = outcome.record.curves
+            for number, curve in enumerate(curves, 1):
+                name = outcome.case.name + (f"-{number}" if len(curves) > 1 else "")
                 lines = [(curve.x_label, curve.y_label), *zip(curve.x, curve.y, strict=True)]
-                csv.writer(text, lineterminator="\n").writerows(lines)
-                replace_text(
-                    folder / f"{outcome.case.name}{_suffix(outcome.record, curve)}.csv", text.getvalue()
-                )
+                write_csv(folder / f"{name}.csv", lines)
         return super().close(report, folder, command)
-
-
-def _suffix(record: Record, curve: Curve) -> str:
-    return "" if len(record.curves) == 1 else f"-{record.curves.index(curve) + 1}"
 
 
 def pictures(outcome: FabricOutcome) -> list[Drawing]:
     """The curves and the shadow of a test."""
     record, name, found = outcome.record, outcome.case.name, []
     if record.curves:
-        lines = [Series(c.name, c.x, c.y) for c in record.curves]
         figure = empty_figure(0.8 * HEIGHT)
         axes = figure.add_subplot(xlabel=record.curves[0].x_label, ylabel=record.curves[0].y_label)
-        for number, line in enumerate(lines):
-            axes.plot(line.x, line.y, color=colour(number), label=line.name, lw=1.4, marker=".", ms=3)
+        for number, curve in enumerate(record.curves):
+            axes.plot(curve.x, curve.y, color=colour(number), label=curve.name, lw=1.4, marker=".", ms=3)
         axes.grid(True, color="#dfe3e8", lw=0.8)
         if all(label.endswith("[cm]") for label in (record.curves[0].x_label, record.curves[0].y_label)):
             axes.set_aspect("equal", adjustable="datalim")  # the shape of a strip
-        if len(lines) > 1:
+        if len(record.curves) > 1:
             axes.legend(fontsize=8)
         found.append(drawn(figure, f"{PLOTS}/{name}", outcome.case.title))
     if record.shadow:

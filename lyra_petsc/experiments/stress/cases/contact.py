@@ -16,7 +16,7 @@ import numpy as np
 
 from lyra_petsc.experiments.bench import Bench, Trial
 from lyra_petsc.experiments.case import Verdict
-from lyra_petsc.experiments.meshes import rectangle
+from lyra_petsc.experiments.meshes import evenly, rectangle
 from lyra_petsc.experiments.stress.step_balance import Record
 from lyra_petsc.experiments.stress.stress_scenes import (
     FULL,
@@ -136,15 +136,14 @@ def _knot(setting: Setting, bench: Bench) -> Content:
         on = (end - before) / np.linalg.norm(end - before)
         tails.append(end + 0.3 * (1.0 - np.exp(-s / 0.3)) * on + s * out)
     way = KNOT * np.concatenate([tails[0][::-1], bow, tails[1]])
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-    cells = round(float(length[-1]) / STRAND)
-    at = np.linspace(0.0, length[-1], cells + 1)
-    middle = np.column_stack([np.interp(at, length, way[:, k]) for k in range(3)])
+    length = float(np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))[-1])
+    cells = round(length / STRAND)
+    middle = evenly(way, cells + 1)
     along = np.gradient(middle, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    flat, faces = rectangle(cells, WIDE, float(length[-1]), WIDE * STRAND)
+    flat, faces = rectangle(cells, WIDE, length, WIDE * STRAND)
     side = np.arange(WIDE + 1.0) - 0.5 * WIDE
     start = (middle + STRAND * side[:, None, None] * across).reshape(-1, 3)
     row = (cells + 1) * np.arange(WIDE + 1)
